@@ -65,7 +65,7 @@ def plain_text(text: str, keep: str = "") -> str:
 def one_line(text: str) -> str:
     """Return ``text`` as one line of ``plain_text``; text longer than ``LINE_LIMIT`` is shortened in the middle.
 
-    The beginning of a message says what is wrong and where, and its end says what would be right. Both are kept.
+    The beginning of a message (what is wrong, and where) and its end (what would be right) are kept.
     """
     blanks = text if len(text) <= 2 * LINE_LIMIT else text[:LINE_LIMIT] + text[-LINE_LIMIT:]
     line = plain_text(blanks)
@@ -253,7 +253,8 @@ class Unfamiliar(UserWarning):
 def renumbered(rows: Sequence[int] | NDArray[np.int64]) -> Iterator[None]:
     """Context manager: change the row numbers in a ``PhysicsError`` or ``AgentFailed`` that is raised in the block.
 
-    Use this for a block that works on a part of a batch: world k of the part is row ``rows[k]`` of the whole batch.
+    Use this context manager for a block that works on a part of a batch: world k of the part is row ``rows[k]`` of the
+    whole batch.
     """
     try:
         yield
@@ -281,8 +282,8 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
         kind: what the name should be a name of, for example ``scenario``.
         name: the unknown name.
         known: the known names.
-        may_be_own: true if users can register names of this kind. The message then says that the user's own name must
-            be registered or installed first.
+        may_be_own: true if users can register names of this kind. The message then says that a name of the user's own
+            must first be registered or installed.
 
     """
     names = sorted(known)
@@ -308,7 +309,7 @@ def refuse_shipped_path(path: str, agent: str = "") -> None:
 def check_whole_number(what: str, value: object, least: int, most: int | None = None) -> None:
     """Raise ``InvalidInput`` unless ``value`` is a whole number from ``least`` to ``most`` (None: no upper limit).
 
-    ``what``: name of the value, with which the message begins.
+    ``what``: name of the value; the error message begins with this name.
     """
     whole = isinstance(value, Integral) and not isinstance(value, bool)
     if not (whole and least <= value and (most is None or value <= most)):  # type: ignore[operator]  # whole

@@ -63,7 +63,7 @@ def schema_option(module: str, model: str, kind: str) -> Any:
     """Return the type of a Typer option ``--schema``, which prints the JSON Schema of a kind of file and exits.
 
     Args:
-        module: name of the module with the model; it is imported only when the option is used.
+        module: name of the module that defines ``model``; it is imported only when the option is used.
         model: name of the model's class, which has a method ``json_schema``.
         kind: kind of file, for the help text, such as ``recipe``.
 
@@ -120,7 +120,7 @@ class Out:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop redirecting stdout; after Ctrl-C, print a message and end the command with status 130.
+        """Stop redirecting stdout; after Ctrl-C, print a message and end the command with exit status 130.
 
         The arguments describe the exception that ended the block, as for every context manager.
         """
@@ -170,8 +170,8 @@ class Out:
 
         Args:
             path: path of the file; None: no file was requested, and nothing is checked.
-            endings: allowed endings of the name, such as ``.csv``; without endings, all are allowed.
-            what: words for the content of the file, for the error message.
+            endings: allowed endings of the file's name, such as ``.csv``; if none is given, every ending is allowed.
+            what: words in the error message for the content of the file.
 
         """
         if path is None:

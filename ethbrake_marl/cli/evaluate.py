@@ -45,7 +45,7 @@ _POLICIES = {"same": "the same", "other": "another", "none": ""}
 
 
 def read_task(scenario: str, settings: Sequence[str] | None) -> Task:
-    """Load a scenario, change its settings, and return the task of controlling its learners.
+    """Load a scenario, apply ``settings`` to it, and return the task of controlling its learners.
 
     Args:
         scenario: name of a scenario, or path of its file.
@@ -331,7 +331,7 @@ def compare_command(first: Annotated[Path, _FILE], second: Annotated[Path, _FILE
 
     Shows the harm in the second result minus the harm in the first, for each agent that both results contain. Both
     results must come from the same command and the same worlds of the same scenario. Confidence intervals are paired by
-    world if both folders have the files of --per-world.
+    world if both folders contain the file that --per-world writes.
     """
     with Out(as_json=as_json) as out:
         comparison = evaluation.compare_results(evaluation.read_result(first), evaluation.read_result(second))
@@ -366,10 +366,10 @@ def shield_command(
     """Compare agents without and with the shield.
 
     Each agent runs in the same worlds without a shield, with the shield in episode mode, and with the shield in step
-    mode. A team of several learners runs without a shield, in step mode, and in step mode with caps. Name the agents
-    without a shield: full_brake, not full_brake+step. The shield bounds first-impact harm, or total harm with --set
-    harm_count=total. For each action that step mode replaced, the table says what harm the replaced action would have
-    caused: more (the replacement was needed), the same (harmless) or less (costly).
+    mode. A team of several learners runs without a shield, with the shield in step mode, and with that shield plus
+    caps. Name the agents without a shield: full_brake, not full_brake+step. The shield bounds first-impact harm, or
+    total harm with --set harm_count=total. For each action that step mode replaced, the table says what harm the
+    replaced action would have caused: more (the replacement was needed), the same (harmless) or less (costly).
     """
     with Out(as_json=as_json) as out:
         task = read_task(scenario, settings)

@@ -82,7 +82,7 @@ class Wording:
 
     Args:
         model: pydantic model of the file.
-        needed: text that says what must be written if a required key is missing, the same for all keys.
+        needed: text that says what must be written for a missing key; the same text for every key.
 
     """
 
@@ -207,8 +207,8 @@ def first_mistake(error: ValidationError) -> Mistake:
 def path_of(detail: ErrorDetails) -> YamlPath:
     """Return the path (keys and indices inside the file) of a mistake that pydantic reports.
 
-    The tags of unions are removed from the path that pydantic reports. If ``refuse`` raised the error, its ``at`` is
-    appended.
+    The tags of unions are removed from the path that pydantic reports. If ``refuse`` raised the error, its argument
+    ``at`` is appended.
     """
     keys = tuple(key for key in detail["loc"] if not (isinstance(key, str) and key.startswith("#")))
     return (*keys, *detail.get("ctx", {}).get("at", ()))

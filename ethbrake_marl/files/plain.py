@@ -54,7 +54,8 @@ def open_plain(
     """Open a plain file of at most ``limit_bytes`` for reading, as a context manager.
 
     Kind and size of the file are checked before it is opened, so a pipe or device is not opened. Kind and size are
-    checked again after opening, in case another process has replaced the file. Opening never waits.
+    checked again after opening, in case another process has replaced the file. The function never waits for the file to
+    open.
 
     Args:
         path: path of the file.

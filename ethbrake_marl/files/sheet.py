@@ -41,7 +41,7 @@ class Estimate:
         Args:
             digits: number of digits after the decimal point.
             scale: factor that multiplies all numbers, for example 100 for per cent.
-            unit: text directly after the value, such as a unit.
+            unit: text to put directly after the value, such as ``" %"``.
 
         """
         return Column("", digits=digits, scale=scale, unit=unit).show(self).in_words
@@ -124,8 +124,9 @@ Row = Sequence[Any] | str  # a row of cells, or the name of a section that begin
 class Sheet:
     """A table: title, columns, rows of cells, and a note below.
 
-    A string in ``columns`` is the heading of a column of texts. A string in ``rows`` is the name of a section that
-    begins there. If a row has fewer cells than the table has columns, the remaining cells are shown empty.
+    A string in ``columns`` is the heading of a column of texts. A string in ``rows`` is the name of a section, which
+    consists of the following rows. If a row has fewer cells than the table has columns, the remaining cells are shown
+    empty.
 
     >>> from ethbrake_marl.files.sheet import Column, Estimate, Sheet
     >>> sheet = Sheet("Harm", ["Agent", Column("Total", "total_harm")], [("coast", Estimate(1.5, (1.0, 2.0)))])
@@ -341,12 +342,12 @@ def parquet_file(
     """Context manager: yield a function ``add(columns)`` that appends rows to a new Parquet file.
 
     ``columns`` maps column names to arrays of equal length. With ``add(columns, together=True)`` the appended rows form
-    one row group. The file appears only if the block ends without error. Raises ``MissingExtra`` if pyarrow is not
+    one row group. The file is created only if the block ends without error. Raises ``MissingExtra`` if pyarrow is not
     installed.
 
     Args:
         path: path of the new file.
-        told: function that returns metadata for the file, called at the end of the block; None: no metadata.
+        told: function that is called at the end of the block and returns metadata for the file; None: no metadata.
         **options: options of ``pyarrow.parquet.ParquetWriter``.
 
     """

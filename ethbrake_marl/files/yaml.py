@@ -116,7 +116,7 @@ class Document:
     def refusing_at(self, path: YamlPath) -> Iterator[None]:
         """Context manager: if the block raises ``InvalidInput``, put file and line number in front of its message.
 
-        ``path``: keys and indices that lead to the value; the line of this value is put in front of the message.
+        ``path``: keys and indices that lead to the value; the line number of this value is put in front of the message.
         """
         try:
             yield

@@ -24,7 +24,8 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 def shipped_folder(folder: Literal["scenarios", "train"] = "scenarios") -> Path:
     """Return the folder of the shipped scenarios, or of the shipped recipes if ``folder`` is ``"train"``.
 
-    The folder is part of the source checkout or of the installed package. Raises ``InvalidInput`` if both lack it.
+    The folder is part of the source checkout or of the installed package. Raises ``InvalidInput`` if neither contains
+    the folder.
     """
     checkout, installed = _PACKAGE.parent / folder, _PACKAGE / "_data" / folder
     if (_PACKAGE.parent / "pyproject.toml").is_file() and checkout.is_dir():

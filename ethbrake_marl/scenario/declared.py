@@ -176,7 +176,7 @@ class ScenarioFields(FileModel):
     @field_validator(*QUANTITY.needed, mode="before")
     @classmethod
     def _needed(cls, value: Any, info: ValidationInfo) -> Any:
-        """Raise an error if a quantity that has no default lacks a value.
+        """Raise an error if a quantity has neither a value nor a default.
 
         No value is needed if every vehicle type, or the table, declares the quantity, or if the scenario is a mixture.
         """
@@ -385,7 +385,7 @@ class ScenarioFields(FileModel):
         return None if self.vehicle_types is None else TypesOfLine(self.vehicle_types, self.types, self.vehicles)
 
     def equipped(self, types: Ints | None = None) -> Equipped:
-        """Return the V2X equipment of the vehicles in worlds with these vehicle ``types`` (indices, [n, N]).
+        """Return the vehicles' V2X equipment in worlds with the vehicle types ``types`` (indices, [n, N]).
 
         If ``types`` is None, the result has one row, [1, N]: for each vehicle the least equipment of all its possible
         types.
@@ -525,7 +525,7 @@ def obstacle_gap(
 
     Args:
         scenario: the scenario that declares the obstacle.
-        found: the other quantities of these worlds by key, [k, entries] each.
+        found: the other quantities of the k worlds: key -> values, [k, entries].
         declared: function that maps ``"obstacle_gap_m"`` or ``"obstacle_margin_m"`` to its value in each world, [k].
 
     """

@@ -270,7 +270,7 @@ Quantity = Annotated[
 
 
 class WithLoad(_Distribution):
-    """``{with_load: [empty, full]}``: linear in the vehicle's load, from load 0 to load 1; only in vehicle types.
+    """``{with_load: [empty, full]}``: linear in the load, ``empty`` at 0 and ``full`` at 1; only in vehicle types.
 
     ``spread`` is the distribution, around 0, of a random amount that is added to each vehicle's value.
     """

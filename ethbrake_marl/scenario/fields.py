@@ -131,8 +131,9 @@ class Quantities(NamedTuple):
     def of(self, worlds: Worlds) -> dict[str, QuantityRule]:
         """Return the quantities that ``worlds`` have: key -> ``QuantityRule``.
 
-        Friction is included if all worlds have it, the distance to an obstacle if some world has an obstacle, brake and
-        release rates if some rate is finite, and the weights of harm if some weight is not 1.
+        Of the optional quantities, friction is included if all worlds have it, the distance to an obstacle if some
+        world has an obstacle, brake and release rates if some rate is finite, and the weights of harm if some weight is
+        not 1.
         """
         there = {"obstacle_gap_m": worlds.obstacle_ahead.any(), "friction": np.isfinite(worlds.friction).all()}
         there["harm_weight"] = (worlds.vehicles.harm_weight != 1.0).any()

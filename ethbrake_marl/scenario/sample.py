@@ -24,8 +24,8 @@ def recording_of(texts: _Texts) -> _Texts:
 def clusters_of(kinds: Mapping[str, _Texts], index: Ints) -> _Texts | None:
     """Return the name of each world's cluster, [n], or None if all worlds are independent.
 
-    Worlds of the same cluster are not statistically independent. A cluster is all worlds of one recording, whichever
-    vehicles of the recording they come from. A world without a recording, in a mixture, is a cluster of its own.
+    Worlds of the same cluster are not statistically independent. A cluster contains all worlds from one recording, even
+    if they show different vehicles. In a mixture, a world without a recording is a cluster of its own.
 
     Args:
         kinds: texts about the worlds by name, [n] each, such as ``Sample.kinds``.
@@ -61,7 +61,7 @@ class Sample:
         return f"Sample({self.worlds!r}, {numbers}, {self.rejected:,} rejected)"
 
     def take(self, rows: ArrayLike) -> Sample:
-        """Return a sample of the worlds selected by ``rows`` (indices or a mask [n]); its ``rejected`` is 0."""
+        """Return a sample of the worlds selected by ``rows`` (indices or a mask [n]), with ``rejected`` = 0."""
         some = np.asarray(rows)
         texts = (None if each is None else each[some] for each in (self.types, self.scenarios, self.recordings))
         return Sample(self.worlds.take(some), self.index[some], 0, *texts)
