@@ -83,9 +83,9 @@ def versions_used() -> dict[str, str]:
 class Registry(Mapping[str, T]):
     """Mapping name -> part for all parts (such as agents) of one kind. A part is loaded when first looked up.
 
-    Testing for a name and iterating over the names do not load any part. Looking up a name raises ``UnknownName`` if no
-    part has this name. It raises ``InvalidInput`` if the part cannot be loaded or two installed packages define it, and
-    ``MissingExtra`` if a package of an extra is missing.
+    Testing whether a name exists, and iterating over the names, load no part. Looking up a name raises ``UnknownName``
+    if no part has this name. It raises ``InvalidInput`` if the part cannot be loaded or two installed packages define
+    it, and ``MissingExtra`` if a package of an extra is missing.
 
     Args:
         kind: what the parts are called in messages, for example ``agent``.
@@ -183,7 +183,7 @@ class Registry(Mapping[str, T]):
             )
 
     def usable(self) -> dict[str, T]:
-        """Load all parts and return those that could be loaded, by name."""
+        """Load all parts (such as agents) and return those that could be loaded, by name."""
         return {name: self.loaded[name] for name in self if self.why_not(name) is None and name in self.loaded}
 
     def why_not(self, name: str) -> str | None:

@@ -18,7 +18,7 @@ class Actor:
     """The deterministic policy: observations [n, F] float32 -> actions [n, A] float32 in [-1, 1].
 
     In a mixture of experts, only the selected expert is computed for each observation. All methods except ``__call__``
-    take transposed arrays, with one observation per column, [F, rows].
+    expect transposed observations, one per column, [F, rows].
     """
 
     def __init__(self, spec: NetworkSpec, tensors: Mapping[str, Float32s], prefix: str = "") -> None:

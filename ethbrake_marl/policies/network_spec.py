@@ -44,10 +44,11 @@ class NetworkSpec(FileModel):
     the highest score acts; if several actors have this score, the first of them acts. A mixture of experts has no noise
     and no critic.
 
-    With output ``choice`` the actor scores ``choices`` actions, evenly spaced from -1 to 1. The policy takes the action
-    with the highest score; if several actions have this score, it takes the lowest of them. A policy with output
-    ``choice`` has no noise and no critic. Its actor may also score whole policies (``among``), which act on the same
-    observation. In the actor's result, the scores of the policies precede the scores of the actions.
+    With output ``choice`` the actor computes a score for each of ``choices`` actions, which are evenly spaced from -1
+    to 1. The policy takes the action with the highest score; if several actions have this score, it takes the lowest of
+    these actions. A policy with output ``choice`` has no noise and no critic. Its actor may also score whole policies
+    (``among``), which act on the same observation. In the actor's result, the scores of the policies precede the scores
+    of the actions.
     """
 
     observation_size: Annotated[int, Field(ge=1, le=4096)]  # F, length of an observation

@@ -77,12 +77,12 @@ class Policy:
 
     @property
     def steps(self) -> int:
-        """Number of learners' decisions in training before the policy was saved."""
+        """Number of decisions that the learners made in training before the policy was saved."""
         return self.manifest.steps
 
     @property
     def drivers(self) -> dict[str, Policy]:
-        """Name of each vehicle that the policy learned to control -> this policy: ``{"vehicle_2": policy}``."""
+        """This policy, by the name of each vehicle that it learned to control: ``{"vehicle_2": policy}``."""
         return dict.fromkeys(self.manifest.learners, self)
 
     @classmethod
