@@ -82,7 +82,7 @@ class Policy:
 
     @property
     def drivers(self) -> dict[str, Policy]:
-        """This policy, by the name of each vehicle that it learned to control: ``{"vehicle_2": policy}``."""
+        """The policy itself, by the name of each vehicle that it learned to control: ``{"vehicle_2": policy}``."""
         return dict.fromkeys(self.manifest.learners, self)
 
     @classmethod
