@@ -65,7 +65,7 @@ def plain_text(text: str, keep: str = "") -> str:
 def one_line(text: str) -> str:
     """Return ``text`` as one line of ``plain_text``; text longer than ``LINE_LIMIT`` is shortened in the middle.
 
-    The beginning of a message says what is wrong and where, and its end says what would be right. Both are kept.
+    The beginning of a message (what is wrong, and where) and its end (what would be right) are kept.
     """
     blanks = text if len(text) <= 2 * LINE_LIMIT else text[:LINE_LIMIT] + text[-LINE_LIMIT:]
     line = plain_text(blanks)
@@ -86,7 +86,7 @@ def describe_error(error: BaseException, path: str | None = None) -> str:
     """Describe an exception from the user's code in a few words, with the number of the line of code that raised it.
 
     ``path``: the user's file; the last line of this file in the traceback is reported. If ``path`` is None, the
-    innermost line of the traceback is reported. An error of this package is described by its message alone.
+    innermost line of the traceback is reported. For an error of this package, the description is only its message.
     """
     text = str(error) if isinstance(error, EthBrakeError) else f"{type(error).__name__}: {error}"
     frames = traceback.extract_tb(error.__traceback__)
@@ -129,7 +129,7 @@ class UnknownName(InvalidInput):
 
 
 class AlreadyExists(EthBrakeError, FileExistsError):
-    """A file or a registered name exists already. ``force`` (``--force``) allows overwriting a file."""
+    """A file or a registered name exists already. With ``force`` (``--force``) an existing file is overwritten."""
 
 
 class CorruptBundle(EthBrakeError, ValueError):
@@ -161,7 +161,7 @@ class MissingExtra(EthBrakeError, ImportError):
 def naming_extras() -> Iterator[None]:
     """Context manager: raise ``MissingExtra`` if an import in the block fails because an optional extra is missing.
 
-    All other import errors pass unchanged.
+    Any other import error is raised unchanged.
     """
     try:
         yield
@@ -184,7 +184,7 @@ def _missing(package: str) -> MissingExtra:
 
 
 class PhysicsError(EthBrakeError, ArithmeticError):
-    """Some worlds of a batch could not be advanced. The cause is a defect of the physics kernel, never of the input.
+    """Some worlds of a batch could not be simulated. The cause is a defect of the physics kernel, never of the input.
 
     The failure does not affect the other worlds of the batch, so a caller may compute the batch again without the
     failed worlds (``physics.left_out.leaving_out_failed``).
@@ -235,7 +235,7 @@ class AgentFailed(InvalidInput):
     def naming(name: str, others: Collection[str] = ()) -> Iterator[None]:
         """Context manager: change the agent's name in an ``AgentFailed`` error to ``name``, which the user knows.
 
-        ``others``: names of the agents of the other vehicles; an error of one of these agents passes unchanged.
+        ``others``: names of the agents of the other vehicles; an error of one of these agents keeps the agent's name.
         """
         try:
             yield
@@ -253,7 +253,8 @@ class Unfamiliar(UserWarning):
 def renumbered(rows: Sequence[int] | NDArray[np.int64]) -> Iterator[None]:
     """Context manager: change the row numbers in a ``PhysicsError`` or ``AgentFailed`` that is raised in the block.
 
-    Use this for a block that works on a part of a batch: world k of the part is row ``rows[k]`` of the whole batch.
+    Use this context manager for a block that works on a part of a batch: world k of the part is row ``rows[k]`` of the
+    whole batch.
     """
     try:
         yield
@@ -268,21 +269,21 @@ class UncertifiedStep(EthBrakeError):
 def new_name(name: object, known: Collection[str]) -> str | None:
     """Return the new name if ``name`` was renamed and the new name is in ``known``; otherwise None.
 
-    Words between colons are renamed one by one.
+    If ``name`` contains colons, each word between them is looked up separately.
     """
     new = ":".join(RENAMED.get(word, word) for word in name.split(":")) if isinstance(name, str) else None
     return new if new != name and new in known else None
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
-    """Return the error for an unknown name, which shows its new name, a similar name, or all known names.
+    """Return the error for an unknown name; its message shows the new name, a similar name, or all known names.
 
     Args:
-        kind: kind of thing that should have the name, for example ``scenario``.
+        kind: what the name should be a name of, for example ``scenario``.
         name: the unknown name.
         known: the known names.
-        may_be_own: true if users can register names of this kind. The message then says that the user's own name must
-            be registered or installed first.
+        may_be_own: true if users can register names of this kind. The message then says that a name of the user's own
+            must first be registered or installed.
 
     """
     names = sorted(known)
@@ -297,7 +298,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
 def refuse_shipped_path(path: str, agent: str = "") -> None:
     """Raise ``UnknownName`` if ``path`` is ``shipped`` or ``shipped/NAME``, the former way to name a shipped policy.
 
-    ``agent``: the name before the ``@``, in ``agent@path``; "" for a path alone.
+    ``agent``: the name before the ``@``, in ``agent@path``; empty if there is no ``@``.
     """
     folder, _, name = path.partition("/")
     if folder == "shipped":
@@ -308,7 +309,7 @@ def refuse_shipped_path(path: str, agent: str = "") -> None:
 def check_whole_number(what: str, value: object, least: int, most: int | None = None) -> None:
     """Raise ``InvalidInput`` unless ``value`` is a whole number from ``least`` to ``most`` (None: no upper limit).
 
-    ``what``: name of the value, with which the message begins.
+    ``what``: name of the value; the error message begins with this name.
     """
     whole = isinstance(value, Integral) and not isinstance(value, bool)
     if not (whole and least <= value and (most is None or value <= most)):  # type: ignore[operator]  # whole

@@ -1,4 +1,4 @@
-"""Find the folder of the cached compiled kernels, and call functions before the first compilation, without numba."""
+"""Find the cache folder of compiled kernels, and call functions before the first compilation; imports no numba."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _tellers: list[Callable[[Path, bool], None]] = []
 
 @cache
 def cache_folder() -> Path:
-    """Return the folder of the compiled kernels: the user's cache, or a temporary folder if that is not writable."""
+    """Return the folder of the compiled kernels: the user's cache, or a temporary folder if the cache is read-only."""
     try:
         home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         folder = Path(home) / "ethbrake_marl"
@@ -38,7 +38,7 @@ def on_first_compilation(tell: Callable[[Path, bool], None]) -> None:
     """Call ``tell(folder, was_empty)`` once, just before this process compiles its first kernel.
 
     ``folder`` is the cache folder. ``was_empty`` is true if this process has not loaded any kernel from the cache yet.
-    Loading a cached kernel does not count as compiling.
+    ``tell`` is not called when a cached kernel is loaded.
     """
     _tellers.append(tell)
 

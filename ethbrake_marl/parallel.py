@@ -45,14 +45,15 @@ def run_each(calls: Iterable[Call], jobs: int | None = None, ray: str | None = N
 
     Args:
         calls: tuples (function, argument, ...) with module-level functions. If ``calls`` is a generator, each tuple is
-            requested shortly before its call starts.
-        jobs: number of calls that run at once. None means 1 without Ray, and the number of cores with Ray. A single
-            call at a time without Ray runs in this process.
-        ray: ``local`` to start Ray on this machine, or the address of a Ray cluster. None: run in processes of joblib,
-            without Ray.
+            taken from it shortly before the call starts.
+        jobs: number of calls that run at once. If ``jobs`` is None, the number is 1 without Ray, and the number of
+            cores with Ray. With one call at a time and without Ray, the calls run in this process.
+        ray: ``local`` to start Ray on this machine, or the address of a Ray cluster. If ``ray`` is None, the calls run
+            in processes of joblib.
 
-    Raises the error of a call that fails; ``WorkerLost`` if a worker process is killed (Ray repeats the call instead);
-    ``MissingExtra`` if joblib or Ray is not installed; ``InvalidInput`` if no cluster answers at the address.
+    Raises the error that a call raised, or ``WorkerLost`` if a worker process of joblib is killed (Ray repeats the call
+    instead). Raises ``MissingExtra`` if joblib or Ray is not installed, and ``InvalidInput`` if no cluster answers at
+    the address ``ray``.
 
     """
     if ray is None and jobs in (None, 1):
@@ -108,7 +109,7 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _sigterm_as_ctrl_c() -> Iterator[None]:
-    """Handle SIGTERM like Ctrl-C in the block, so joblib cleans up; does nothing if SIGTERM already has a handler."""
+    """Context manager: handle SIGTERM like Ctrl-C, so that joblib cleans up, unless SIGTERM already has a handler."""
     before = signal.getsignal(signal.SIGTERM)
     if threading.current_thread() is not threading.main_thread() or before is not signal.SIG_DFL:
         yield
@@ -140,9 +141,9 @@ def own_signals() -> Iterator[None]:
 
 @contextmanager
 def _backend(ray: str | None, jobs: int | None) -> Iterator[tuple[dict[str, Any], int]]:
-    """Context manager: start joblib's backend; yield its settings and the number of calls that run at once.
+    """Context manager: start joblib's backend; yield the backend's settings and the number of calls that run at once.
 
-    The arguments have the same meaning as in ``run_each``.
+    ``ray`` and ``jobs`` have the same meaning as in ``run_each``.
     """
     if ray is None:
         yield {"backend": "loky", "inner_max_num_threads": 1}, jobs or 1

@@ -12,7 +12,8 @@ from typing import Literal
 class Progress:
     """Progress of a long computation: ``done`` of ``total`` units of work are done; ``name`` says what is computed.
 
-    In training, a unit is one decision of a learner, and ``total`` is rounded up to a whole number of policy updates.
+    In training, a unit of work is one decision of a learner, and ``total`` is rounded up to a whole number of policy
+    updates.
 
     >>> import ethbrake_marl as eb
     >>> eb.Progress("full_brake", 500, 1000)
@@ -55,8 +56,8 @@ Told = OnProgress | Literal["show"] | None
 class ShownProgress:
     """Prints progress on stderr.
 
-    On a terminal, one line of text is rewritten. Otherwise a new line is printed for each tenth of the work and for
-    each evaluation.
+    On a terminal, one line of text is updated in place. If stderr is not a terminal, a new line is printed for each
+    tenth of the work and for each evaluation.
     """
 
     def __init__(self) -> None:

@@ -1,12 +1,13 @@
 """Registries of agents, shields, measures, features, objectives, algorithms and commands, by name.
 
-Each registry contains the parts of one kind. A running program adds a part with a ``register_...`` function. An
-installed package adds a part with an entry point in its ``pyproject.toml``, as this package does for its extensions:
+Each registry contains the objects, called *parts*, of one kind, for example all agents. A running program adds a part
+with a ``register_...`` function. An installed package adds a part with an entry point in its ``pyproject.toml``, as
+this package does for its extensions:
 
     [project.entry-points."ethbrake_marl.agents"]
     gentle = "my_package.agents:make_gentle"
 
-The entry point is loaded, and its value is passed to the ``register_...`` function, when the name is first used. A part
+When the name is first used, the entry point is loaded and its value is passed to the ``register_...`` function. A part
 that is installed but not used is never imported, so it cannot break anything.
 """
 
@@ -37,9 +38,9 @@ T = TypeVar("T")
 class Part:
     """Value of an entry point: the arguments of a ``register_...`` function, except the name.
 
-    The part is registered under the name of the entry point. For example, an entry point in the group
-    ``ethbrake_marl.measures`` with the value ``part`` below has the same effect as
-    ``register_measure(name, closing, unit="m/s")``.
+    The function registers the value under the name of the entry point. For example, an entry point in the group
+    ``ethbrake_marl.measures`` with the value ``part`` below has the same effect as ``register_measure(name, closing,
+    unit="m/s")``.
 
     >>> import ethbrake_marl as eb
     >>> def closing(episodes):
@@ -55,7 +56,7 @@ class Part:
 def points(group: str) -> dict[str, list[EntryPoint]]:
     """Return the entry points of a group by name; several packages may define an entry point with the same name.
 
-    The names from this package precede the names from other packages.
+    In the result, names defined by this package come before names defined by other packages.
 
     ``group``: name of the group without the prefix ``ethbrake_marl.``, for example ``agents``.
     """
@@ -67,24 +68,24 @@ def points(group: str) -> dict[str, list[EntryPoint]]:
 
 
 def giver(point: EntryPoint) -> str:
-    """Return the name of the distribution that defines an entry point; ``?`` if it is unknown."""
+    """Return the name of the installed package that defines an entry point; ``?`` if the package is unknown."""
     return "?" if point.dist is None else point.dist.name
 
 
 def versions_used() -> dict[str, str]:
-    """Return a dictionary name -> version of the other packages that have added parts, such as agents, to this process.
+    """Return a dictionary name -> version of the other packages that have added, for example, agents to this process.
 
-    A package is included only if one of its entry points has been loaded.
+    The dictionary contains a package only if one of the package's entry points has been loaded.
     """
     return dict(sorted(_VERSIONS.items()))
 
 
 class Registry(Mapping[str, T]):
-    """Mapping name -> part for all parts of one kind. A part is loaded when its name is first looked up.
+    """Mapping name -> part for all parts (such as agents) of one kind. A part is loaded when first looked up.
 
-    Testing for a name and iterating over the names do not load any part. Looking up a name raises ``UnknownName`` if no
-    part has this name, ``InvalidInput`` if its part cannot be loaded or two distributions define it, and
-    ``MissingExtra`` if a package of an extra is missing.
+    Testing whether a name exists, and iterating over the names, load no part. Looking up a name raises ``UnknownName``
+    if no part has this name. It raises ``InvalidInput`` if the part cannot be loaded or two installed packages define
+    it, and ``MissingExtra`` if a package of an extra is missing.
 
     Args:
         kind: what the parts are called in messages, for example ``agent``.
@@ -123,10 +124,10 @@ class Registry(Mapping[str, T]):
         return self.loaded[name]
 
     def load(self, name: str) -> list[str]:
-        """Load the part called ``name`` if it is not loaded yet, and return the names of all parts that it defines.
+        """Load the part (such as an agent) called ``name`` if needed; return the names of all parts that it defines.
 
-        An entry point usually defines one part; a dictionary as its value defines several parts. Raises
-        ``UnknownName`` if no part has this name, and ``InvalidInput`` or ``MissingExtra`` if the part cannot be loaded.
+        An entry point defines several parts if its value is a dictionary, otherwise one part. Raises ``UnknownName`` if
+        no part has this name, and ``InvalidInput`` or ``MissingExtra`` if the part cannot be loaded.
         """
         candidates = points(self.group).get(name, [])
         givers = [OURS] * (name in self._built_in) + [giver(point) for point in candidates]
@@ -167,10 +168,10 @@ class Registry(Mapping[str, T]):
         return list(parts)
 
     def add(self, name: str, part: T, is_same: Callable[[T], bool]) -> None:
-        """Add ``part`` under ``name``; raise ``AlreadyExists`` if the name belongs to another part.
+        """Add ``part`` (such as an agent) under ``name``; raise ``AlreadyExists`` if another part has the name.
 
-        ``is_same`` returns whether the part that has the name already equals the new part; an equal part is not added
-        again.
+        ``is_same`` is called with the part that is registered under ``name``, and returns whether it equals ``part``;
+        an equal part is not added again.
         """
         if name not in self.loaded and name in self and name not in self._loading:
             self.load(name)
@@ -182,11 +183,11 @@ class Registry(Mapping[str, T]):
             )
 
     def usable(self) -> dict[str, T]:
-        """Load all parts and return those that could be loaded, by name."""
+        """Load all parts (such as agents) and return those that could be loaded, by name."""
         return {name: self.loaded[name] for name in self if self.why_not(name) is None and name in self.loaded}
 
     def why_not(self, name: str) -> str | None:
-        """Load the part called ``name``; return the error message if that fails, otherwise None."""
+        """Load the part (such as an agent) called ``name``; return the error message if this fails, otherwise None."""
         try:
             self.load(name)
         except (InvalidInput, MissingExtra) as error:
@@ -194,7 +195,7 @@ class Registry(Mapping[str, T]):
         return None
 
     def unknown(self, name: object, known: Iterable[str] | None = None) -> UnknownName:
-        """Return the error for a ``name`` that no part has.
+        """Return the error for a ``name`` that is not in this registry.
 
         ``known``: names to suggest or list; None: all names of this registry.
         """

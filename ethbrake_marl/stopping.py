@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM set a flag that is checked between two steps; they do not raise an exception within a step."""
+"""Ctrl-C and SIGTERM set a flag that a long computation checks between two steps, and raise no exception."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def stop_on_signal() -> Iterator[Callable[[], bool]]:
     """Context manager: yield a function that returns whether Ctrl-C was pressed or SIGTERM was received in the block.
 
     A second Ctrl-C or SIGTERM has its usual effect. Outside the main thread, where Python delivers no signals, the
-    function always returns False.
+    yielded function always returns False.
     """
     asked = threading.Event()
     if threading.current_thread() is not threading.main_thread():

@@ -72,8 +72,8 @@ def main() -> None:
 def run_command(arguments: Sequence[str]) -> int:
     """Run a command line (the arguments after ``ethbrake``) and return its exit status.
 
-    The status is 0 for success. The status is 2 for invalid input, wrong usage or a file error; the reason is then
-    printed in one line on stderr. The status is 1 if the reader of the output has closed the pipe. Other errors are
+    The exit status is 0 for success. It is 2 for invalid input, wrong usage or a file error; the reason is then printed
+    in one line on stderr. The exit status is 1 if the reader of the output has closed the pipe. Other errors are
     defects of the program and are raised.
     """
     asked = _shell_asks(os.environ)
@@ -111,8 +111,8 @@ def run_command(arguments: Sequence[str]) -> int:
 def _shell_asks(environment: Mapping[str, str]) -> bool:
     """Return whether a shell runs this command to complete a command line (see ``--show-completion``).
 
-    ``environment``: environment variables. The variable that requests a completion is ignored if other variables of the
-    completion script are missing, so a command never fails because of it.
+    ``environment``: environment variables. A variable that requests a completion is ignored if the other variables of
+    the completion script are missing, so a command never fails because a stray variable is set.
     """
     if environment.get("_ETHBRAKE_COMPLETE") == "complete_bash":
         return "COMP_WORDS" in environment and environment.get("COMP_CWORD", "").isdecimal()
@@ -131,7 +131,7 @@ def prepare_streams() -> None:
 
     A character that the encoding of stdout does not have (m², lines of boxes) is printed as ``?`` instead of raising an
     error. Output that bypasses Python's stdout, such as that of a library or child process, goes to stderr. Warnings of
-    this package are printed in one line. The first compilation of kernels is announced.
+    this package are printed in one line. A message is printed before the first compilation of kernels.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
@@ -154,7 +154,7 @@ def prepare_streams() -> None:
 def tell_compilation(folder: Path, empty: bool) -> None:
     """Announce that kernels are being compiled, and print every ten seconds how many are done.
 
-    A thread prints these reports, because compiling a single kernel may take a minute.
+    A background thread prints these lines, because compiling a single kernel may take a minute.
 
     Args:
         folder: folder in which compiled kernels are stored; a temporary folder is deleted at the end.
@@ -250,13 +250,14 @@ class Installed(TyperCommand):
         return with_installed(command, self.entry)
 
     def make_context(self, *arguments: Any, **settings: Any) -> Any:
-        """Return the context in which the imported command runs. The arguments are those of Typer's method."""
+        """Return the context in which the imported command runs. The arguments are the same as in Typer's method."""
         return self.command().make_context(*arguments, **settings)
 
     def get_short_help_str(self, limit: int = 45) -> str:
-        """Return the description of the command in the list of commands, of at most ``limit`` characters.
+        """Return the short description for the list of commands, of at most ``limit`` characters.
 
-        A command of another package is described by the name of the package, so that the package need not be imported.
+        For a command of another package the description is the name of the package, so that the package need not be
+        imported.
         """
         return str(self.command().get_short_help_str(limit) if self.is_ours else super().get_short_help_str(limit))
 
@@ -265,7 +266,7 @@ def with_installed(group: Any, name: str) -> Any:
     """Add the commands of the entry points ``NAME.COMMAND`` to the command group ``name``; return the group.
 
     Args:
-        group: the command group, a Typer (click) command with subcommands; it is changed.
+        group: the command group, a Typer (click) command with subcommands; the function adds commands to it.
         name: name of the group.
 
     """
@@ -279,8 +280,8 @@ def with_installed(group: Any, name: str) -> Any:
 def whole_command() -> Any:
     """Return the program ``ethbrake`` as a Typer (click) group of commands.
 
-    The group has the commands of the core, of extensions and installed packages, and of ``add_command``. Raises
-    ``AlreadyExists`` if two commands have the same name.
+    The group contains the commands of the core, of extensions, of installed packages, and those that ``add_command``
+    added. Raises ``AlreadyExists`` if two commands have the same name.
     """
     added = [name for name in COMMANDS if name not in _OURS and "." not in name]
     names = [*_names(), *added]

@@ -63,7 +63,7 @@ def schema_option(module: str, model: str, kind: str) -> Any:
     """Return the type of a Typer option ``--schema``, which prints the JSON Schema of a kind of file and exits.
 
     Args:
-        module: name of the module with the model; it is imported only when the option is used.
+        module: name of the module that defines ``model``; it is imported only when the option is used.
         model: name of the model's class, which has a method ``json_schema``.
         kind: kind of file, for the help text, such as ``recipe``.
 
@@ -91,12 +91,12 @@ def say(text: str) -> None:
 class Out:
     """Output of a command of ``ethbrake``, used as ``with Out() as out``.
 
-    Inside the block only results go to stdout. All other output, for instance of a user's agent, goes to stderr. Ctrl-C
-    ends the command with a message of one line and status 130.
+    Inside the ``with`` block only results go to stdout. All other output, for instance of a user's agent, goes to
+    stderr. Ctrl-C ends the command with a message of one line and exit status 130.
 
     Args:
-        as_json: whether to print results as JSON.
-        force: whether to replace existing files.
+        as_json: True: print results as JSON instead of texts and tables.
+        force: True: replace existing files.
         remains: text about the files that remain after Ctrl-C, for the end of the message.
 
     """
@@ -120,7 +120,7 @@ class Out:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop redirecting stdout; after Ctrl-C, print a message and end the command with status 130.
+        """Stop redirecting stdout; after Ctrl-C, print a message and end the command with exit status 130.
 
         The arguments describe the exception that ended the block, as for every context manager.
         """
@@ -133,8 +133,8 @@ class Out:
         """Print the result of the command on stdout.
 
         Args:
-            content: plain data, printed if JSON is requested.
-            shown: texts and tables, printed otherwise.
+            content: result as plain data (dictionaries, lists, texts, numbers), printed if JSON is requested.
+            shown: texts and tables, printed if JSON is not requested.
             end: characters printed after each text.
 
         """
@@ -166,12 +166,12 @@ class Out:
         say(text)
 
     def check(self, path: Path | None, *endings: str, what: str = "the file") -> None:
-        """Raise ``InvalidInput`` or ``AlreadyExists`` if a file cannot be written. Commands call this before any work.
+        """Raise ``InvalidInput`` or ``AlreadyExists`` if a file cannot be written. Commands call this method first.
 
         Args:
             path: path of the file; None: no file was requested, and nothing is checked.
-            endings: allowed endings of the name, such as ``.csv``; without endings, all are allowed.
-            what: name of the file's content, for the error message.
+            endings: allowed endings of the file's name, such as ``.csv``; if none is given, every ending is allowed.
+            what: words in the error message for the content of the file.
 
         """
         if path is None:
@@ -199,14 +199,15 @@ class Out:
         raise typer.Exit(130)  # 128 + SIGINT, as shells expect
 
     def progress(self, name: str, done: int, total: int, harm: str = "", note: str = "") -> None:
-        """Show the progress of a task of the command: ``done`` of ``total`` units.
+        """Show the progress of a task of the command: ``done`` of ``total`` units of work are done.
 
-        A terminal shows one progress bar per task. Otherwise a line is printed at the beginning and every ten seconds.
+        A terminal shows one progress bar per task. If stderr is not a terminal, a line is printed at the beginning and
+        every ten seconds.
 
         Args:
             name: name of the task; a task ``TASK: STAGE`` has the same bar as ``TASK``.
-            done: number of units that are done.
-            total: number of all units.
+            done: number of units of work that are done.
+            total: number of all units of work.
             harm: latest harm, shown after the name of the task.
             note: message to print once, above the bars.
 
@@ -241,7 +242,7 @@ class Out:
         self.progress(progress.name, progress.done, progress.total, progress.harm, progress.note)
 
     def end_progress(self) -> None:
-        """Stop updating the progress bars. They stay on the screen, and later output is printed below them."""
+        """Stop updating the progress bars. The bars stay on the screen, and later output is printed below them."""
         if self._bars is not None:
             self._bars.stop()
             self._bars, self._tasks = None, {}

@@ -96,7 +96,7 @@ def diagnose(*, compile_all: bool = False) -> list[Check]:
 
 
 def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
-    """Return the check ``name`` with the result (ok, detail) of ``look()``; if it raises an error, the check failed."""
+    """Return the check ``name`` with the result (ok, detail) of ``look()``; an error in ``look`` is a failed check."""
     try:
         return Check(name, *look())
     except Exception as error:
@@ -129,7 +129,8 @@ def _dependencies() -> Iterator[Check]:
 def _requirements() -> list[tuple[str, Requirement]]:
     """Return the dependencies of the package as pairs (extra, requirement); the extra is "" for a core dependency.
 
-    They are read from ``pyproject.toml`` in a checkout, otherwise from the metadata of the installed package.
+    The dependencies are read from ``pyproject.toml`` in a source checkout, or else from the metadata of the installed
+    package.
     """
     from packaging.requirements import Requirement
 
@@ -172,7 +173,8 @@ def _scenarios() -> tuple[bool, str]:
 def _golden_impact() -> tuple[bool, str]:
     """Check the physics: a car at 10 m/s brakes with 5 m/s2, 8 m behind a standing car.
 
-    The exact harm is ``10^2 - 2 * 5 * 8 = 20`` m2/s2. Returns whether the computed harm is correct, and a text.
+    The exact harm, the square of the impact speed, is ``10^2 - 2 * 5 * 8 = 20`` m2/s2. Returns whether the computed
+    harm equals this value, and a text with both.
     """
     import numpy as np
 
@@ -193,7 +195,7 @@ def _golden_baseline() -> tuple[bool, str]:
     """Check the baseline E-V2X-BM in the paper's distance scenario with gaps of 7 m and 7 m.
 
     The known result is a deceleration of 5.17021 m/s2 and a harm of 4.03447 m2/s2. Returns whether the computed result
-    is the same, and a text.
+    is the same, and a text with both results.
     """
     import numpy as np
 

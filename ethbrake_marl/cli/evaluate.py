@@ -45,7 +45,7 @@ _POLICIES = {"same": "the same", "other": "another", "none": ""}
 
 
 def read_task(scenario: str, settings: Sequence[str] | None) -> Task:
-    """Load a scenario, change its settings, and return the task of controlling its learners.
+    """Load a scenario, apply ``settings`` to it, and return the task of controlling its learners.
 
     Args:
         scenario: name of a scenario, or path of its file.
@@ -69,8 +69,9 @@ def make_drivers(agents: str | Sequence[str], task: Task, *, bare: bool = False)
 
     Args:
         agents: names of agents, as a list or as a text with commas.
-        task: the scenario, and the count of harm that the agents minimise.
-        bare: whether to raise ``InvalidInput`` for an agent with a shield, because the command adds shields itself.
+        task: the scenario with its controlled vehicles, and the count of harm that the agents minimise.
+        bare: True: raise ``InvalidInput`` for an agent with a shield, because the calling command adds the shields
+            itself.
 
     """
     return evaluation.make_lineup(agents, task.scenario, harm_count=task.harm_count, bare=bare)
@@ -104,8 +105,8 @@ def evaluate_command(
 ) -> None:
     """Compare agents on the same fixed list of worlds.
 
-    `ethbrake agent list` shows all agents; the name ladder means all agents from coast to best_harm in this list. A
-    name can be followed by +search and by one shield, +episode or +step; for instance full_brake+step or
+    `ethbrake agent list` shows all agents; the name ladder is short for all agents from coast to best_harm in this
+    list. A name can be followed by +search and by one shield, +episode or +step; for instance full_brake+step or
     ppo@PATH+search+episode, where PATH is a run or a policy bundle. The shield +robust needs an uncertainty, which can
     be set only in Python; +robust:estimated does not need one. With --set harm_count=total, agents minimise total harm
     instead of first-impact harm. --set measures=injury,my_file.py:worst adds these measures to the results.
@@ -166,10 +167,10 @@ def _evaluate_long_list(
     """Evaluate the agents on an evaluation list that is too long for the memory; return the results table.
 
     Args:
-        out: output of the command.
-        lineup: the agents and the scenario.
-        episodes: number of worlds in the list.
-        seed: seed of the list.
+        out: object that prints the output of the command.
+        lineup: the agents to evaluate, and the scenario.
+        episodes: number of worlds in the evaluation list.
+        seed: seed of the evaluation list.
         jobs: number of parallel processes; None: one process.
         ray: address of a Ray cluster, or ``local``; None: without Ray.
 
@@ -195,7 +196,7 @@ def _evaluate_group(
     The table shows the collision rate, the hardest impact, and mean harm.
 
     Args:
-        out: output of the command.
+        out: object that prints the output of the command.
         output: folder for the results as JSON; None: do not write them.
         group: the scenarios, each with its controlled vehicles.
         agents: names of agents, with commas between them.
@@ -251,7 +252,8 @@ def _evaluate_group(
 def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, report: bool) -> None:
     """Raise an error, before any work, if the folder ``output`` is not writable or contains results already.
 
-    ``per_world`` (``csv``, ``parquet`` or None) and ``report`` say which files are requested; they need a folder.
+    ``per_world`` (``csv``, ``parquet`` or None) and ``report`` say which files the user requested besides
+    ``results.json``; these files need a folder ``output``.
     """
     if output is None:
         for option in (name for name, value in (("--per-world", per_world), ("--report", report)) if value):
@@ -278,9 +280,9 @@ def _write_worlds(out: Out, output: Path | None, result: evaluation.Evaluation, 
 
 
 def _write_results(out: Out, output: Path | None, results: object, *beside: str) -> None:
-    """Write ``results.json`` into the folder ``output``, and delete files of earlier results except ``beside``.
+    """Write ``results.json`` into the folder ``output``, and delete earlier result files not named in ``beside``.
 
-    If ``output`` is None, write nothing.
+    If ``output`` is None, do nothing.
     """
     if output is None:
         return
@@ -299,8 +301,8 @@ def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: f
     """Print in how many worlds some vehicle still moves at the horizon, if there are such worlds.
 
     Args:
-        out: output of the command.
-        moving: number of worlds in which some vehicle still moves, by name of each agent with a shield.
+        out: object that prints the output of the command.
+        moving: number of worlds in which some vehicle still moves at the horizon, by name of each agent with a shield.
         worlds: number of all worlds.
         horizon_s: time of the horizon (s).
 
@@ -314,7 +316,7 @@ def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: f
 
 
 def _moving(rows: Sequence[evaluation.SummaryRow]) -> dict[str, int]:
-    """Return in how many worlds some vehicle still moves at the horizon, by name of each agent behind a shield.
+    """Return the number of worlds in which some vehicle still moves at the horizon, for each agent with a shield.
 
     ``rows``: rows of the results table, one per agent.
     """
@@ -327,9 +329,9 @@ _FILE = typer.Argument(metavar="RESULTS.json", help="File results.json of evalua
 def compare_command(first: Annotated[Path, _FILE], second: Annotated[Path, _FILE], as_json: JsonOption = False) -> None:
     """Show how harm differs between two results.
 
-    Shows the second result minus the first, for agents of the same name. Both results must come from the same command
-    and the same worlds of the same scenario. Confidence intervals are paired by world if both folders have the files of
-    --per-world.
+    Shows the harm in the second result minus the harm in the first, for each agent that both results contain. Both
+    results must come from the same command and the same worlds of the same scenario. Confidence intervals are paired by
+    world if both folders contain the file that --per-world writes.
     """
     with Out(as_json=as_json) as out:
         comparison = evaluation.compare_results(evaluation.read_result(first), evaluation.read_result(second))
@@ -361,13 +363,13 @@ def shield_command(
     settings: SettingsOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare agents without and behind the shield.
+    """Compare agents without and with the shield.
 
-    Each agent is run in the same worlds without a shield, in episode mode and in step mode. A team of several learners
-    is run without a shield, in step mode, and in step mode with caps. Name the agents without a shield: full_brake, not
-    full_brake+step. The shield bounds first-impact harm, or total harm with --set harm_count=total. For each decision
-    that step mode replaced, the table shows whether the replacement was needed (harm would have been higher without
-    it), harmless (equal) or costly (lower).
+    Each agent runs in the same worlds without a shield, with the shield in episode mode, and with the shield in step
+    mode. A team of several learners runs without a shield, with the shield in step mode, and with that shield plus
+    caps. Name the agents without a shield: full_brake, not full_brake+step. The shield bounds first-impact harm, or
+    total harm with --set harm_count=total. For each action that step mode replaced, the table says what harm the
+    replaced action would have caused: more (the replacement was needed), the same (harmless) or less (costly).
     """
     with Out(as_json=as_json) as out:
         task = read_task(scenario, settings)
@@ -383,7 +385,7 @@ def shield_command(
 
 
 def _measure_modes(out: Out, agents: str, sample: Sample, task: Task) -> evaluation.ShieldModes:
-    """Compare agents without and behind the shield in the worlds of ``sample``, and show the progress on stderr.
+    """Compare agents without and with the shield in the worlds of ``sample``, and show the progress on stderr.
 
     ``agents``: names of agents without a shield, with commas between them.
     """
@@ -396,7 +398,7 @@ def _measure_modes(out: Out, agents: str, sample: Sample, task: Task) -> evaluat
 
 
 def _tell_left_out(out: Out, left_out: LeftOutRows, whole: int) -> None:
-    """Print in one line on stderr which of ``whole`` worlds were left out of the results, if there are any."""
+    """Print on stderr which worlds were left out of the results, if any; ``whole``: number of all worlds."""
     if left_out:
         texts = [f"world {world} of seed {evaluation.LIST_SEED} ({reason})" for world, reason in left_out]
         out.note(evaluation.LeftOut.line(texts, whole))

@@ -10,15 +10,15 @@ from ethbrake_marl.registry import Registry
 
 
 def register_page(shows: str, write: Callable[..., None]) -> None:
-    """Register the function that a command calls to write a page or picture.
+    """Register the function that a command calls to write its page (a report) or its picture.
 
-    An installed package registers it with an entry point of the group ``ethbrake_marl.pages``.
+    An installed package registers such a function with an entry point of the group ``ethbrake_marl.pages``.
 
     Args:
         shows: subject of the page: ``"evaluation"`` (``evaluate --report``) or ``"worlds"`` (``scenario sample``).
         write: function that writes the page. Its arguments are, for ``"evaluation"``, the path of the file, the
             evaluation, the results table and the agents by name; for ``"worlds"``, the path of the file, the scenario
-            and the sample. The calls in ``cli.evaluate`` and ``cli.scenario`` show its keyword arguments.
+            and the sample. The calls in ``cli.evaluate`` and ``cli.scenario`` show the keyword arguments of ``write``.
 
     """
     PAGES.add(shows, write, lambda other: other is write)
@@ -28,7 +28,7 @@ PAGES: Registry[Callable[..., Any]] = Registry("page", "pages", register_page)
 
 
 def page_of(shows: str, option: str) -> Callable[..., None]:
-    """Return the registered function that writes the page with the subject ``shows``.
+    """Return the registered function that writes the page about ``shows``, such as ``"evaluation"``.
 
     Raises ``InvalidInput``, whose message begins with the command's ``option``, if no such function is registered.
     """

@@ -225,8 +225,8 @@ def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
 def _refused(scenario: scenarios.Scenario, sample: scenarios.Sample | None = None) -> str:
     """Return how many draws were rejected for an early impact, as a text ``: 3 of 203 draws (1.5 %)``.
 
-    The text is empty for a scenario without a table. With a table the number of rejections matters, because rejections
-    change how often each row occurs. ``sample``: worlds to count in; None: draw 200 worlds.
+    The text is empty for a scenario without a table. With a table, rejections change how often each row occurs in the
+    worlds. ``sample``: worlds whose rejected draws are counted; None: draw 200 worlds.
     """
     if all(each.table is None for each in scenario.members or (scenario,)):
         return ""
@@ -288,7 +288,8 @@ def scenario_new(
 ) -> None:
     """Write a new scenario file, NAME.yaml, with comments.
 
-    The file has every key. If the scenario has a table, its rows are written to NAME.csv in the same folder.
+    The file contains every key of a scenario. If the scenario has a table, its rows are written to NAME.csv in the same
+    folder.
     """
     with Out(force=force) as out:
         file, rows = output / f"{name}.yaml", output / f"{name}.csv"
@@ -360,8 +361,8 @@ def scenario_sample(
     """Draw worlds, and show them as a table or picture.
 
     The table has a column for each quantity that is not fixed in the scenario; `eb.read_worlds` reads such a table. The
-    picture shows distributions, pairs of quantities, and three worlds. The same scenario, seed and number give the same
-    worlds on every machine.
+    picture shows the distributions of quantities, scatter plots of pairs of quantities, and three worlds. The same
+    scenario, seed and number of worlds give the same worlds on every machine.
     """
     with Out(as_json=as_json, force=force) as out:
         out.check(output, ".csv", ".png", ".svg", ".pdf", what="worlds")

@@ -73,12 +73,11 @@ def run_command(
 ) -> None:
     """Train a policy, shield it, compare it, and write a report.
 
-    Trains a single learner or a team. Writes a run's folder with policies, results as CSV and JSON, results per
-    world, three figures and report.html. If the scenario is one of the three tests (paper-random, paper-random-
-    brake-only, paper-random-obstacle), the policy is also evaluated on the other two. For a team, the report also
-    shows the harm that each vehicle bears, and the effect of each learner and of the messages, for which further
-    policies are trained. Ctrl-C ends the training early and evaluates the policy so far; a second Ctrl-C stops at
-    once.
+    Trains a single learner or a team. Writes a run's folder with policies, results as CSV and JSON, results per world,
+    three figures and report.html. If the scenario is one of the three tests (paper-random, paper-random-brake-only,
+    paper-random-obstacle), the policy is also evaluated on the other two. For a team, the report also shows the harm
+    that each vehicle bears. To show the effect of each learner and of the messages, the command trains further
+    policies. Ctrl-C ends the training early and evaluates the policy trained so far; a second Ctrl-C stops at once.
     """
     with Out(as_json=as_json, force=force, remains=REMAINS) as out:
         # torch takes seconds to load, here and in the other commands that learn
@@ -122,7 +121,7 @@ def run_command(
 
 
 def quickest(*, several: bool = False) -> str:
-    """Return the name of the recipe that `ethbrake run` trains by default. ``several``: for several learners."""
+    """Return the name of the default recipe of `ethbrake run`, for one learner or for ``several`` learners."""
     usable = training.TrainingRecipe.usable()
     return next(name for name in (QUICKEST_TEAM if several else QUICKEST) if name in usable)
 
@@ -160,10 +159,10 @@ def train_command(
 ) -> None:
     """Train a policy, or the policies of several learners.
 
-    Writes a run's folder. At the end it prints the harm of the trained agent and of full braking, the agent's name, and
-    a command that evaluates the agent. Ctrl-C ends the training after the current update and saves the policy.
-    `ethbrake train --resume FOLDER` continues the training; the final policy is then the same, bit for bit, as without
-    the interruption.
+    Writes the folder of the training run. At the end the command prints the harm of the trained agent and of full
+    braking, the agent's name, and a command that evaluates the agent. Ctrl-C ends the training after the current update
+    and saves the policy. `ethbrake train --resume FOLDER` continues the training; the final policy is then the same,
+    bit for bit, as without the interruption.
     """
     with Out(as_json=as_json, force=force, remains=REMAINS) as out:
         if resume is not None:
@@ -206,7 +205,8 @@ def train_command(
 def _show(out: Out, result: training.TrainResult, scenario: str | None = None) -> None:
     """Print the harm of the trained agent and of full braking on stdout, and how the training ended on stderr.
 
-    ``scenario``: name or path of the scenario from the command line; None: the name of the training's scenario.
+    ``scenario``: name or path of the scenario in the command that is printed; None: the name of the scenario of the
+    training run.
     """
     from ethbrake_marl.training.fixed_list import measure_full_braking
     from ethbrake_marl.training.progress import objective_in_words

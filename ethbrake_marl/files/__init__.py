@@ -1,1 +1,1 @@
-"""Strict reading and atomic writing of files. All code that depends on a file format is in this folder."""
+"""Read files strictly; write files completely or not at all. All code for file formats is in this folder."""

@@ -65,8 +65,8 @@ def check_arrays(found: Mapping[str, ArrayHeader], wanted: Sequence[ArrayRow], w
 
     Args:
         found: headers of the arrays in a file, by name.
-        wanted: required names, types and shapes.
-        word: word that error messages use for an array.
+        wanted: required names, types and shapes of the arrays.
+        word: noun that error messages use for an array, such as ``array`` or ``tensor``.
 
     """
     names = {row.name for row in wanted}
@@ -142,7 +142,7 @@ class ArrayArchive:
     def unpack(self, wanted: Sequence[ArrayRow]) -> dict[str, NDArray[Any]]:
         """Return the arrays by name, read-only, after checking their names, types and shapes against ``wanted``.
 
-        Raises the same ``ValueError`` as ``check_arrays``.
+        Raises ``ValueError`` in the same cases as ``check_arrays``.
         """
         check_arrays(self.headers, wanted)
         arrays = {}

@@ -1,6 +1,6 @@
 """Pydantic models of files, and the error message for the first mistake in a file.
 
-The message contains the place of the mistake, the invalid value, and what would be valid.
+The error message contains the place of the mistake, the invalid value, and what would be valid.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ NAME_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,63}$"
 class FileModel(BaseModel):
     """Base class of pydantic models of a file's content; a subclass declares a field for each key.
 
-    Its objects are immutable. Unknown keys and values of the wrong type are errors.
+    Objects of a subclass are immutable. Unknown keys and values of the wrong type are errors.
     """
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
@@ -82,7 +82,7 @@ class Wording:
 
     Args:
         model: pydantic model of the file.
-        needed: text that says what must be written if a required key is missing, the same for all keys.
+        needed: text that says what must be written for a missing key; the same text for every key.
 
     """
 
@@ -106,7 +106,7 @@ class Wording:
         return ""
 
     def owner(self, path: YamlPath) -> str:
-        """Return the vehicle or pair to which the value at ``path`` belongs; empty if the message need not name it.
+        """Return the vehicle or pair to which the value at ``path`` belongs, for the error message; may be empty.
 
         ``path``: keys and indices inside the file.
         """
@@ -115,7 +115,7 @@ class Wording:
     def right(self, detail: ErrorDetails) -> str:
         """Return what would be valid instead of the value in ``detail`` (a mistake, as pydantic reports it).
 
-        An empty text means that the general message is used.
+        If the text is empty, the error message uses a general text instead.
         """
         return ""
 
@@ -129,7 +129,7 @@ def explain(document: Document, error: ValidationError, wording: Wording) -> Inv
     Args:
         document: the parsed file, with the line of each value.
         error: pydantic's error for the content of the file.
-        wording: texts about this kind of file.
+        wording: texts that error messages use for this kind of file.
 
     """
     # A default that depends on an invalid field is not counted as a mistake.
@@ -156,13 +156,13 @@ def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
 def read_model(source: str | Path | Document, model: type[Model], wording: Wording, advice: str) -> Model:
     """Read a YAML file or document into ``model``; raise ``InvalidInput`` for the first mistake.
 
-    The message names file, line, key and value, and says what would be valid.
+    The error message names file, line, key and value, and says what would be valid.
 
     Args:
         source: path of the file, or the parsed document.
         model: pydantic model of the content.
-        wording: texts about this kind of file.
-        advice: end of the sentence "must be a mapping ...", used if the content is not a mapping.
+        wording: texts that error messages use for this kind of file.
+        advice: end of the error message "must be a mapping ...", which is shown if the file does not contain a mapping.
 
     """
     document = source if isinstance(source, Document) else read_yaml(source)
@@ -187,7 +187,7 @@ def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
 
 
 class Mistake(NamedTuple):
-    """The first mistake that pydantic found in data from a program; as text, its place and what would be valid."""
+    """The first mistake that pydantic found in data from a program. ``str`` gives its place and what would be valid."""
 
     place: str  # place of the mistake, keys joined by dots; empty if the data as a whole are invalid
     given: Any  # the invalid value
@@ -198,7 +198,7 @@ class Mistake(NamedTuple):
 
 
 def first_mistake(error: ValidationError) -> Mistake:
-    """Return the first mistake in ``error``, for files that programs write and for settings in code."""
+    """Return the first mistake in pydantic's ``error``, for files that programs write and for settings in code."""
     detail = error.errors(include_url=False)[0]
     right = {"missing": "is missing", "extra_forbidden": "is an unknown key"}.get(detail["type"])
     return Mistake(".".join(str(key) for key in path_of(detail)), detail["input"], right or _right(detail))
@@ -207,7 +207,8 @@ def first_mistake(error: ValidationError) -> Mistake:
 def path_of(detail: ErrorDetails) -> YamlPath:
     """Return the path (keys and indices inside the file) of a mistake that pydantic reports.
 
-    The tags of unions are removed from pydantic's path, and the path given to ``refuse`` is appended.
+    The tags of unions are removed from the path that pydantic reports. If ``refuse`` raised the error, its argument
+    ``at`` is appended.
     """
     keys = tuple(key for key in detail["loc"] if not (isinstance(key, str) and key.startswith("#")))
     return (*keys, *detail.get("ctx", {}).get("at", ()))
@@ -276,7 +277,7 @@ def _right(detail: ErrorDetails) -> str:
 
 
 def suggestion(key: str, known: Iterable[str]) -> str:
-    """Return a hint for an unknown ``key``: "did you mean ...?" or its new name; empty if no known key is similar.
+    """Return a hint for an unknown ``key``: "did you mean ...?" or the key's new name; empty if no key is similar.
 
     ``known``: the valid keys. A key with a wrong or missing unit is also recognised: ``gaps_km``, ``mass``.
     """

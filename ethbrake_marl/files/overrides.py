@@ -21,16 +21,16 @@ class Override:
 
     @property
     def top(self) -> str:
-        """The outermost key: ``reward`` for ``reward.harm=0.5``."""
+        """The first key of the setting's path: ``reward`` for ``reward.harm=0.5``."""
         return self.path[0]
 
     @property
     def key(self) -> str:
-        """The path, with dots between the keys: ``reward.harm`` for ``reward.harm=0.5``."""
+        """The path of the setting, with dots between the keys: ``reward.harm`` for ``reward.harm=0.5``."""
         return ".".join(self.path)
 
     def inside(self) -> Override:
-        """Return the setting without its outermost key: ``harm=0.5`` for ``reward.harm=0.5``."""
+        """Return the setting without the first key of its path: ``harm=0.5`` for ``reward.harm=0.5``."""
         return Override(self.text, self.path[1:], self.value)
 
     @staticmethod
@@ -68,9 +68,10 @@ class Override:
 
 
 def _placed(part: Any, path: tuple[str, ...], override: Override) -> Any:
-    """Return a copy of ``part`` (a mapping, list or other value) with the value of ``override`` at ``path`` inside it.
+    """Return a copy of ``part`` (a mapping, list or other value) in which ``path`` has the value of ``override``.
 
-    ``path``: last keys of ``override.path``; if it is empty, the value replaces ``part``. Missing mappings are created.
+    ``path``: last keys of ``override.path``; if ``path`` is empty, the value replaces ``part``. Mappings that are
+    missing along the path are created.
     """
     if not path:
         return override.value

@@ -1,4 +1,4 @@
-"""Safe reading of untrusted files: only plain files of limited size are read, and JSON is parsed strictly."""
+"""Safe reading of untrusted files: only plain files (no folders, pipes or devices) of limited size; strict JSON."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ def read_plain(
 ) -> bytes:
     """Return the content of a plain file of at most ``limit_bytes``; raise ``refusal`` if it cannot be read.
 
-    The limit also applies to a file that grows while it is read.
+    The limit on the size also applies to a file that grows while it is read.
 
     Args:
         path: path of the file.
         limit_bytes: largest accepted size of the file.
-        refusal: class of the error to raise; its message has path and reason, see ``open_plain``.
+        refusal: class of the error to raise; see ``open_plain``.
         follow_links: whether a symbolic link is accepted.
 
     """
@@ -53,14 +53,15 @@ def open_plain(
 ) -> Iterator[BufferedReader]:
     """Open a plain file of at most ``limit_bytes`` for reading, as a context manager.
 
-    Kind and size of the file are checked before it is opened, so a pipe or device is not opened. They are checked again
-    after opening, in case another process has replaced the file. Opening never waits.
+    Kind and size of the file are checked before it is opened, so a pipe or device is not opened. Kind and size are
+    checked again after opening, in case another process has replaced the file. The function never waits for the file to
+    open.
 
     Args:
         path: path of the file.
         limit_bytes: largest accepted size of the file.
         refusal: class of the error to raise if the file does not exist, is not a plain file, is too large, or cannot be
-            read (also inside the block). The message has path and reason.
+            read (also inside the block). The error message contains the path and the reason.
         follow_links: whether a symbolic link is accepted.
 
     """

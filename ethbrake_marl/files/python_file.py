@@ -1,7 +1,7 @@
 """Run Python files of the user, and record their SHA-256.
 
-A Python file runs only if the user names it on the command line (``--agents my_file.py:make_agent``) or in code. A file
-that a run's folder, a recipe or a scenario names is never run.
+A Python file runs only if the user names it on the command line (``--agents my_file.py:make_agent``) or in code. A
+Python file named only by a run's folder, a recipe or a scenario is never run.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def load_from_file(path: str, name: str, reads: str | None = None) -> Any:
 
     The file runs without restrictions. ``reads`` is the path of a file that the Python file uses, such as weights; its
     SHA-256 is recorded if it exists. Raises ``InvalidInput`` if the Python file is missing, raises an error (the
-    message has the line), has changed since it ran, or does not define ``name``.
+    message gives the line number), has changed since it ran, or does not define ``name``.
     """
     _, module = _run_file(Path(path), f"file {path!r}")
     if not hasattr(module, name):
@@ -50,7 +50,7 @@ def file_sha256(path: Path) -> str:
 def files_run() -> dict[str, str]:
     """Return the SHA-256 of every Python file that this process ran, and of the files that they use, by file name.
 
-    If several files have the same name, their hashes are joined by commas.
+    If several files have the same name, the value is a text with all their hashes, separated by commas.
     """
     files = {name: set(several) for name, several in _READ.items()}
     for path, (sha256, _) in _RUN.items():

@@ -41,7 +41,7 @@ class Estimate:
         Args:
             digits: number of digits after the decimal point.
             scale: factor that multiplies all numbers, for example 100 for per cent.
-            unit: text directly after the value, such as a unit.
+            unit: text to put directly after the value, such as ``" %"``.
 
         """
         return Column("", digits=digits, scale=scale, unit=unit).show(self).in_words
@@ -52,9 +52,9 @@ class Estimate:
 
     @staticmethod
     def side_by_side(estimates: Mapping[str, Estimate | None]) -> dict[str, Any]:
-        """Return estimates by name as flat plain data: ``{"x": 1.5, "x_interval": [1.0, 2.0]}``.
+        """Convert estimates to a dictionary for JSON: ``{"x": 1.5, "x_interval": [1.0, 2.0]}``.
 
-        For an estimate that is None, both values are None.
+        If the estimate ``x`` is None, ``x`` and ``x_interval`` are None.
         """
         cells: dict[str, Any] = {}
         for name, estimate in estimates.items():
@@ -124,8 +124,9 @@ Row = Sequence[Any] | str  # a row of cells, or the name of a section that begin
 class Sheet:
     """A table: title, columns, rows of cells, and a note below.
 
-    A string in ``columns`` is the heading of a column of texts. A string in ``rows`` is the name of a section that
-    begins there. If a row has fewer cells than the table has columns, the missing cells are empty.
+    A string in ``columns`` is the heading of a column of texts. A string in ``rows`` is the name of a section, which
+    consists of the following rows. If a row has fewer cells than the table has columns, the remaining cells are shown
+    empty.
 
     >>> from ethbrake_marl.files.sheet import Column, Estimate, Sheet
     >>> sheet = Sheet("Harm", ["Agent", Column("Total", "total_harm")], [("coast", Estimate(1.5, (1.0, 2.0)))])
@@ -240,7 +241,7 @@ class Sheet:
         """Return the table as HTML for a notebook or a page, with the title above and the note below.
 
         All content is escaped unless it has a method ``__html__``. The first cell of a row is the heading of the row.
-        Intervals are in brackets. Texts in the other columns may wrap.
+        Confidence intervals are shown in brackets. In the other columns, a long text may be broken into several lines.
         """
         columns, label = self._columns(), self.title or f"Table: {self.headings[0]}"
         kinds = [' class="words"' if k and self.rows and column.text else "" for k, column in enumerate(columns)]
@@ -281,7 +282,8 @@ class Sheet:
     def csv(self) -> str:
         """Return the table as CSV text, one line per row.
 
-        The interval of a column ``x`` becomes the columns ``x_low`` and ``x_high``. Missing values are empty.
+        The interval of a column ``x`` becomes the columns ``x_low`` and ``x_high``. Missing values are written as empty
+        cells.
         """
         return csv_text(self.json())
 
@@ -307,7 +309,8 @@ def terminal_text(*shown: RenderableType, whole_rows: bool = False) -> str:
 def csv_text(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
     """Return rows as CSV text with a header line.
 
-    A column ``x_interval`` with pairs becomes two columns ``x_low`` and ``x_high``. None and missing values are empty.
+    A column ``x_interval`` of pairs (low, high) is written as two columns, ``x_low`` and ``x_high``. None and missing
+    values are written as empty cells.
 
     Args:
         rows: rows, each a mapping from column names to values.
@@ -338,13 +341,13 @@ def parquet_file(
 ) -> Iterator[Callable[..., None]]:
     """Context manager: yield a function ``add(columns)`` that appends rows to a new Parquet file.
 
-    ``columns`` maps column names to arrays of equal length; ``add(columns, together=True)`` writes these rows as one
-    row group. The file appears only if the block ends without error. Raises ``MissingExtra`` if pyarrow is not
+    ``columns`` maps column names to arrays of equal length. With ``add(columns, together=True)`` the appended rows form
+    one row group. The file is created only if the block ends without error. Raises ``MissingExtra`` if pyarrow is not
     installed.
 
     Args:
         path: path of the new file.
-        told: function that returns metadata for the file, called at the end of the block; None: no metadata.
+        told: function that is called at the end of the block and returns metadata for the file; None: no metadata.
         **options: options of ``pyarrow.parquet.ParquetWriter``.
 
     """

@@ -55,7 +55,7 @@ def check_writable(folder: Path) -> None:
 
 
 def check_target(path: str | Path, *, force: bool = False) -> Path:
-    """Check that a file can be written to ``path``; return ``path`` as a ``Path``. Call this before a long computation.
+    """Check that a file can be written to ``path``; return ``path`` as a ``Path``. For use before a long computation.
 
     Raises ``AlreadyExists`` if the file exists and ``force`` is False. Raises ``InvalidInput`` if the file cannot be
     written, or if ``path`` is a folder, device, pipe or symbolic link, which ``force`` does not replace.
@@ -116,8 +116,8 @@ def write_output(path: str | Path, data: bytes, *, force: bool = False) -> None:
 def new_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
     """Context manager: yield a temporary folder, which is renamed to ``path`` if the block succeeds, else deleted.
 
-    With ``replace``, an existing folder ``path`` is deleted after the block has succeeded. Otherwise ``AlreadyExists``
-    is raised if ``path`` exists before or after the block.
+    With ``replace``, an existing folder ``path`` is deleted after the block has succeeded. Without ``replace``,
+    ``AlreadyExists`` is raised if ``path`` exists before or after the block.
     """
     if not replace:
         _refuse_existing(path)
@@ -145,7 +145,7 @@ def new_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
 
 
 def remove_folder(path: Path) -> None:
-    """Delete the folder ``path``. It is renamed first, so an interruption does not leave a half-deleted ``path``."""
+    """Delete the folder ``path``. The folder is renamed first, so an interruption leaves no half-deleted ``path``."""
     aside = Path(tempfile.mkdtemp(dir=path.parent, prefix=_HIDDEN, suffix=_UNFINISHED))
     path.rename(aside / path.name)
     shutil.rmtree(aside)
@@ -162,7 +162,7 @@ def remove_unfinished(folder: Path) -> None:
 
 @contextmanager
 def hold_lock(lock: Path, other: str) -> Iterator[None]:
-    """Context manager: hold the lock file ``lock`` while the block runs. The lock also ends if the process ends.
+    """Context manager: hold the lock file ``lock`` while the block runs. The lock is also released if the process ends.
 
     Raises ``InvalidInput`` if another process holds the lock, or if the file cannot be used as a lock. ``other``: error
     message for a lock that another process holds.

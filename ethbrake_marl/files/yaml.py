@@ -116,7 +116,7 @@ class Document:
     def refusing_at(self, path: YamlPath) -> Iterator[None]:
         """Context manager: if the block raises ``InvalidInput``, put file and line number in front of its message.
 
-        ``path``: keys and indices that lead to the value whose line number is used.
+        ``path``: keys and indices that lead to the value; the line number of this value is put in front of the message.
         """
         try:
             yield
@@ -210,7 +210,7 @@ class _Reader:
         _fail(self.file, self.at, reason)
 
     def _value(self, event: Any, path: YamlPath) -> Any:
-        """Return the value at ``path``, which begins with the YAML event ``event``."""
+        """Return the value at ``path`` (keys and indices); its first YAML event is ``event``."""
         self._check_plain(event)
         self.lines.setdefault(path, self.at[0] + 1)
         if isinstance(event, yaml.ScalarEvent):

@@ -18,11 +18,11 @@ class Actor:
     """The deterministic policy: observations [n, F] float32 -> actions [n, A] float32 in [-1, 1].
 
     In a mixture of experts, only the selected expert is computed for each observation. All methods except ``__call__``
-    take transposed arrays, with one observation per column, [F, rows].
+    expect transposed observations, one per column, [F, rows].
     """
 
     def __init__(self, spec: NetworkSpec, tensors: Mapping[str, Float32s], prefix: str = "") -> None:
-        """Take the layers from ``tensors``, which must fit ``spec`` (see ``NetworkSpec.tensors``).
+        """Build the layers from the weights and biases in ``tensors``, which must fit ``spec.tensors``.
 
         ``prefix`` is the beginning of the tensors' names, for example ``among_1.``, if this policy is part of another
         policy.
@@ -54,11 +54,11 @@ class Actor:
         return chosen
 
     def take(self, number: NDArray[np.int64], x: Float32s) -> Float32s:
-        """Return the action for each observation, [1, rows], given the network's choice of a policy or fixed action.
+        """Return the action of the choice ``number`` for each observation, [1, rows].
 
         Args:
-            number: index of the choice for each observation, [rows]. Indices from 0 on choose a policy in
-                ``NetworkSpec.among``; the indices after these policies choose a fixed action.
+            number: index of the choice for each observation, [rows]. The first indices (0, 1, ...) choose a policy in
+                ``NetworkSpec.among``; the indices after them choose a fixed action.
             x: observations, [F, rows].
 
         """
@@ -70,7 +70,7 @@ class Actor:
         return actions
 
     def _block(self, x: Float32s) -> Float32s:
-        """Return the actions [A, rows] for the observations ``x`` [F, rows]."""
+        """Return the actions [A, rows] for the observations ``x`` [F, rows], one column per observation."""
         if len(self._networks) == 1:
             y = self._forward(self._networks[0], x)
             if self.spec.choices is not None:

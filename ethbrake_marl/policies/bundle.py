@@ -87,10 +87,11 @@ def _read(path: Path) -> bytes:
 
 
 def _check_observed(path: Path, manifest: Manifest) -> None:
-    """Check that the features that a policy observes are the same as at its training.
+    """Check that the features that a policy observes are the same as when the policy was trained.
 
-    ``path`` is the manifest file, for messages. Raises ``InvalidInput`` for a registered feature that is missing or has
-    changed, and ``CorruptBundle`` for features of this package that are missing or have another scaling.
+    ``path`` is the path of the manifest file, for error messages. Raises ``InvalidInput`` for a registered feature that
+    is missing or has changed, and ``CorruptBundle`` for features of this package that are missing or whose scaling has
+    changed.
     """
     seen = manifest.observation
     for was in seen.registered:

@@ -24,7 +24,7 @@ _SMALL = 1e-4  # below this, x - x^3 / 3 is tanh(x) to double precision
 def squash(values: NDArray[np.float32]) -> None:
     """Replace every entry of ``values`` [k, rows] by its hyperbolic tangent, in place.
 
-    The error is little more than half a unit in the last place.
+    The rounding error is little more than half a unit in the last place of a float32.
     """
     for j in range(values.shape[0]):
         row = values[j]
@@ -54,9 +54,9 @@ def layers_of(name: str, hidden: int, tensors: Mapping[str, Float32s]) -> Layers
 def dense(weight: Float32s, bias: Float32s, x: Float32s, y: Float32s) -> None:
     """Compute one layer of a network, ``y = weight x + bias``.
 
-    The products are added in groups of four, ``(a + b) + (c + d)``, always in this order, without fused or reordered
-    operations (no fastmath). The rounding error is half as large as the error of a running sum. Each column of ``x`` is
-    computed independently.
+    The products of weights and inputs are added in groups of four, ``(a + b) + (c + d)``, always in this order, without
+    fused or reordered operations (no fastmath). The rounding error is half as large as if one product after another
+    were added. The result for a column of ``x`` does not depend on the other columns.
 
     Args:
         weight: weights of K inputs and O outputs, [O, K].

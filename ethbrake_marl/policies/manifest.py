@@ -25,7 +25,7 @@ _PACKAGES = ("ethbrake-marl", "gymnasium", "numba", "numpy", "safetensors", "sta
 def installed_versions() -> dict[str, str]:
     """Return name -> version of Python, of this package, and of every package on which training results may depend.
 
-    This includes packages whose entry points are used in this process (``registry.versions_used``).
+    The result includes packages whose entry points are used in this process (``registry.versions_used``).
     """
     return {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES} | versions_used()
 
@@ -53,7 +53,7 @@ class FeatureDefinition(_Strict):
 
 
 class ObservationSchema(_Strict):
-    """Description of an observation: number of neighbours, feature names in order, and a hash of the scaling."""
+    """An observation: number of neighbours, feature names in order, and a hash of the features' scaling."""
 
     front: Neighbours  # number of observed neighbours ahead
     rear: Neighbours  # number of observed neighbours behind
@@ -63,7 +63,7 @@ class ObservationSchema(_Strict):
 
     @classmethod
     def of(cls, spec: ObservationSpec) -> Self:
-        """Return a description of the observation ``spec``, which makes later changes of its features detectable."""
+        """Return a description of the observation ``spec``, by which later changes of its features can be detected."""
         names = tuple(f.name for f in spec.features)
         scaling = [[f.name, f.unit, f.scale, f.low, f.high] for f in spec.features]
         return cls(
@@ -87,7 +87,7 @@ class ObservationSchema(_Strict):
 
 
 class Manifest(_Strict):
-    """Description of a policy: everything except the tensors.
+    """Everything that a bundle stores about a policy, except its tensors (weights and biases).
 
     The network determines the format version: 3 for a mixture of experts, 4 for a network that scores actions, 5 for a
     network that also scores policies, and 2 for any other network.

@@ -26,27 +26,29 @@ class TensorRow(NamedTuple):
     shape: tuple[int, ...]  # length of each axis
 
     def inside(self, part: str) -> TensorRow:
-        """Return this row with the tensor name ``part.name``, for a network that is a part of another policy."""
+        """Return this row with ``part.`` in front of the tensor's name, for a network inside another policy."""
         return self._replace(name=f"{part}.{self.name}")
 
 
 class NetworkSpec(FileModel):
     """The networks of a policy: an actor, and optionally a critic, both multilayer perceptrons on the same observation.
 
-    The action is ``output(actor(observation))`` in [-1, 1]. Output ``clip`` clips the actor's result to [-1, 1]; in
-    training (PPO) this result is the mean of a Gaussian with one noise parameter per action. Output ``tanh`` applies
-    tanh to the actor's result; in training (SAC) it is the mean of a Gaussian whose noise comes from a second head of
-    the actor. If ``value_hidden`` is empty, there is no critic; a policy can act without a critic.
+    The key ``output`` says how the actor's result becomes an action in [-1, 1]. Output ``clip`` clips the actor's
+    result to [-1, 1]; in training (PPO) this result is the mean of a Gaussian with one noise parameter per action.
+    Output ``tanh`` applies tanh to the actor's result; in training (SAC) the actor's result is the mean of a Gaussian
+    whose noise comes from a second head of the actor. If ``value_hidden`` is empty, there is no critic; a policy can
+    act without a critic.
 
-    If ``networks`` is above 1, the policy is a mixture of experts. It then has ``networks`` actors of the same shape,
-    and a gating network (hidden layers ``gate_hidden``) that scores the actors at every decision. The actor with the
-    highest score acts; if several actors have this score, the first of them acts. A mixture of experts has no noise and
-    no critic.
+    If ``networks`` is above 1, the policy is a mixture of experts. Such a policy has ``networks`` actors of the same
+    shape, and a gating network (hidden layers ``gate_hidden``) that scores the actors at every decision. The actor with
+    the highest score acts; if several actors have this score, the first of them acts. A mixture of experts has no noise
+    and no critic.
 
-    With output ``choice`` the actor scores ``choices`` actions, evenly spaced from -1 to 1. The policy takes the action
-    with the highest score; if several actions have this score, it takes the lowest of them. Such a policy has no noise
-    and no critic. The actor may also score whole policies (``among``), which get the same observation. In the actor's
-    result, the scores of the policies precede the scores of the actions.
+    With output ``choice`` the actor computes a score for each of ``choices`` actions, which are evenly spaced from -1
+    to 1. The policy takes the action with the highest score; if several actions have this score, it takes the lowest of
+    these actions. A policy with output ``choice`` has no noise and no critic. Its actor may also score whole policies
+    (``among``), which act on the same observation. In the actor's result, the scores of the policies precede the scores
+    of the actions.
     """
 
     observation_size: Annotated[int, Field(ge=1, le=4096)]  # F, length of an observation
@@ -102,7 +104,7 @@ class NetworkSpec(FileModel):
 
     @property
     def format_version(self) -> Literal[2, 3, 4, 5]:
-        """Format version of a manifest with this network."""
+        """Version of the manifest format for a policy with this network."""
         if self.choices is not None:
             return 5 if self.among else 4
         return 2 if self.networks == 1 else 3

@@ -59,12 +59,12 @@ class Policy:
         return Actor(self.manifest.network, self.tensors)
 
     def __call__(self, observation: Float32s) -> Float32s:
-        """Return the actions [n, A] in [-1, 1] for the observations [n, F], float32; each row is computed alone."""
+        """Return the actions [n, A] in [-1, 1] for the observations [n, F], float32; no row depends on another."""
         return self._actor(observation)
 
     @cached_property
     def observation(self) -> ObservationSpec:
-        """The observation that this policy takes, with the time step of its training scenario.
+        """The observation on which this policy acts, with the time step of its training scenario.
 
         Raises ``UnknownName`` if a feature does not exist any more.
         """
@@ -77,12 +77,12 @@ class Policy:
 
     @property
     def steps(self) -> int:
-        """Number of learners' decisions in training before the policy was saved."""
+        """Number of decisions that the learners made in training before the policy was saved."""
         return self.manifest.steps
 
     @property
     def drivers(self) -> dict[str, Policy]:
-        """Name of each vehicle that the policy learned to control -> this policy: ``{"vehicle_2": policy}``."""
+        """The policy itself, by the name of each vehicle that it learned to control: ``{"vehicle_2": policy}``."""
         return dict.fromkeys(self.manifest.learners, self)
 
     @classmethod
@@ -93,7 +93,7 @@ class Policy:
 
         Args:
             tensors: weights and biases by name, see ``NetworkSpec.tensors``.
-            observation: the observation that the networks take.
+            observation: the observation that is the input of the networks.
             **manifest: the other fields of ``Manifest``; ``versions`` defaults to the installed versions.
 
         Raises ``InvalidInput`` naming the invalid tensor or field.
@@ -145,9 +145,8 @@ class Policy:
         """Return the ONNX model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
 
         The acceleration is the action times the vehicle's braking capacity (action below 0) or driving capacity (action
-        above 0). Both capacities are read from the observation. Results of the ONNX model agree with this package up to
-        rounding errors, because products are summed in another order. Raises ``MissingExtra`` if the package onnx is
-        not installed.
+        above 0). Both capacities are read from the observation. The ONNX model adds products in another order than this
+        package, so its results differ by rounding errors. Raises ``MissingExtra`` if the package onnx is not installed.
         """
         return onnx_model(self.manifest, self.observation, self.tensors)
 

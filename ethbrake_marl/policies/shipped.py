@@ -16,7 +16,7 @@ _FOLDER = Path(__file__).resolve().parents[1] / "_policies"
 
 
 def shipped_policies() -> dict[str, Path]:
-    """Return the name of every shipped policy -> folder of its bundle."""
+    """Return the folder of the bundle of every shipped policy, by the policy's name."""
     return {path.parent.name: path.parent for path in sorted(_FOLDER.glob("*/policy"))}
 
 

@@ -21,11 +21,11 @@ class PolicyTeam:
 
     @property
     def steps(self) -> int:
-        """Number of learners' decisions in training before the policies were saved."""
+        """Number of decisions that the learners made in training before the policies were saved."""
         return next(iter(self.drivers.values())).steps
 
     def save(self, folder: str | os.PathLike[str], *, replace: bool = False) -> None:
-        """Write a folder with one bundle per learner in subfolders such as ``vehicle_2/``, with ``Policy.save``.
+        """Write a folder with one subfolder per learner, such as ``vehicle_2/``; each contains the learner's bundle.
 
         Raises ``AlreadyExists`` if the folder exists. With ``replace``, an existing folder is deleted after the new
         folder was written.
@@ -41,7 +41,8 @@ Trained = Policy | PolicyTeam  # result of a training: one policy for all learne
 def read_trained(folder: Path) -> Trained:
     """Read the policy or team that ``save`` wrote into ``folder``.
 
-    Raises ``CorruptBundle`` if ``folder`` contains no policy and no team, and the errors of ``load_policy``.
+    Raises ``CorruptBundle`` if ``folder`` contains neither a policy nor a team. Also raises the errors of
+    ``load_policy``.
     """
     if (folder / MANIFEST).exists():
         return load_policy(folder)

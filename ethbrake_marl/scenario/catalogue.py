@@ -24,8 +24,8 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 def shipped_folder(folder: Literal["scenarios", "train"] = "scenarios") -> Path:
     """Return the folder of the shipped scenarios, or of the shipped recipes if ``folder`` is ``"train"``.
 
-    The folder is in the checkout or in the installed package. Raises ``InvalidInput`` if the folder is in neither
-    place.
+    The folder is part of the source checkout or of the installed package. Raises ``InvalidInput`` if neither contains
+    the folder.
     """
     checkout, installed = _PACKAGE.parent / folder, _PACKAGE / "_data" / folder
     if (_PACKAGE.parent / "pyproject.toml").is_file() and checkout.is_dir():
@@ -61,9 +61,10 @@ class CatalogueEntry:
 def register_scenarios(folder: str | os.PathLike[str]) -> None:
     """Register the scenarios of a folder by name: a file ``my-name.yaml`` in it becomes ``--scenario my-name``.
 
-    Subfolders are ignored. A file is checked only when it is used. Registering the same folder again changes nothing.
-    Raises ``InvalidInput`` if the folder does not exist or has no ``.yaml`` file. Raises ``AlreadyExists`` if a shipped
-    scenario, or a scenario of another registered folder, has the same name as a scenario of this folder.
+    Subfolders are ignored. A scenario file is checked only when its scenario is used. Registering the same folder again
+    changes nothing. Raises ``InvalidInput`` if the folder does not exist or has no ``.yaml`` file. Raises
+    ``AlreadyExists`` if a shipped scenario, or a scenario of another registered folder, has the same name as a scenario
+    of this folder.
     """
     path = Path(folder).resolve()
     if not path.is_dir():
@@ -133,7 +134,7 @@ BENCHMARK = (  # scenarios that ship with a table of best known harm, which the 
 def group_of_scenarios(name: str) -> list[str]:
     """Return the names of the scenarios in a group: ``benchmark``, or a folder of shipped scenarios (``stress``).
 
-    The result is empty for any other name.
+    The list is empty if ``name`` is not the name of a group.
     """
     if name == "benchmark":
         return list(BENCHMARK)
@@ -187,7 +188,7 @@ def _load(path: Path) -> Scenario:
 
 
 def _with_members(document: Document, folder: Path) -> Document:
-    """Return the document with the content of the files that it names: scenarios of a mixture, and rows of tables.
+    """Return the document with scenarios of a mixture and rows of tables read from the files that it names.
 
     Paths in the document are relative to ``folder``.
     """
@@ -265,9 +266,9 @@ def check_file_name(kind: str, name: str) -> None:
 def new_scenario_text(name: str, based_on: str = "paper-random", *, rows_file: str = "") -> str:
     """Return the text of a commented YAML file for a new scenario ``name`` with the values of ``based_on``.
 
-    The text contains every key; a key that ``based_on`` does not use is a comment with an example. Save the text as
-    ``<name>.yaml``. If ``rows_file`` is given, the text names this CSV file instead of containing the rows of the
-    table; ``rows_text`` returns the content of that file. Raises ``InvalidInput`` for an invalid name or unknown
+    The text contains every key; a key that ``based_on`` does not use appears as a comment with an example. Save the
+    text as ``<name>.yaml``. If ``rows_file`` is given, the text names this CSV file instead of containing the rows of
+    the table; ``rows_text`` returns the content of that file. Raises ``InvalidInput`` for an invalid name or unknown
     ``based_on``.
     """
     check_file_name("scenario", name)
@@ -313,7 +314,7 @@ def _line(key: str, values: Mapping[str, object]) -> str:
 
 
 def _short_member(entry: dict[str, Any]) -> dict[str, Any]:
-    """Return an entry of a mixture's list of scenarios; the content of a shipped scenario is replaced by its name."""
+    """Return an item of a mixture's list, with the content of a shipped scenario replaced by its name."""
     content, name = entry["scenario"], entry["scenario"]["name"]
     as_shipped = name in _shipped_paths() and member_content(load_scenario(name)) == content
     return {**entry, "scenario": name} if as_shipped else entry

@@ -8,22 +8,23 @@ of vehicle j from this time on, in s after the alert:
 
 T is the message period, and ``U(0, T)`` the random wait for the next message. L_radio is the time of transmission,
 t_proc the time until the message is processed, and t_act the time until the brakes respond. ``k`` is the number of
-periods during which a burst of losses destroys every message. In a stationary Gilbert-Elliott channel ``P(k >= m) = (p
-/ (p + r)) (1 - r)^(m - 1)``, if in each period a burst begins with probability p and ends with probability r. With
-probability ``lost`` no message ever arrives on a link. Sensors see the direct neighbours after a delay drawn from
-``sensing_s``, called a *hop*. Vehicle i can react to the emergency from this time on:
+message periods during which a burst of losses destroys every message. In each period, a burst begins with probability
+p, and an ongoing burst ends with probability r. In the stationary state of this Gilbert-Elliott channel ``P(k >= m) =
+(p / (p + r)) (1 - r)^(m - 1)`` for m = 1, 2, ... With probability ``lost`` no message ever arrives on a link. A
+vehicle's sensors see its direct neighbours after a delay, called a *hop*, which is drawn from the range ``sensing_s``.
+Vehicle i can react to the emergency from this time on:
 
     latency_i = max(own latency_i, min(tau_i1, latency_(i-1) + hop_(i, i-1)))
 
-Before this time it has neither received the message of Vehicle 1 nor seen the vehicle ahead brake. Vehicle i knows the
-state of vehicle j from ``max(latency_i, tau_ij)`` on. If j is a direct neighbour in sight, it knows this state from
-``max(latency_i, hop_ij)`` on if that time is earlier. If a vehicle observes another vehicle's latency, it observes the
-*own* latency of that vehicle, which does not include delays of the channel. Under the preset ``paper`` a vehicle knows
-everything as soon as its own latency has elapsed.
+Before this time vehicle i has neither received the message of Vehicle 1 nor seen the vehicle ahead brake. Vehicle i
+knows the state of vehicle j from ``max(latency_i, tau_ij)`` on. If vehicle i also sees vehicle j, it knows the state of
+vehicle j from ``max(latency_i, min(tau_ij, hop_ij))`` on. If a vehicle observes another vehicle's latency, it observes
+the *own* latency of that vehicle, which does not include delays of the channel. Under the preset ``paper`` a vehicle
+knows everything as soon as its own latency has elapsed.
 
 With ``persistence: first``, vehicle i knows the present state of vehicle j after the first message. With ``persistence:
-periodic``, a message is sent in every period T and may be lost by the same Gilbert-Elliott channel; vehicle i then
-knows the state in the newest message that arrived (``physics.messages``).
+periodic``, vehicle j sends a message in every period T, and the same Gilbert-Elliott channel may lose it. Vehicle i
+then knows the state of vehicle j in the newest message that arrived (``physics.messages``).
 """
 
 from __future__ import annotations
@@ -75,8 +76,8 @@ class Equipage(FileModel):
 class Equipped(NamedTuple):
     """V2X equipment of the vehicles in n worlds.
 
-    There is a single row (n = 1) if all worlds have the same equipment, or if the row is the least equipment in any
-    world.
+    The arrays have a single row (n = 1) if all worlds have the same equipment, or if the row describes the least
+    equipment that each vehicle has in any world.
     """
 
     sends: Bools  # [n, N] whether vehicle i sends messages
@@ -98,7 +99,7 @@ class Equipped(NamedTuple):
 
 
 class Channel(NamedTuple):
-    """All settings that determine what each vehicle knows, and when. The module docstring explains the symbols."""
+    """All settings that determine what each vehicle knows, and when. The module docstring explains tau, T and p."""
 
     # how the delay tau of a link arises: "latency": tau is the receiver's own latency; "fixed": tau is link_latency_s;
     # "messages": tau is drawn with the settings of messages and losses below
@@ -120,7 +121,7 @@ class Channel(NamedTuple):
     def contents(self, vehicles: int) -> Bools | None:
         """Return whether the messages of each vehicle contain each item of ``PIECES``, [N, len(PIECES)].
 
-        Return None if ``tells`` is not given: then the messages contain ``USUAL_PIECES``.
+        Return None if ``tells`` is not given; messages then contain the items in ``USUAL_PIECES``.
         """
         if self.tells is None:
             return None
@@ -298,7 +299,7 @@ class V2X(FileModel):
     def _leave_out(self, names: tuple[str, ...], why: str) -> None:
         """Raise an error if one of the keys ``names`` is given although it has no effect.
 
-        ``why``: reason, for the error message.
+        ``why``: reason why the key has no effect, for the error message.
         """
         for name in names:
             self._require(getattr(self, name) is None, name, f"has no effect, because {why}; leave it out")
@@ -327,7 +328,7 @@ class V2X(FileModel):
 
     @property
     def delays(self) -> bool:
-        """Whether the channel differs from the paper's rule in other respects than the contents of messages."""
+        """Whether the channel differs from the paper's rule in anything other than the contents of messages."""
         return self.channel._replace(tells=None) != CHANNELS["paper"]
 
     @property
@@ -360,13 +361,14 @@ class V2X(FileModel):
 
     @staticmethod
     def width(vehicles: int) -> int:
-        """Return how many uniform numbers the links of a line of ``vehicles`` vehicles need per world."""
+        """Return how many uniform numbers one world needs for all links of a line of ``vehicles`` vehicles."""
         return PER_LINK * vehicles * vehicles
 
     def with_news(self, vehicles: Vehicles, u: Floats, equipped: Equipped) -> Vehicles:
-        """Return ``vehicles`` with the latencies that the channel causes, and the times from which others are known.
+        """Return ``vehicles`` with the channel's effect on latencies, and the times from which each knows the others.
 
-        The previous latencies, which must not include delays of a channel, become ``own_latency_s``.
+        The latencies in the argument ``vehicles`` must not include delays of a channel; they become ``own_latency_s``
+        of the result.
 
         Args:
             vehicles: parameters of the vehicles in n worlds.
@@ -387,7 +389,7 @@ class V2X(FileModel):
     def heard_and_seen(self, u: Floats, equipped: Equipped) -> tuple[Floats, Floats]:
         """Return (heard, seen): when vehicle i can use the first message of vehicle j, and the delay of seeing j.
 
-        Both have shape [n, N, N] (world, i, j) and unit s. Infinite means never.
+        Both arrays have the shape [n, N, N] (world, i, j) and the unit s. Infinite means never.
 
         Args:
             u: uniform numbers in [0, 1) for the links, [n, N * N * PER_LINK].
@@ -407,7 +409,7 @@ class V2X(FileModel):
         return heard, np.where(in_sight[channel.senses], hop, np.inf)
 
     def with_channel(self, worlds: Worlds, u: Floats, key: Floats, time_step_s: float, equipped: Equipped) -> Worlds:
-        """Return ``worlds`` with the times from which a vehicle knows others, and with the data of periodic messages.
+        """Return ``worlds`` with the times from which each vehicle knows the others, and the data of periodic messages.
 
         Args:
             worlds: worlds without a channel, at the alert (time 0).
@@ -431,13 +433,13 @@ class V2X(FileModel):
         return replace(worlds, messages=messages.columns)
 
     def with_fixed_news(self, worlds: Worlds, time_step_s: float, where: str, equipped: Equipped | None) -> Worlds:
-        """Return the user's worlds with the data of this channel; raise ``InvalidInput`` if the channel is random.
+        """Return the user's ``worlds`` with this channel's data added; raise ``InvalidInput`` if the channel is random.
 
         Args:
             worlds: worlds without a channel.
             time_step_s: time between two decisions (s).
-            where: source of the worlds, for the error message.
-            equipped: V2X equipment of the vehicles, one row for all worlds; None: the equipment is random.
+            where: beginning of the error message, which says where the user gave the worlds.
+            equipped: V2X equipment of the vehicles, one row for all worlds; None if the equipment is random.
 
         """
         if not self.by_link:
@@ -454,8 +456,9 @@ class V2X(FileModel):
 def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
     """Return the number k of message periods that a burst of losses lasts, in the shape of ``u``.
 
-    ``k >= m`` holds exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``. This rule is the inverse distribution function of
-    the stationary Gilbert-Elliott channel. k is computed without logarithms, so every machine gets the same k.
+    The result k is at least m exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``. This rule is the inverse of the
+    distribution function of k in the stationary Gilbert-Elliott channel. k is computed without logarithms, so every
+    machine gets the same k.
 
     Args:
         u: uniform numbers in [0, 1).
@@ -474,7 +477,7 @@ def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
 
 
 def link_delays(channel: Channel, u: Floats) -> Floats:
-    """Return the delay tau of each link in s, [...]; infinite if no message arrives.
+    """Return the delay tau of the first message on each link in s, [...]; infinite if no message arrives.
 
     With the timing ``latency`` the delay is minus infinity: a vehicle knows everything after its own latency.
 

@@ -1,7 +1,7 @@
 """Checks of a scenario that concern several fields together.
 
-Each check raises a pydantic error for the first mistake that it finds. The error contains the path inside the file and
-the value.
+Each check raises a pydantic error for the first mistake that it finds. The error contains the invalid value and its
+path (keys and indices) inside the file.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ MOST_SAMPLES = 1_000  # largest number of samples that a vehicle may have to sto
 def check_whole(scenario: ScenarioFields) -> None:
     """Check the fields of a scenario that depend on each other; raise a pydantic error for the first mistake.
 
-    The checks concern quantities that are declared twice, time step, horizon, latencies, channel, speeds, gaps,
-    obstacle and scripts.
+    The checks concern time step, horizon, latencies, channel, speeds, gaps, obstacle, scripts, and quantities that are
+    declared twice.
     """
     alone = "speed_deviations_mps" in scenario.model_fields_set and scenario.line_speed_mps is None
     right = "can be used only with line_speed_mps, the speed to which the deviations are added"
@@ -129,7 +129,7 @@ def _check_speeds(scenario: ScenarioFields) -> None:
 
 
 def _check_derived(scenario: ScenarioFields) -> None:
-    """Raise an error if a gap (from a time gap) or the distance of the obstacle (from a margin) is too large."""
+    """Raise an error if a gap (computed from a time gap) or obstacle distance (from a margin) is too large."""
     largest = QUANTITY.usual["gaps_m"].high
     for pair, (_, high) in enumerate(scenario.bounds("gaps_m") if scenario.time_gaps_s is not None else ()):
         right = f"gives gaps up to {high:g} m at the speed of vehicle_{pair + 2}; a gap must not be above {largest:g} m"

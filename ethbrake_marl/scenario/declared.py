@@ -176,7 +176,7 @@ class ScenarioFields(FileModel):
     @field_validator(*QUANTITY.needed, mode="before")
     @classmethod
     def _needed(cls, value: Any, info: ValidationInfo) -> Any:
-        """Raise an error if a quantity that has no default lacks a value.
+        """Raise an error if a quantity has neither a value nor a default.
 
         No value is needed if every vehicle type, or the table, declares the quantity, or if the scenario is a mixture.
         """
@@ -225,7 +225,7 @@ class ScenarioFields(FileModel):
     @field_validator("table")
     @classmethod
     def _columns_of_line(cls, value: Table | None, info: ValidationInfo) -> Table | None:
-        """Check that each column of the table fits this number of vehicles, and that its numbers are in range."""
+        """Check that each column of the table fits the number of vehicles, and has only numbers in range."""
         if value is None or "vehicles" not in info.data:
             return value
         known = columns_of_table({**QUANTITY.usual, **QUANTITY.optional}, info.data["vehicles"])
@@ -243,7 +243,7 @@ class ScenarioFields(FileModel):
     @field_validator(*QUANTITY.declared)
     @classmethod
     def _entries(cls, value: Any, info: ValidationInfo) -> Any:
-        """Check that all possible values of a quantity are in range, and that a list has the right length."""
+        """Check that all possible values of a quantity are in range, and that a list has the required length."""
         rule, vehicles = QUANTITY.declared[str(info.field_name)], info.data.get("vehicles")
         if value is None:
             return value
@@ -324,7 +324,7 @@ class ScenarioFields(FileModel):
         return {i: role for i, role in enumerate(roles) if role != LEARNER}
 
     def play_pieces(self, worlds: Worlds, driven: Sequence[int] = ()) -> Worlds:
-        """Return ``worlds`` with the commands of all ``profile`` scripts, which brake by a fixed sequence of commands.
+        """Return ``worlds`` with the fixed command sequence of each vehicle that follows a ``profile`` script.
 
         ``driven``: indices (from 0) of controlled vehicles, which follow no script.
         """
@@ -351,7 +351,8 @@ class ScenarioFields(FileModel):
     def declares(self, field: str) -> bool:
         """Return whether the scenario declares the quantity ``field``, for example ``"mass_t"``.
 
-        The declaration may be the key itself, a key of a vehicle type, or columns of the table for all vehicles.
+        A quantity may be declared by its key in the scenario, by its key in a vehicle type, or by columns of the table
+        for all vehicles.
         """
         kinds = (self.vehicle_types or {}).values() if field in QUANTITY.of_a_type else ()
         return (
@@ -367,14 +368,14 @@ class ScenarioFields(FileModel):
 
     @property
     def recordings(self) -> TableColumn | None:
-        """Table column with the recording of each row; None if the table has no such column, and for a mixture."""
+        """Table column with the name of each row's recording; None without such a column, and for a mixture."""
         return self._recordings
 
     @property
     def by_link(self) -> bool:
         """Whether ``v2x`` differs from the paper's rule (a vehicle knows everything once its own latency has elapsed).
 
-        For a mixture: whether it differs in at least one of the scenarios.
+        For a mixture: whether ``v2x`` differs from this rule in at least one of the scenarios.
         """
         return any(member.by_link for member in self.members) or self.v2x.by_link
 
@@ -384,9 +385,10 @@ class ScenarioFields(FileModel):
         return None if self.vehicle_types is None else TypesOfLine(self.vehicle_types, self.types, self.vehicles)
 
     def equipped(self, types: Ints | None = None) -> Equipped:
-        """Return the V2X equipment of the vehicles in worlds with these vehicle ``types`` (indices, [n, N]).
+        """Return the vehicles' V2X equipment in worlds with the vehicle types ``types`` (indices, [n, N]).
 
-        Without ``types`` the result has one row, [1, N]: the least equipment that each vehicle has with any type.
+        If ``types`` is None, the result has one row, [1, N]: for each vehicle the least equipment of all its possible
+        types.
         """
         line, each = self.types_of_line, []
         own = self.v2x.vehicles or {}
@@ -425,7 +427,7 @@ class ScenarioFields(FileModel):
     def supports(self, field: str) -> tuple[tuple[float, float], ...]:
         """Return (smallest, largest) value of the quantity ``field`` for each vehicle, pair or world.
 
-        The range of a vehicle includes all its possible types.
+        The range of a vehicle includes the values of all its possible types.
         """
         supports = []
         for each in self.possible_quantities(field):
@@ -478,7 +480,7 @@ class ScenarioFields(FileModel):
 
 
 def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]) -> dict[str, Floats]:
-    """Return every quantity of k worlds by key, [k, entries] each, computed from the declared quantities.
+    """Compute all quantities of k worlds from the declared quantities: key -> values, [k, entries].
 
     Derived quantities are ``speed = line speed + own deviation``, ``gap = time gap x speed of the pair's rear vehicle``
     and ``latency = own latency + time of the alert``. The derived quantities increase with the declared ones, so bounds
@@ -504,10 +506,10 @@ def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]
 
 
 def on_road(found: Mapping[str, Floats]) -> dict[str, Floats]:
-    """Return ``found`` with braking and driving capacities limited to friction times gravity.
+    """Return ``found`` with all braking and driving capacities limited to friction times gravity.
 
-    ``found`` maps keys such as ``"friction"`` and ``"braking_capacity_mps2"`` to values, [k, entries]. Without the key
-    ``"friction"`` nothing is limited.
+    ``found`` maps keys such as ``"friction"`` and ``"braking_capacity_mps2"`` to values, [k, entries]. If the key
+    ``"friction"`` is missing, the capacities are not limited.
     """
     return as_road_allows(found, found["friction"]) if "friction" in found else dict(found)
 
@@ -517,13 +519,13 @@ def obstacle_gap(
 ) -> Floats | None:
     """Return the distance from Vehicle 1 to the obstacle ahead in k worlds, [k] m; None without an obstacle.
 
-    A scenario declares this distance, or a margin: the distance from the point where Vehicle 1 stops by full braking to
-    the obstacle. In the second case ``distance = margin + v_1 tau_1 + v_1^2 / (2 a_1)``. Vehicle 1 has the speed v_1,
-    the latency tau_1 and the braking capacity a_1, and its brakes act at once.
+    A scenario declares either this distance or a margin, the distance from the point where Vehicle 1 stops by full
+    braking to the obstacle. With a margin ``distance = margin + v_1 tau_1 + v_1^2 / (2 a_1)``. Vehicle 1 has the speed
+    v_1, the latency tau_1 and the braking capacity a_1, and its brakes act at once.
 
     Args:
         scenario: the scenario that declares the obstacle.
-        found: the other quantities of these worlds by key, [k, entries] each.
+        found: the other quantities of the k worlds: key -> values, [k, entries].
         declared: function that maps ``"obstacle_gap_m"`` or ``"obstacle_margin_m"`` to its value in each world, [k].
 
     """
@@ -537,7 +539,7 @@ def obstacle_gap(
 
 
 def _supports_of(scenario: ScenarioFields) -> Callable[[str], Floats]:
-    """Return a function from a quantity's key to its smallest and largest value per vehicle or pair, [2, entries]."""
+    """Return a function that maps a key to the smallest and largest value per vehicle or pair, [2, entries]."""
     return lambda key: np.array(scenario.supports(key)).T
 
 

@@ -37,8 +37,8 @@ Numbers = Annotated[tuple[Number, ...], Field(strict=False, min_length=1)]
 class _Distribution(FileModel):
     """Base class of the distributions that a quantity in a scenario file may have, such as ``Uniform``.
 
-    A subclass declares its parameters as fields. It also defines the property ``support``, the smallest and largest
-    possible value, and the method ``value(u)``, which turns uniform numbers ``u`` in [0, 1) into values.
+    A subclass declares its parameters as fields. A subclass also defines the property ``support``, the smallest and
+    largest possible value, and the method ``value(u)``, which turns uniform numbers ``u`` in [0, 1) into values.
     """
 
 
@@ -54,7 +54,7 @@ class Uniform(_Distribution):
 
     @property
     def support(self) -> tuple[float, float]:
-        """Smallest and largest possible value."""
+        """Smallest and largest value that can be drawn."""
         return self.uniform
 
     def value(self, u: Floats) -> Floats:
@@ -84,7 +84,7 @@ class LogUniform(_Distribution):
 
     @property
     def support(self) -> tuple[float, float]:
-        """Smallest and largest possible value."""
+        """Smallest and largest value that can be drawn."""
         return self.loguniform
 
     def value(self, u: Floats) -> Floats:
@@ -124,14 +124,15 @@ class Normal(_Distribution):
 
     @property
     def support(self) -> tuple[float, float]:
-        """Smallest and largest possible value."""
+        """Smallest and largest value that can be drawn."""
         return self.normal.low, self.normal.high
 
     def value(self, u: Floats) -> Floats:
         """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
 
         A value is ``mean + sd Q(p_low + (p_high - p_low) u)``. Q is the quantile function of the standard normal
-        distribution; p_low and p_high are the probabilities of a value below low and below high before truncation.
+        distribution; p_low and p_high are the probabilities that the untruncated distribution gives a value below low,
+        and below high.
         """
         shape = self.normal
         below, above = self._bounds()
@@ -169,7 +170,7 @@ class LogNormal(_Distribution):
 
     @property
     def support(self) -> tuple[float, float]:
-        """Smallest and largest possible value."""
+        """Smallest and largest value that can be drawn."""
         return self.lognormal.low, self.lognormal.high
 
     def value(self, u: Floats) -> Floats:
@@ -198,7 +199,7 @@ class Choice(_Distribution):
 
     @property
     def support(self) -> tuple[float, float]:
-        """Smallest and largest possible value."""
+        """Smallest and largest value that can be drawn."""
         return min(self.choice), max(self.choice)
 
     def value(self, u: Floats) -> Floats:
@@ -224,7 +225,7 @@ class TableColumn:
 
     @property
     def support(self) -> tuple[float, float]:
-        """Smallest and largest possible value."""
+        """Smallest and largest value that can be drawn."""
         return float(self.rows.min()), float(self.rows.max())
 
     @property
@@ -237,7 +238,7 @@ class TableColumn:
     def value(self, u: Floats) -> NDArray[Any]:
         """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
 
-        A value comes from the first row whose cumulative weight is above u.
+        A value comes from the first row whose cumulative weight, normalised to a total of 1, is above u.
         """
         return self.rows[np.searchsorted(self.cumulative, u, side="right")]
 
@@ -245,7 +246,7 @@ class TableColumn:
 def _kind(value: object) -> str | None:
     """Return the tag of the class in ``Quantity`` that checks a value from a file, such as ``"#uniform"``.
 
-    Return None for a list, or for a mapping without a known distribution.
+    Return None for a list, or for a mapping that contains no name of a distribution.
     """
     if isinstance(value, _Distribution):
         return f"#{type(value).__name__.lower()}"
@@ -269,7 +270,7 @@ Quantity = Annotated[
 
 
 class WithLoad(_Distribution):
-    """``{with_load: [empty, full]}``: a linear function of the vehicle's load (0 to 1); allowed in vehicle types only.
+    """``{with_load: [empty, full]}``: linear in the load, ``empty`` at 0 and ``full`` at 1; only in vehicle types.
 
     ``spread`` is the distribution, around 0, of a random amount that is added to each vehicle's value.
     """
@@ -288,14 +289,14 @@ class WithLoad(_Distribution):
 
     @property
     def support(self) -> tuple[float, float]:
-        """Smallest and largest possible value."""
+        """Smallest and largest value that can be drawn."""
         low, high = support(self.spread)
         return min(self.with_load) + low, max(self.with_load) + high
 
     def value(self, load: Floats, u: Floats) -> Floats:
-        """Return ``empty + (full - empty) load``, plus the random amount that the uniform numbers ``u`` draw.
+        """Return ``empty + (full - empty) load``, plus an amount that ``u`` draws from ``spread``.
 
-        ``load`` in [0, 1], ``u`` in [0, 1) and the result have the same shape.
+        The arrays ``load`` (loads in [0, 1]) and ``u`` (uniform numbers in [0, 1)) and the result have the same shape.
         """
         empty, full = self.with_load
         moved = np.clip(empty + (full - empty) * load, min(self.with_load), max(self.with_load))

@@ -83,17 +83,17 @@ class QuantityRule:
         return {"vehicle": vehicles, "pair": vehicles - 1, "world": 1}[self.per]
 
     def place(self, index: int) -> Place:
-        """Return which uniform number draws entry ``index`` (from 0), as (stream, column)."""
+        """Return (stream, column) of the uniform number that draws the value of vehicle or pair ``index`` (from 0)."""
         return self.stream, BLOCK * (self.block + index) + self.slot
 
     def column_of(self, index: int) -> str:
-        """Return the column name of entry ``index`` (from 0) in a table of initial states, such as ``gap_1_m``."""
+        """Return the column name for vehicle or pair ``index`` (from 0) in a table of initial states: ``gap_1_m``."""
         return self.column.format(index + 1)
 
     def owner(self, index: int) -> str:
-        """Return the vehicle or pair of entry ``index`` (from 0): ``vehicle_1``, or ``vehicle_1 to vehicle_2``.
+        """Return the name of vehicle or pair ``index`` (from 0): ``vehicle_1``, or ``vehicle_1 to vehicle_2``.
 
-        The text is empty for a quantity with one value per world.
+        The name is empty for a quantity with one value per world.
         """
         front = f"vehicle_{index + 1}"
         return {"vehicle": front, "pair": f"{front} to vehicle_{index + 2}", "world": ""}[self.per]
@@ -116,7 +116,7 @@ class QuantityRule:
 
 
 class Quantities(NamedTuple):
-    """All quantities that a scenario can declare, in groups. A group maps a key such as ``gaps_m`` to its rule."""
+    """All quantities that a scenario can declare, in groups. A group maps keys (``gaps_m``) to ``QuantityRule``."""
 
     usual: dict[str, QuantityRule]  # quantities that every world has
     otherwise: dict[str, QuantityRule]  # other ways to declare speeds, gaps and an obstacle, and the time of the alert
@@ -129,10 +129,11 @@ class Quantities(NamedTuple):
     declared: dict[str, QuantityRule]  # all keys that declare a quantity
 
     def of(self, worlds: Worlds) -> dict[str, QuantityRule]:
-        """Return the quantities that ``worlds`` have: key -> rule.
+        """Return the quantities that ``worlds`` have: key -> ``QuantityRule``.
 
-        Friction is included if all worlds have it, the distance to an obstacle if some world has an obstacle, brake and
-        release rates if some rate is finite, and the weights of harm if some weight is not 1.
+        Of the optional quantities, friction is included if all worlds have it, the distance to an obstacle if some
+        world has an obstacle, brake and release rates if some rate is finite, and the weights of harm if some weight is
+        not 1.
         """
         there = {"obstacle_gap_m": worlds.obstacle_ahead.any(), "friction": np.isfinite(worlds.friction).all()}
         there["harm_weight"] = (worlds.vehicles.harm_weight != 1.0).any()
@@ -271,7 +272,7 @@ def columns_of_table(rules: Mapping[str, QuantityRule], vehicles: int) -> dict[s
     An example is ``{"gap_1_m": ("gaps_m", 0), ...}``.
 
     Args:
-        rules: rules of the quantities, by key.
+        rules: ``QuantityRule`` of each quantity, by key.
         vehicles: number of vehicles in the line.
 
     """
@@ -282,7 +283,7 @@ def columns_of_table(rules: Mapping[str, QuantityRule], vehicles: int) -> dict[s
 def is_tabled(data: Mapping[str, Any], key: str) -> bool:
     """Return whether a scenario's table has columns of the quantity ``key`` for every vehicle, pair or world.
 
-    ``data``: fields of the scenario that are checked already, by name; only ``table`` and ``vehicles`` are used.
+    ``data``: scenario fields that have been checked already, by name; only ``table`` and ``vehicles`` are used.
     """
     table, rule = data.get("table"), QUANTITY.declared[key]
     if table is None or "vehicles" not in data or not rule.column:

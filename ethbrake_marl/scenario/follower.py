@@ -18,7 +18,7 @@ class Follower(FileModel):
 
     The default latency (0.75 s) and braking capacity (0.774 g) are those of the competent driver in UN Regulation 157.
     The default time gap (0.6 s) is our choice. The follower's brakes act at once, but the regulation's driver needs
-    some time to build up the braking force. Its mass equals the mass of the last vehicle.
+    some time to build up the braking force. The follower's mass equals the mass of the last vehicle.
     """
 
     time_gap_s: float = Field(
@@ -31,9 +31,9 @@ class Follower(FileModel):
 def with_follower(document: Document, build: Callable[[Document], Any]) -> Document:
     """Return the document with the follower as one more vehicle of the line, and without the key ``follower``.
 
-    Tables and lists get entries for this vehicle. If the follower is invalid, the document is returned unchanged, and
-    the schema rejects it later. Raises ``InvalidInput`` if the line is invalid, if it has vehicle types, or if the
-    speed of the last vehicle is random and not in the table.
+    In the result, tables and lists also have entries for the follower. If the follower is invalid, the document is
+    returned unchanged, and the schema rejects the document later. Raises ``InvalidInput`` if the line is invalid, if it
+    has vehicle types, or if the speed of the last vehicle is random and not in the table.
 
     Args:
         document: parsed file with a key ``follower``.

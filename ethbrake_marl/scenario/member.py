@@ -27,7 +27,7 @@ class Member(FileModel):
     """One scenario of a mixture, with its weight relative to the others.
 
     In a file, ``scenario`` is a scenario's name, the path of its file, or the content of such a file. Loading replaces
-    a name or path by the content of that file, so this field is always a mapping from keys to values.
+    a name or path by the content of the scenario's file, so ``scenario`` is a mapping in a loaded ``Member``.
     """
 
     scenario: Annotated[dict[str, Any], _MemberSchema] = Field(

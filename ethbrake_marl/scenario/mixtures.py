@@ -40,10 +40,11 @@ def build_members(
 ) -> tuple[Document, tuple[AnyScenario, ...]]:
     """Build the scenarios listed under the key ``mixture``; return the completed document and these scenarios.
 
-    Keys next to ``mixture`` replace the same keys in every listed scenario. A key for which all scenarios have the same
-    value is added to the document. If the list is invalid, the document is returned unchanged, without scenarios, and
-    the schema rejects it later. Raises ``InvalidInput`` naming the invalid scenario, or the key that must have the same
-    value in all scenarios but has not.
+    Keys that stand beside ``mixture`` in the file replace the same keys in every listed scenario. Shared settings, such
+    as ``vehicles``, are added to the document if all scenarios have the same value. If the list is invalid, the
+    function returns the unchanged document and no scenarios, and the schema rejects the document later. Raises
+    ``InvalidInput`` naming the invalid scenario, or the key that must have the same value in all scenarios but does
+    not.
 
     Args:
         document: parsed file with a key ``mixture``.
@@ -72,7 +73,7 @@ def _is_whole(entry: Any) -> bool:
 def member_content(member: ScenarioFields) -> dict[str, Any]:
     """Return everything that determines the worlds of one scenario of a mixture, as plain data.
 
-    The result has the declared values, and the settings that all scenarios of a mixture share. It has no title,
+    The result contains the declared values and the settings that all scenarios of a mixture share, but no title,
     description or source.
     """
     declared = member.model_dump(mode="json", exclude_unset=True, exclude_none=True, exclude=set(WORDS))
@@ -85,8 +86,8 @@ def _member_document(document: Document, i: int, entry: Mapping[str, Any], besid
     Args:
         document: parsed file of the mixture.
         i: position of the scenario in the mixture's list, from 0.
-        entry: entry of the list at this position.
-        beside: keys and values next to ``mixture``, which replace the same keys of the scenario.
+        entry: content of the mixture's list at this position.
+        beside: keys and values that stand beside ``mixture`` in the file; they replace the same keys of the scenario.
 
     """
     own = {key: value for key, value in entry["scenario"].items() if key not in WORDS}

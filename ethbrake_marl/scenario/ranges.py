@@ -1,4 +1,4 @@
-"""The random numbers of a scenario as points of a unit cube, with one coordinate per random number of a world."""
+"""Describe each world of a scenario as a point of a unit cube; a coordinate is one random number of the world."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _UNUSED = 0.5  # value of uniform numbers without effect
 
 @dataclass(frozen=True, slots=True)
 class Ranges:
-    """Coordinates of the unit cube of a scenario: name, stream and column of each random number that draws a world."""
+    """Coordinates of a scenario's unit cube: name, stream and column of each random number of a world."""
 
     scenario: ScenarioFields  # the scenario whose worlds the points of the cube determine
     names: tuple[str, ...]  # name of each coordinate, such as ``mass_t of vehicle_1``
@@ -58,7 +58,7 @@ class Ranges:
 
 
 def _of_quantities(scenario: ScenarioFields) -> dict[str, Place]:
-    """Return which uniform number draws each random quantity: name -> (stream, column)."""
+    """Return which uniform number draws each random quantity: name -> (stream of random numbers, column)."""
     used: list[str] = []
 
     def note(key: str) -> Floats:
@@ -79,9 +79,10 @@ def _of_quantities(scenario: ScenarioFields) -> dict[str, Place]:
 
 
 def _of_types(scenario: ScenarioFields) -> dict[str, Place]:
-    """Return which uniform numbers draw vehicle types and loads: name -> (stream, column).
+    """Return which uniform numbers draw vehicle types and loads: name -> (stream of random numbers, column).
 
-    Numbers without effect are left out: a type if only one is possible, a load if no quantity depends on it.
+    Numbers without effect are left out: the number of a vehicle's type if only one type is possible, and the number of
+    its load if no quantity depends on the load.
     """
     if scenario.types_of_line is None:
         return {}

@@ -42,7 +42,7 @@ class ScriptSpec(NamedTuple):
         """Parse ``spec``, a text ``name[:argument]``.
 
         Raises ``InvalidInput`` unless the name matches ``[a-z][a-z0-9_@.-]*`` and the argument has no spaces. Also
-        raises it for a Python file, because loading somebody else's scenario must not run code.
+        raises ``InvalidInput`` for a Python file, because loading somebody else's scenario must not run code.
         """
         match = _SPEC.fullmatch(spec) if isinstance(spec, str) else None
         if match is None:
@@ -59,7 +59,7 @@ class ScriptSpec(NamedTuple):
 
     @property
     def deceleration_mps2(self) -> float | None:
-        """Deceleration a of ``constant:a`` (m/s2, negative for driving); None for any other script.
+        """Deceleration a of a script ``constant:a`` (m/s2, negative for driving); None for any other script.
 
         Raises ``InvalidInput`` if the deceleration is missing or not a finite number.
         """
@@ -75,10 +75,10 @@ class ScriptSpec(NamedTuple):
 
     @property
     def pieces(self) -> tuple[tuple[float, float], ...]:
-        """Pieces (intervals of constant braking) of a ``profile``; an empty tuple for any other script.
+        """Intervals of constant braking of a ``profile``; an empty tuple for any other script.
 
-        A piece is (start in s after the latency, deceleration in m/s2). Raises ``InvalidInput`` unless the starts begin
-        with 0 and increase, and no deceleration is negative.
+        Each interval is (start in s after the latency, deceleration in m/s2). Raises ``InvalidInput`` unless the starts
+        begin with 0 and increase, and no deceleration is negative.
         """
         if self.name != _PROFILE:
             return ()
@@ -87,13 +87,13 @@ class ScriptSpec(NamedTuple):
 
     @property
     def hardest_mps2(self) -> float | None:
-        """Largest deceleration (m/s2) of ``constant:a`` or a ``profile``; None for any other script."""
+        """Largest deceleration (m/s2) of a script ``constant:a`` or ``profile``; None for any other script."""
         return max(braking for _, braking in self.pieces) if self.name == _PROFILE else self.deceleration_mps2
 
     def is_state_free(self) -> bool:
         """Return whether the script does not need the state: ``full_brake``, ``coast``, ``constant:a`` or a profile.
 
-        Raises ``InvalidInput`` if the argument of such a script is missing, invalid or not allowed.
+        Raises ``InvalidInput`` if the argument of one of these scripts is missing, invalid or not allowed.
         """
         if self.name == _PROFILE:
             return len(self.pieces) > 0
@@ -171,7 +171,7 @@ def _role_text(role: object) -> object:
 def _role_content(role: str) -> str | dict[str, list[list[float]]]:
     """Convert a role to its form in a scenario file: ``profile:0=3`` to ``{"profile": [[0.0, 3.0]]}``.
 
-    Any other role is returned unchanged.
+    A role that is not a ``profile`` is returned unchanged.
     """
     pieces = ScriptSpec.parse(role).pieces
     return {_PROFILE: [list(piece) for piece in pieces]} if pieces else role

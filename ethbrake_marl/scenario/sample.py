@@ -1,4 +1,4 @@
-"""``Sample``: drawn worlds, with their numbers in the list of worlds, vehicle types, scenarios and recordings."""
+"""``Sample``: drawn worlds, and for each world its number in the list, its vehicle types, scenario and recording."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ def recording_of(texts: _Texts) -> _Texts:
 def clusters_of(kinds: Mapping[str, _Texts], index: Ints) -> _Texts | None:
     """Return the name of each world's cluster, [n], or None if all worlds are independent.
 
-    Worlds of the same cluster depend on each other. A cluster is all worlds of one recording, whichever vehicles of the
-    recording they come from. A world without a recording, in a mixture, is a cluster of its own.
+    Worlds of the same cluster are not statistically independent. A cluster contains all worlds from one recording, even
+    if they show different vehicles. In a mixture, a world without a recording is a cluster of its own.
 
     Args:
-        kinds: columns of text by name, such as ``Sample.kinds``.
+        kinds: texts about the worlds by name, [n] each, such as ``Sample.kinds``.
         index: number of each world in its list, [n].
 
     """
@@ -61,7 +61,7 @@ class Sample:
         return f"Sample({self.worlds!r}, {numbers}, {self.rejected:,} rejected)"
 
     def take(self, rows: ArrayLike) -> Sample:
-        """Return a sample of the worlds selected by ``rows`` (indices or a mask [n]); its ``rejected`` is 0."""
+        """Return a sample of the worlds selected by ``rows`` (indices or a mask [n]), with ``rejected`` = 0."""
         some = np.asarray(rows)
         texts = (None if each is None else each[some] for each in (self.types, self.scenarios, self.recordings))
         return Sample(self.worlds.take(some), self.index[some], 0, *texts)
@@ -70,8 +70,8 @@ class Sample:
     def join(parts: Sequence[Sample], rejected: int) -> Sample:
         """Join samples into one, in the order of their world numbers.
 
-        Vehicle types must be given in all of ``parts`` or in none. The same is true for scenarios and for recordings.
-        ``rejected``: number of rejected draws in the result.
+        Vehicle types must be given in all of ``parts`` or in none, and so must scenarios and recordings. ``rejected``:
+        number of rejected draws, which becomes ``Sample.rejected``.
         """
         index = np.concatenate([part.index for part in parts])
         order = np.argsort(index)
@@ -102,8 +102,8 @@ class Sample:
     def count_kinds(self) -> str:
         """Return a text with the number of worlds for each scenario of a mixture and each vehicle type.
 
-        An example is ``"; vehicle_1_type: car 7, truck 3"``. For recordings the text says only how many different
-        ones there are. The text is empty if ``kinds`` is empty.
+        An example is ``"; vehicle_1_type: car 7, truck 3"``. For recordings the text contains only the number of
+        different recordings. The text is empty if the sample has no ``kinds``.
         """
         text = ""
         for kind, column in self.kinds.items():

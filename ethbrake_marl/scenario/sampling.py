@@ -1,4 +1,4 @@
-"""Draw worlds from a scenario. World k of a seed is the same, bit for bit, for any number of drawn worlds."""
+"""Draw worlds from a scenario. For a given seed, world k is the same, bit for bit, for any number of worlds."""
 
 from __future__ import annotations
 
@@ -56,11 +56,11 @@ def sample(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, chann
         n: number of worlds.
         seed: seed of the list, a whole number of at least 0.
         first: number of the first world in the list, from 0.
-        channel: ``"list"`` (worlds for evaluation) or ``"training"``. Each seed has both lists, and they are
-            independent of each other.
+        channel: ``"list"`` (worlds for evaluation) or ``"training"``. Each seed has one list of each kind; the two
+            lists are independent.
 
-    Raises ``InvalidInput`` for a negative seed or ``first``, for ``n < 1``, or if the scenario rejects early impacts
-    and some world has one in each of ``MOST_ATTEMPTS`` draws.
+    Raises ``InvalidInput`` for a negative ``seed`` or ``first``, and for ``n < 1``. If the scenario rejects early
+    impacts, also raises it for a world that has an early impact in each of ``MOST_ATTEMPTS`` draws.
 
     """
     for name, value, least in (("number of worlds", n, 1), ("seed of the list", seed, 0), ("first world", first, 0)):
@@ -91,7 +91,7 @@ def sample(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, chann
 def members_of(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Ints:
     """Return the scenario that each world of a mixture is drawn from, as an index into ``scenario.members``, [n].
 
-    The index is 0 if the scenario is not a mixture. The arguments have the same meaning as in ``sample``.
+    All indices are 0 if the scenario is not a mixture. The arguments have the same meaning as in ``sample``.
     """
     cumulative = np.cumsum([member.weight for member in scenario.mixture or ()] or [1.0])
     u = uniform_numbers(seed, channel, 0, first, n, OF_WORLD, of=MIXTURE)[:, 0]
@@ -106,12 +106,13 @@ def middle_world(scenario: ScenarioFields) -> Worlds:
 
 
 def sample_by(scenario: ScenarioFields, numbers: Callable[[int, tuple[int, ...]], Floats], index: Ints) -> Sample:
-    """Return the worlds that result from the uniform numbers ``numbers``; early impacts are not rejected.
+    """Return the worlds drawn with uniform numbers from ``numbers``; worlds with early impacts are not rejected.
 
     Args:
         scenario: the scenario to draw from; it must not be a mixture.
-        numbers: function (width, stream) that returns uniform numbers in [0, 1), [n, width]. The stream is a tuple
-            such as ``fields.TYPES``, or ``()`` for the main stream.
+        numbers: function (width, stream) that returns ``width`` uniform numbers in [0, 1) for each world, [n, width]. A
+            stream is an independent sequence of random numbers, named by a tuple such as ``fields.TYPES``; ``()`` is
+            the main stream.
         index: number of each world in its list, [n]; becomes ``Sample.index``.
 
     """
@@ -144,11 +145,11 @@ def drawn_quantities(
 ) -> Callable[[str], Floats]:
     """Return a function that maps the key of a declared quantity to its values in n worlds, [n, entries].
 
-    There is one entry per vehicle, per pair or per world, as ``QUANTITY`` defines for each key.
+    A quantity has one entry per vehicle, per pair or per world; ``fields.QUANTITY`` says which.
 
     Args:
         scenario: the scenario that declares the quantities.
-        numbers: source of uniform numbers, the same function as in ``sample_by``.
+        numbers: function that returns uniform numbers, as in ``sample_by``.
         typed: type (index) and load of every vehicle, both [n, N]; None if the scenario has no vehicle types.
 
     """
@@ -182,8 +183,8 @@ def uniform_numbers(
 ) -> Floats:
     """Return uniform numbers in [0, 1) for worlds ``first`` to ``first + n - 1``, [n, width].
 
-    Row k depends only on (seed, channel, attempt, of, first + k, width). Each number is the upper 53 bits of a 64-bit
-    integer from the Philox generator, divided by 2^53.
+    Row k of the result depends only on ``seed``, ``channel``, ``attempt``, ``of``, ``width`` and the world number
+    ``first + k``. Each number is the upper 53 bits of a 64-bit integer from the Philox generator, divided by 2^53.
 
     Args:
         seed: seed of the list.
@@ -191,8 +192,9 @@ def uniform_numbers(
         attempt: number of the draw, from 0; a rejected world is drawn again with the next attempt number.
         first: number of the first world in the list, from 0.
         n: number of worlds.
-        width: how many numbers each world gets, a multiple of 4.
-        of: independent stream that the numbers come from, such as ``fields.V2X_NEWS``; ``()`` is the main stream.
+        width: number of uniform numbers for each world, a multiple of 4.
+        of: name of the stream (independent sequence of random numbers) to use, such as ``fields.V2X_NEWS``; ``()`` is
+            the main stream.
 
     """
     sequence = np.random.SeedSequence([seed], spawn_key=(CHANNELS[channel], attempt, *of))
@@ -206,8 +208,8 @@ def uniform_numbers(
 def _draw_numbers(scenario: ScenarioFields, index: Ints, seed: int, channel: Channel) -> Sample:
     """Return the worlds whose numbers in the scenario's list are ``index`` (ascending, [n]).
 
-    Worlds with early impacts are drawn again if the scenario says ``early_impacts: reject``. The other arguments have
-    the same meaning as in ``sample``.
+    Worlds with early impacts are drawn again if the scenario says ``early_impacts: reject``. ``seed`` and ``channel``
+    have the same meaning as in ``sample``.
     """
     drawn = _draw(scenario, seed, channel, 0, index)
     if scenario.early_impacts == "keep" or not scenario.learners:
@@ -222,7 +224,7 @@ def early_impact(scenario: ScenarioFields, worlds: Worlds) -> Bools:
     """Return whether each world has an impact no later than the time at which the first learner can act, [n].
 
     No learner can prevent such an impact: until that time learners coast and the other vehicles follow their scripts.
-    Scripts must not depend on the state (otherwise ``InvalidInput`` is raised). The scenario must have a learner.
+    Raises ``InvalidInput`` if a script depends on the state. The scenario must have a learner.
     """
     vehicles = worlds.vehicles
     command = np.zeros(worlds.speeds_mps.shape)
@@ -248,7 +250,7 @@ def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, drawn: Sample
         scenario: the scenario to draw from.
         seed: seed of the list.
         channel: ``"list"`` or ``"training"``.
-        drawn: worlds of the first attempt.
+        drawn: all worlds as drawn in the first attempt.
         early: whether each world in ``drawn`` is rejected for an early impact, [n].
 
     """
@@ -268,10 +270,10 @@ def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, drawn: Sample
 
 
 def _redraw_one(scenario: ScenarioFields, seed: int, channel: Channel, index: Ints) -> None:
-    """Raise ``InvalidInput`` if all remaining attempts to draw world number ``index`` [1] are rejected.
+    """Raise ``InvalidInput`` if world number ``index`` [1] is rejected in every remaining attempt to draw it.
 
-    Testing a single world first reports a scenario without acceptable worlds sooner than drawing the whole list. The
-    other arguments have the same meaning as in ``sample``.
+    If a scenario has no acceptable worlds, trying a single world shows this sooner than drawing the whole list.
+    ``seed`` and ``channel`` have the same meaning as in ``sample``.
     """
     for attempt in range(_PATIENCE, MOST_ATTEMPTS):
         if not early_impact(scenario, _draw(scenario, seed, channel, attempt, index).worlds)[0]:
@@ -291,8 +293,8 @@ def _unusable(scenario: ScenarioFields, world: int) -> InvalidInput:
 def _draw(scenario: ScenarioFields, seed: int, channel: Channel, attempt: int, index: Ints) -> Sample:
     """Draw the worlds whose numbers are ``index`` (ascending, [n]) once; early impacts are not rejected.
 
-    ``attempt``: number of the draw, from 0, which selects the random numbers. The other arguments have the same meaning
-    as in ``sample``.
+    ``attempt``: number of the draw, from 0; every attempt uses other random numbers. ``seed`` and ``channel`` have the
+    same meaning as in ``sample``.
     """
     first, last = int(index[0]), int(index[-1])
 

@@ -73,7 +73,7 @@ class ScenarioWording(Wording):
         return f"write, for instance, {key}: {rule.example}{other} ({rule.meaning})"
 
     def owner(self, path: YamlPath) -> str:
-        """Return the vehicle or pair that the value at ``path`` belongs to, such as ``vehicle_2``, or an empty text.
+        """Return the vehicle or pair whose value is at ``path``, such as ``vehicle_2``; empty if there is none.
 
         ``path``: keys and indices inside the file, for example ``("speeds_mps", 1)``.
         """
@@ -155,8 +155,9 @@ class Scenario(ScenarioFields):
     def sample(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:
         """Return worlds ``first`` to ``first + n - 1`` of the endless list of worlds that belongs to ``seed``.
 
-        World k of a seed is always the same, bit for bit. ``channel``: ``"list"`` (worlds for evaluation) or
-        ``"training"``, two independent lists. Raises ``InvalidInput`` for an invalid number. See ``sampling.sample``.
+        World k of the list is always the same, bit for bit. ``channel``: ``"list"`` (worlds for evaluation) or
+        ``"training"``, two independent lists. Raises ``InvalidInput`` for an invalid ``n``, ``seed`` or ``first``. See
+        ``sampling.sample``.
         """
         return sample(self, n, seed, first=first, channel=channel)
 
@@ -180,8 +181,9 @@ class Scenario(ScenarioFields):
     def replace(self, **changes: Any) -> Scenario:
         """Return a copy of the scenario with changed values, for example ``replace(mass_t=2.0)``.
 
-        A new way to declare gaps or speeds replaces the old way. In a mixture the values change in every scenario.
-        Raises ``InvalidInput`` if the result is not a valid scenario.
+        If ``changes`` declares gaps or speeds by another key, such as ``time_gaps_s``, the old key (``gaps_m``) is
+        removed. In a mixture the values change in every scenario. Raises ``InvalidInput`` if the result is not a valid
+        scenario.
         """
         return Scenario(**changed_content(self.declared(), changes))
 
@@ -252,7 +254,7 @@ def _range(key: str, low: float, high: float, positive: bool = False) -> dict[st
         key: key of the quantity.
         low: smallest allowed value.
         high: largest allowed value.
-        positive: whether ``low`` itself is excluded.
+        positive: True: the value ``low`` itself is not allowed.
 
     """
     limits = {"exclusiveMinimum" if positive else "minimum": low, "maximum": high}
@@ -282,7 +284,7 @@ def _build(scenario: Scenario, document: Document) -> None:
 def _plain(value: Any) -> Any:
     """Return ``value`` with numpy numbers and arrays converted to Python numbers and lists, also inside containers.
 
-    A ``Scenario`` is converted to its content.
+    A ``Scenario`` is converted to a mapping with its content.
     """
     if isinstance(value, Scenario):
         return value.declared()

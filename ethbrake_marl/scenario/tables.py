@@ -52,7 +52,7 @@ class _Naming:
 
 
 def _quantities(scenario: ScenarioFields) -> dict[str, QuantityRule]:
-    """Return the quantities that every world of this scenario has: key -> rule."""
+    """Return the quantities that every world of this scenario has: key -> ``QuantityRule``."""
     there = {"obstacle_gap_m": scenario.has_obstacle, "friction": scenario.has_friction}
     return QUANTITY.usual | {
         key: rule for key, rule in QUANTITY.optional.items() if there.get(key, scenario.declares(key))
@@ -60,14 +60,14 @@ def _quantities(scenario: ScenarioFields) -> dict[str, QuantityRule]:
 
 
 def _worlds(given: Mapping[Entry, Floats], scenario: ScenarioFields, naming: _Naming) -> Worlds:
-    """Build worlds from columns of numbers; take quantities without a column from the scenario.
+    """Build worlds from the columns ``given``; a quantity without a column has the scenario's value.
 
-    Raises ``InvalidInput`` for a value out of range, and for a quantity that has no column and is random.
+    Raises ``InvalidInput`` for a value out of range, and for a random quantity without a column.
 
     Args:
-        given: values of each column, [n], by quantity and index.
+        given: values of each column, [n], by (key of the quantity, index of the vehicle or pair).
         scenario: the scenario that the worlds belong to.
-        naming: how error messages name a value.
+        naming: whether error messages name a value by column and row, or by key and index.
 
     """
     if scenario.members:
@@ -104,16 +104,16 @@ def _worlds(given: Mapping[Entry, Floats], scenario: ScenarioFields, naming: _Na
 
 
 def _fixed(scenario: ScenarioFields, field: str, index: int, full: Mapping[str, Floats]) -> Floats | None:
-    """Return the scenario's fixed value of one entry of a quantity, [n] or [1]; None if the value is random.
+    """Return the scenario's fixed value of a quantity of one vehicle or pair, [n] or [1]; None if it is random.
 
-    A gap that is declared as a time gap depends on the speeds in ``full``. An obstacle that is declared by a margin
-    depends on the values of Vehicle 1 in ``full``.
+    If the scenario declares a time gap, the gap is computed from the speeds in ``full``. If it declares a margin to the
+    obstacle, the distance to the obstacle is computed from the values of Vehicle 1 in ``full``.
 
     Args:
         scenario: the scenario that declares the quantity.
         field: key of the quantity, such as ``"gaps_m"``.
         index: index of the vehicle or pair, from 0.
-        full: the quantities of the n worlds that are already known, by key, [n, entries] each.
+        full: values in the n worlds of the quantities that are already known, by key, [n, entries] each.
 
     """
     if field == "obstacle_gap_m":
@@ -143,8 +143,8 @@ def _require_all(good: Bools, naming: _Naming, entry: Entry, column: Floats, rig
 
     Args:
         good: whether the value is valid in each world, [n].
-        naming: how error messages name a value.
-        entry: quantity and index of the value.
+        naming: whether error messages name a value by column and row, or by key and index.
+        entry: key of the value's quantity, and index of its vehicle or pair.
         column: the value in each world, [n].
         right: what would be valid, for the error message.
 
@@ -155,7 +155,7 @@ def _require_all(good: Bools, naming: _Naming, entry: Entry, column: Floats, rig
 
 
 def _known_columns(header: list[str], scenario: ScenarioFields, where: str) -> list[Entry]:
-    """Return (quantity, index) of each column of a table with this header.
+    """Return, for each column name in ``header``, the key of its quantity and the index of its vehicle or pair.
 
     Raises ``InvalidInput``, whose message begins with ``where``, for unknown, repeated and missing columns.
     """
@@ -190,7 +190,7 @@ def _numbers(what: str, value: ArrayLike) -> Floats:
 def _read_csv(file: Path) -> tuple[list[str], list[list[str]], list[int]]:
     """Return the header of a CSV file, its rows (at least one), and the number of the line on which each row begins.
 
-    The values are unchecked texts.
+    The cells of the rows are unchecked texts.
     """
     rows: list[list[str]] = []
     lines: list[int] = []
@@ -221,7 +221,7 @@ def _cell_at(file: Path, header: list[str], row: list[str], line: int, column: s
     Args:
         file: path of the file, for error messages.
         header: names of all columns.
-        row: texts of the row.
+        row: texts of the row's cells.
         line: number of the line on which the row begins, for error messages.
         column: name of the column to read.
 
@@ -267,7 +267,7 @@ def read_rows(file: Path, columns: object, weights: object) -> dict[str, Any]:
 
     Args:
         file: path of the CSV file, which has a header line.
-        columns: names of the columns to read, unchecked, as the scenario file lists them.
+        columns: names of the columns to read, as the scenario file lists them; this function checks them.
         weights: name of the column with the weight of each row; None: the rows have no weights.
 
     """
@@ -322,9 +322,9 @@ def worlds_from_table(scenario: ScenarioFields, columns: Mapping[str, ArrayLike]
 def worlds_from_state(scenario: ScenarioFields, initial_state: Mapping[str, Any]) -> Worlds:
     """Build one world (n = 1) from a state ``{"gaps_m": [7, 7], "speeds_mps": [20, 18, 20], ...}``.
 
-    The keys are the quantities of a scenario. A single number applies to every vehicle. Quantities without a key have
-    the scenario's value, which must be a fixed number. Raises ``InvalidInput`` for an invalid value; the message names
-    its key and its index.
+    The keys of a state are quantities of a scenario. A single number applies to every vehicle. Quantities without a key
+    have the scenario's value, which must be a fixed number. Raises ``InvalidInput`` for an invalid value; the message
+    names its key and its index.
     """
     if not isinstance(initial_state, Mapping):
         raise InvalidInput(f"initial_state = {initial_state!r}: must be a mapping such as {{'gaps_m': [7, 7]}}")

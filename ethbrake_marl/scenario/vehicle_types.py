@@ -66,7 +66,7 @@ TypeQuantity = Annotated[
 class VehicleType(FileModel):
     """A vehicle type: its weight in the random draw, and its quantities.
 
-    Quantities that it leaves out are declared outside ``vehicle_types``.
+    A quantity that the type does not declare has the scenario's general declaration outside ``vehicle_types``.
     """
 
     weight: Weight = Field(default=1.0, description="how likely this type is, relative to the other types")
@@ -210,8 +210,8 @@ Row = Annotated[tuple[Cell, ...], Field(strict=False, min_length=1)]
 class Table(FileModel):
     """A table of measured values: every world takes one of its rows, drawn by weight.
 
-    A scenario file may name a CSV file that contains the rows. Rows with the same text in the column ``recording`` come
-    from the same vehicles in the same recording, so they are not independent of each other.
+    A scenario file may name a CSV file that contains the rows of the table. Rows with the same text in the column
+    ``recording`` come from the same vehicles in the same recording, so they are not independent of each other.
     """
 
     file: str = Field(
@@ -257,7 +257,7 @@ class Table(FileModel):
         return self
 
     def column_values(self) -> dict[str, TableColumn]:
-        """Return the columns of the table by name, including ``recording``, each with the weights of the rows."""
+        """Return each column of the table by name, also ``recording``, together with the weights of the rows."""
         rows = self.rows or ()
         weights = self.weights if isinstance(self.weights, tuple) else (1.0,) * len(rows)
         cumulative = np.cumsum(np.asarray(weights))
