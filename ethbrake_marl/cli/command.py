@@ -32,7 +32,7 @@ ScenarioOption = Annotated[
 
 SettingsOption = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Change a setting: mass_t=40. Can be given several times."),
+    typer.Option("--set", metavar="KEY=VALUE", help="Change a setting, such as mass_t=40. Can be given several times."),
 ]
 
 StepsOption = Annotated[

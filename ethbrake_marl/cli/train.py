@@ -34,7 +34,9 @@ QUICKEST = ("quick", "ppo")  # `ethbrake run` trains the first of these recipes 
 
 QUICKEST_TEAM = ("cooperation", "cooperation-ppo")  # the same for scenarios with several learners
 
-TrainingSeedOption = Annotated[int | None, typer.Option(help="Seed of the training.", show_default="as in the recipe")]
+TrainingSeedOption = Annotated[
+    int | None, typer.Option(help="Seed of the training run.", show_default="as in the recipe")
+]
 
 OutputOption = Annotated[
     Path | None, typer.Option(metavar="FOLDER", help="Folder of the run.", show_default="runs/SCENARIO-RECIPE-seedSEED")
@@ -145,7 +147,7 @@ def train_command(
     seed: TrainingSeedOption = None,
     output: OutputOption = None,
     resume: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Continue the training in this run's folder.")
+        Path | None, typer.Option(metavar="FOLDER", help="Continue the training run in this folder.")
     ] = None,
     other_versions: Annotated[
         bool,

@@ -444,8 +444,8 @@ class V2X(FileModel):
             return worlds
         if self.drawn or equipped is None:
             raise InvalidInput(
-                f"{where}: the channel of the scenario (v2x: {self.preset}) is random, so worlds of your own need a"
-                " scenario with a fixed channel, for instance scenario.replace(v2x='paper')"
+                f"{where}: with v2x: {self.preset}, delays and losses of messages are drawn at random; worlds of your"
+                " own need a scenario without random messages, for instance scenario.replace(v2x='paper')"
             )
         n, N = worlds.speeds_mps.shape
         return self.with_channel(worlds, np.zeros((n, self.width(N))), np.zeros(n), time_step_s, equipped)

@@ -442,7 +442,8 @@ class ScenarioFields(FileModel):
         declared: AnyQuantity | tuple[AnyQuantity, ...] | None = getattr(self, QUANTITY.declared[field].name)
         if self.members:
             raise InvalidInput(
-                f"scenario {self.name!r}: is a mixture, so its members declare {field}; see Scenario.members"
+                f"scenario {self.name!r}: is a mixture of scenarios, each of which declares its own {field}; read"
+                f" {field} from a scenario in Scenario.members"
             )
         if declared is None and not self.declares(field):
             raise InvalidInput(

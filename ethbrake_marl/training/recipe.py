@@ -225,7 +225,9 @@ class TrainingRecipe(FileModel):
                 " or a scenario with one learner"
             )
         if scheme == "independent" and learners == 1:
-            raise InvalidInput(f"scheme independent: {where} has one learner; use the scheme single")
+            raise InvalidInput(
+                f"scheme independent: needs several learners, but {where} has one; use the scheme single"
+            )
         if scheme not in self.schemes:
             raise InvalidInput(
                 f"scheme {scheme}: the algorithm {self.algorithm} of recipe {self.name!r} does not support this scheme;"

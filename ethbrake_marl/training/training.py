@@ -148,7 +148,9 @@ def recorded_training(run: RunDirectory, config: Mapping[str, Any]) -> Training:
         recipe = TrainingRecipe.of(config["recipe"])
         scenario = Scenario.from_document(Document("scenario", config["scenario"], {}))
     except KeyError as error:
-        raise InvalidInput(f"{run.config}: does not describe a training, because {error} is missing") from None
+        raise InvalidInput(
+            f"{run.config}: does not describe a training run, because the key {error} is missing"
+        ) from None
     except InvalidInput as error:
         raise InvalidInput(f"{run.config}: {error}") from None
     return Training.of(recipe, scenario)
