@@ -515,7 +515,7 @@ def real_numbers(value: ArrayLike) -> Floats:
     if np.ma.is_masked(value):
         raise ValueError("is masked")
     if getattr(value, "requires_grad", False):
-        raise ValueError("needs gradients (pass its .detach())")
+        raise ValueError("needs gradients; pass its .detach()")
     try:
         array = np.asarray(value)
         if array.dtype.hasobject and array.ndim > 0:

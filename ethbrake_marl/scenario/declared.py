@@ -49,7 +49,7 @@ class ScenarioFields(FileModel):
     vehicle_types: VehicleTypes | None = Field(
         default=None,
         exclude_if=not_,
-        description="vehicle types by name, such as car and truck: weight and quantities of each type",
+        description="vehicle types by name, such as car and truck: how likely each type is, and its quantities",
     )
     types: Types | None = Field(
         default=None,
@@ -63,7 +63,7 @@ class ScenarioFields(FileModel):
     table: Table | None = Field(
         default=None,
         exclude_if=not_,
-        description="rows of measured values, one of which every world takes; quantities without a column are drawn",
+        description="table of measured values: every world takes one row; quantities without a column are drawn",
     )
     time_step_s: float = Field(default=0.1, ge=1e-3, allow_inf_nan=False, description="time between two decisions")
     horizon_s: float = Field(
@@ -108,7 +108,7 @@ class ScenarioFields(FileModel):
     )
     early_impacts: Literal["keep", "reject"] = Field(
         default="keep",
-        description="keep or reject worlds with an impact no later than the time at which the first learner can act",
+        description="keep or reject worlds with an impact at or before the first decision of a learner",
     )
 
     objective: ObjectiveName | Annotated[tuple[ObjectiveName, ...], Field(strict=False)] = Field(
@@ -123,7 +123,7 @@ class ScenarioFields(FileModel):
     )
     v2x: V2X = Field(
         default_factory=V2X,
-        description="what each vehicle knows, and when: name of a preset, or a mapping with the settings that differ",
+        description="what each vehicle knows, and when: name of a preset, or a mapping with settings of your own",
     )
 
     _members: tuple[ScenarioFields, ...] = PrivateAttr(default=())

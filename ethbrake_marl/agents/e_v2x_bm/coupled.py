@@ -221,7 +221,7 @@ class EV2XBM:
 
         others = fixed_commands(
             scripts, alert, f"agent {self.name!r}", vehicle=vehicle, is_fixed=is_fixed,
-            advice=f" before vehicle_{vehicle + 1} chooses; use e_v2x_bm:pairwise, which does not need the other"
+            advice=f", or only after vehicle_{vehicle + 1} chose; use e_v2x_bm:pairwise, which does not need the other"
             " vehicles' commands, for one of the two vehicles",
         )  # fmt: skip
         coupled = optimise_coupled(
