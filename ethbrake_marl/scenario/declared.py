@@ -107,8 +107,7 @@ class ScenarioFields(FileModel):
         description="additional vehicle behind the last vehicle of the line, at the same speed",
     )
     early_impacts: Literal["keep", "reject"] = Field(
-        default="keep",
-        description="keep or reject worlds with an impact at or before the first decision of a learner",
+        default="keep", description="keep or reject worlds with an impact at or before the first decision of a learner"
     )
 
     objective: ObjectiveName | Annotated[tuple[ObjectiveName, ...], Field(strict=False)] = Field(

@@ -361,10 +361,10 @@ def test_policy__gives_one_action_per_world_and_a_state_per_world() -> None:
 
     with refused("learned: actions have shape (12, 2); must have shape (12, 1), one action per world"):
         LearnedAgent(Fixed()).act(WORLDS, 1)
-    with refused("predict fails for 27 features: a state array has shape (1, 8) for two worlds and (1, 8) for three"):
+    with refused("27 features: an array of the policy's state has shape (1, 8) for two worlds and (1, 8) for three"):
         eb.policy_agent(Shared())
     states = eb.policy_agent(lambda seen, state: (seen, state), name="mine", initial_state=lambda n: np.zeros(3))
-    with refused("initial_state(12): state: ndarray of shape (3,); arrays must have length 12", AgentFailed):
+    with refused("initial_state(12): state: has ndarray of shape (3,); must have arrays of length 12", AgentFailed):
         states.begin(WORLDS, 1, {})
 
 
@@ -406,5 +406,5 @@ def test_model_of_stable_baselines3__was_trained_on_the_features_that_it_is_give
     ):
         eb.policy_agent(numbered, scenario=PAIR)
     stated = PPO("MlpPolicy", eb.make_sb3_vec_env(PAIR, 2, appended="state")).policy
-    with refused("agent 'ActorCriticPolicy': appended = 'state': pass scenario=, the training scenario"):
+    with refused("agent 'ActorCriticPolicy': appended = 'state' needs the scenario of the training; pass it"):
         eb.policy_agent(stated, appended="state")

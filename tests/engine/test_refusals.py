@@ -219,5 +219,5 @@ def test_snapshot__of_another_engine_is_refused() -> None:
     with refused("engine snapshot: the array params has the shape (6, 25); must have the shape (6, 37)"):
         make_engine(load_scenario("cooperation-2-blocked"), 6).restore(kept)
     del kept["params"]
-    with refused("engine snapshot: the array params is missing; the shape (6, 25) is needed"):
+    with refused("engine snapshot: the array params is missing; must have the shape (6, 25)"):
         make_engine(PAPER, 6).restore(kept)
