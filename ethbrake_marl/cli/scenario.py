@@ -352,7 +352,9 @@ def scenario_sample(
     settings: SettingsOption = None,
     output: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="File for the worlds: .csv, .png, .svg or .pdf.", show_default="stdout"),
+        typer.Option(
+            metavar="FILE", help="File for the table (.csv) or the picture (.png, .svg or .pdf).", show_default="stdout"
+        ),
     ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,

@@ -186,7 +186,7 @@ def train_command(
             _show(out, training.resume(resume, on_progress=out.show_progress, other_versions=other_versions))
             return
         if other_versions:
-            raise InvalidInput("--other-versions: has no effect on a new training; use it only with --resume FOLDER")
+            raise InvalidInput("--other-versions: has no effect on a new run; use it only with --resume FOLDER")
         plan = training.load_recipe(recipe or "ppo")
         changes = training.read_settings(settings, [plan])
         chosen = evaluation.load_runnable(scenario or "paper-random", changes.scenario)

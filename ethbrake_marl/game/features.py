@@ -519,7 +519,7 @@ def register_feature(
     _check_numbers(name, scale=scale, low=low, high=high, unknown=unknown)
     if of not in get_args(Of) or (of == "own" and unknown != 0.0):
         raise InvalidInput(
-            f"feature {name!r}: of = {of!r}, unknown = {unknown:g}: of must be 'own' or 'neighbour'; if of is 'own',"
+            f"feature {name!r}: of = {of!r}, unknown = {unknown:g}: of must be 'own' or 'neighbour'; with of = 'own',"
             " unknown must be 0"
         )
 

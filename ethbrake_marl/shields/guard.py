@@ -132,7 +132,7 @@ class StepGuard(ShieldGuard):
         if self._told is None:
             k = int(np.argmax(surprising))
             raise UncertifiedStep(
-                f"shield: after this step of world {k}, the {difference(running.nominal().states[k], seen[k])}"
+                f"shield: after this step of world {k}, {difference(running.nominal().states[k], seen[k])}"
             )
         shield = copy.copy(shield)
         shield.memory = shield.memory._replace(distrusted=distrusted | surprising)

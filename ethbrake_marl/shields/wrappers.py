@@ -284,8 +284,8 @@ def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, *
             inside = inside.env
         if not isinstance(inside, ParallelEnv):
             raise InvalidInput(
-                f"shield: in {inside} the agents act one after the other; shield the parallel environment inside it"
-                " with eb.shielded_aec(parallel)"
+                f"shield: in {inside} the agents act one after the other; make a shielded environment of this kind from"
+                " a parallel environment: eb.shielded_aec(parallel)"
             )
         return shielded_aec(inside, policy, **settings)
     if isinstance(env, VectorEnv):

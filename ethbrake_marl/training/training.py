@@ -169,6 +169,6 @@ def check_same_training(run: RunDirectory, training: Training) -> None:
         if key not in before[part] or key not in wanted[part] or before[part][key] != wanted[part][key]
     ]
     raise InvalidInput(
-        f"{run.path}: this folder contains another training, which differs in {', '.join(other)}; choose another folder"
-        " (--output)"
+        f"{run.path}: this folder contains another training run, which differs in {', '.join(other)}; choose another"
+        " folder (--output)"
     )

@@ -48,10 +48,10 @@ PARTS: dict[str, Callable[[], object]] = {
     "feature 'mine': high = nan: must be a finite number": lambda: eb.register_feature(
         "mine", TIME, **SCALED | {"high": float("nan")}
     ),
-    "of = 'both', unknown = 0: of must be 'own' or 'neighbour'; if of is": lambda: eb.register_feature(
+    "of = 'both', unknown = 0: of must be 'own' or 'neighbour'; with of = 'own'": lambda: eb.register_feature(
         "mine", TIME, **SCALED, of="both"
     ),
-    "of = 'own', unknown = 1: of must be 'own' or 'neighbour'; if of is": lambda: eb.register_feature(
+    "of = 'own', unknown = 1: of must be 'own' or 'neighbour'; with of = 'own'": lambda: eb.register_feature(
         "mine", TIME, **SCALED, unknown=1.0
     ),
     "feature 'mine': its function returned float64 values of shape (); must return numbers of shape (3,),": lambda: (

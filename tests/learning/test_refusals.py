@@ -260,7 +260,7 @@ def test_folder__that_is_there_is_not_replaced_unasked(run: RunDirectory) -> Non
 def test_folder__of_another_training_is_refused(
     training: Callable[[], Training], other: str, run: RunDirectory
 ) -> None:
-    with refused(f"run: this folder contains another training, which differs in {other}; choose another folder"):
+    with refused(f"run: this folder contains another training run, which differs in {other}; choose another folder"):
         check_same_training(run, training())
 
 

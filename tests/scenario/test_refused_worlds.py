@@ -124,8 +124,8 @@ GIVEN: dict[str, Callable[[], object]] = {
     "initial_state: gaps_m[1] = 12000: must be finite and in [0, 10000] m (metres)": lambda: worlds_from_state(
         PAPER.replace(time_gaps_s=[1, 60]), {"speeds_mps": [20, 20, 200], "speed_limit_mps": 200}
     ),
-    "initial_state: with v2x: nominal, delays and losses of messages are drawn at random; worlds": lambda: (
-        worlds_from_state(PAPER.replace(v2x="nominal", early_impacts="keep"), {"gaps_m": 7, "speeds_mps": 20})
+    "initial_state: with v2x: nominal, it is random which messages arrive, and when; worlds": lambda: worlds_from_state(
+        PAPER.replace(v2x="nominal", early_impacts="keep"), {"gaps_m": 7, "speeds_mps": 20}
     ),
 }
 

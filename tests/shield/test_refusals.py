@@ -182,7 +182,7 @@ AROUND: dict[str, Callable[[], object]] = {
     "HybridShield: ethbrake_v1: must be an environment made by eb.parallel_env; eb.shield(env) chooses": lambda: (
         HybridShield(aec_env(), mode="step")
     ),
-    "shield: in BaseWrapper<ethbrake_v1> the agents act one after the other; shield the parallel": lambda: eb.shield(
+    "shield: in BaseWrapper<ethbrake_v1> the agents act one after the other; make a shielded": lambda: eb.shield(
         BaseWrapper(aec_env())
     ),
     "shield: None: must be an agent, a team, or an environment made by eb.parallel_env, eb.env": lambda: eb.shield(
