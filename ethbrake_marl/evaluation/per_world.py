@@ -238,14 +238,14 @@ def read_result(path: Path) -> Result:
             raise InvalidInput(f"{who}: episodes = {row['episodes']!s:.40}: must be from 1 to {_MOST_EPISODES:,}")
         if not 0 <= row["horizon_ends"] <= row["episodes"]:
             raise InvalidInput(
-                f"{who}: horizon_ends (episodes in which a vehicle still moves at the horizon) ="
-                f" {row['horizon_ends']!s:.40}: must be from 0 to {row['episodes']:,}"
+                f"{who}: horizon_ends = {row['horizon_ends']!s:.40}: must be the number of episodes in which a vehicle"
+                f" still moves at the horizon, from 0 to {row['episodes']:,}"
             )
         draws = recorded_value(row, "recordings") or f"{row['episodes']}"
         if not (draws.isdecimal() and len(draws) < 14 and 1 <= int(draws) <= row["episodes"]):
             raise InvalidInput(
-                f"{who}: recordings (number of recordings from which the worlds come) = {draws:.40}: must be from 1 to"
-                f" {row['episodes']:,}, or be missing"
+                f"{who}: recordings = {draws:.40}: must be the number of recordings from which the worlds come, from 1"
+                f" to {row['episodes']:,}, or be missing"
             )
         shoved = row.get("vehicle_1_shoved_m")
         if shoved is not None and not (type(shoved) in (int, float) and abs(shoved) <= _MOST_HARM):
