@@ -641,7 +641,7 @@ class Engine:
         if state.impacts is not None:
             names = ", ".join(self._terms.impact_names)
             raise InvalidInput(
-                f"place: the reward terms {names} need all impacts of an episode, but a world that is placed in the"
+                f"place: the reward needs all impacts of an episode (for {names}), but a world that is placed in the"
                 " engine has no record of its impacts"
             )
         if worlds.speeds_mps.shape != state.wanted.shape:
