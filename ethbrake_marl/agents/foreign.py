@@ -70,8 +70,8 @@ def adapt_policy(policy: Any, name: str, features: int, initial_state: Begin | N
 def _without_memory(action: Any) -> Any:
     if isinstance(action, tuple):
         raise InvalidInput(
-            f"returned a tuple of {len(action)} values; must return an action; for a policy with a memory, which"
-            " returns (action, state), pass initial_state"
+            f"returned a tuple of {len(action)} values; must return the actions alone; a function that returns"
+            " (action, state) also needs the argument initial_state"
         )
     return action
 
@@ -100,8 +100,8 @@ def _ask_model(model: Any, name: str, features: int) -> tuple[Infer, Begin | Non
         candidates = [axis for axis, sizes in enumerate(zip(*shapes, strict=True)) if sizes == (2, 3)]
         if len(candidates) != 1:
             raise InvalidInput(
-                f"a state array has shape {shapes[0]} for two worlds and {shapes[1]} for three; exactly one axis must"
-                " be as long as the number of worlds"
+                f"an array of the policy's state has shape {shapes[0]} for two worlds and {shapes[1]} for three"
+                " worlds; exactly one axis must be as long as the number of worlds"
             )
         return candidates[0]
 
@@ -109,7 +109,10 @@ def _ask_model(model: Any, name: str, features: int) -> tuple[Infer, Begin | Non
         like, of_three = (predict(np.zeros((n, features), np.float32))[1] for n in (2, 3))
         axes = map_memory(world_axis, like, of_three)
     except Exception as error:
-        raise InvalidInput(f"agent {name!r}: predict fails for {features} features: {describe_error(error)}") from error
+        raise InvalidInput(
+            f"agent {name!r}: the model's method predict fails for an observation of {features} features:"
+            f" {describe_error(error)}"
+        ) from error
     if like is None:
         return lambda seen, _: (predict(seen)[0], None), None
 
@@ -260,13 +263,15 @@ def policy_agent(
     if appended is None and (appended := getattr(trained, "appended", None)) is not None:
         scenario = trained.engine.scenario if scenario is None else scenario
     if appended is not None and scenario is None:
-        raise InvalidInput(f"agent {named!r}: appended = {appended!r}: pass scenario=, the training scenario")
+        raise InvalidInput(
+            f"agent {named!r}: appended = {appended!r} needs the scenario of the training; pass it as scenario=..."
+        )
     size = spec.size if scenario is None else len(row_features(spec.features, appended, scenario))
     shape = getattr(getattr(policy, "observation_space", None), "shape", None)
     if shape not in (None, (size,)):
         raise InvalidInput(
-            f"agent {named!r}: the policy takes observations of shape {shape}, but this observation has {size}"
-            " features; pass scenario, observation or appended as in training"
+            f"agent {named!r}: the policy was trained for observations of shape {shape}, but would get observations of"
+            f" {size} features; pass the scenario, observation or appended of the training"
         )
     seen = spec if trained is None or ignore_wrappers else trained.engine.observation
     if [f.name for f in spec.features] != [f.name for f in seen.features]:
@@ -310,7 +315,8 @@ def _appending(appended: Appended, scenario: Scenario) -> Callable[[Worlds, int]
     def number(worlds: Worlds, vehicle: int) -> Observations:
         if vehicle not in scenario.learners:
             raise InvalidInput(
-                f"appended = 'number': vehicle_{vehicle + 1} must be a learner of scenario {scenario.name!r}"
+                f"appended = 'number' adds the learner's number to the observation, but vehicle_{vehicle + 1} is not a"
+                f" learner of scenario {scenario.name!r}"
             )
         return np.full((worlds.n, 1), scenario.learners.index(vehicle), np.float32)
 
@@ -437,18 +443,18 @@ class PolicyAgent:
             return self._checked_indices(action, self._actions, what, worlds, steps)
         if action.shape != (n, 1) or action.dtype.kind not in "fiu":
             first = len(action) if action.shape[1:] in ((), (1,)) and action.ndim and len(action) < n else 0
-            raise self._refusal(first, worlds, steps, f"{what}; must be one number per world, shape ({n}, 1)")
+            raise self._refusal(first, worlds, steps, f"{what}; must return one number per world, shape ({n}, 1)")
         values: Floats = action[:, 0].astype(np.float64)
         if not np.isfinite(values).all():
             k = int(np.argmin(np.isfinite(values)))
             raise self._refusal(
-                k, worlds, steps, f"{what}; the action of this world is {values[k]}; must be in [-1, 1]"
+                k, worlds, steps, f"{what}; the action for this world is {values[k]}; must be in [-1, 1]"
             )
         inside = np.abs(values) <= LARGEST
         if not (self._clip or inside.all()):
             k = int(np.argmin(inside))
             right = "must be in [-1, 1]; clip=True clips such actions"
-            raise self._refusal(k, worlds, steps, f"{what}; the action of this world is {values[k]:g}; {right}")
+            raise self._refusal(k, worlds, steps, f"{what}; the action for this world is {values[k]:g}; {right}")
         return values.clip(-1.0, 1.0)
 
     def _checked_indices(self, indices: NDArray[Any], count: int, what: str, worlds: Worlds, steps: Ints) -> Floats:
@@ -461,7 +467,7 @@ class PolicyAgent:
         inside = (row >= 0) & (row <= last)
         if not inside.all():
             k = int(np.argmin(inside))
-            raise self._refusal(k, worlds, steps, f"{what}; the index of this world is {row[k]}; {right}")
+            raise self._refusal(k, worlds, steps, f"{what}; the action index for this world is {row[k]}; {right}")
         return index_to_action(row, count)
 
     def _refusal(self, k: int, worlds: Worlds, steps: Ints, reason: str) -> AgentFailed:

@@ -98,14 +98,14 @@ def training_environment(model: Any, name: str, *, ignore_wrappers: bool = False
     features = [base.engine.observation.features for base in bases]
     if not ignore_wrappers and any(each != features[0] for each in features):
         raise InvalidInput(
-            f"agent {name!r}: the copies of the model's environment observe different features; all copies must"
-            " observe the same"
+            f"agent {name!r}: the parallel environments with which the model was trained have observations with"
+            " different features; all must have the same features"
         )
     counts = {getattr(base, "actions", None) for base in bases}
     if not ignore_wrappers and len(counts) > 1:
         raise InvalidInput(
-            f"agent {name!r}: the copies of the model's environment have different numbers of actions, {counts}; all"
-            " must have the same number"
+            f"agent {name!r}: the parallel environments with which the model was trained have different numbers of"
+            f" discrete actions, {counts}; all must have the same number"
         )
     return bases[0] if bases else None
 

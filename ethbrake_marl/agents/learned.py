@@ -52,6 +52,6 @@ class LearnedAgent(ByPolicy):
         action = self.policy(observe(worlds, vehicle, self.policy.observation)).astype(np.float64)
         if action.shape != (worlds.n, 1):
             raise InvalidInput(
-                f"{self.name}: shape of actions = {action.shape}: must be ({worlds.n}, 1), one action per world"
+                f"{self.name}: actions have shape {action.shape}; must have shape ({worlds.n}, 1), one action per world"
             )
         return action_to_command(action[:, 0], worlds.vehicles, vehicle)

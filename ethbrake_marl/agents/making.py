@@ -59,10 +59,10 @@ def make_agent(
     if horizon_s is None:
         horizon_s = HORIZON_S if scenario is None else scenario.horizon_s
     if not isinstance(horizon_s, int | float | np.number) or not 0.0 < horizon_s < float("inf"):
-        raise InvalidInput(f"horizon_s = {horizon_s!r}: must be a positive number of seconds")
+        raise InvalidInput(f"horizon_s = {horizon_s!r}: must be a finite number of seconds above 0")
     written = parse_spec(spec)
     if written.name == PROFILE:
-        raise InvalidInput(f"agent {spec!r}: a profile can only be a role in a scenario, not an agent")
+        raise InvalidInput(f"agent {spec!r}: a braking profile can only be the role of a vehicle in a scenario")
     settings = AgentSettings(
         written.core, written.policy, scenario, harm_count, float(horizon_s), most_candidates, uncertainty,
         time_step_s or (0.1 if scenario is None else scenario.time_step_s),
@@ -129,7 +129,9 @@ def find_entry(spec: AgentSpec | str) -> Entry:
         raise unknown_name(f"variant of {written.name}", word, variants_of(written.name))
     if written.policy is not None and "@" not in entry.form:
         own = "" if entry.is_ours else "; to allow one, register the agent with register_agent(..., takes_policy=True)"
-        raise InvalidInput(f"agent {written.core!r}: {written.name} takes no policy{own}")
+        raise InvalidInput(
+            f"agent {written.core!r}: {written.name} does not use a policy; leave out @ and what follows{own}"
+        )
     return entry
 
 

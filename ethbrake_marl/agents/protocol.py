@@ -159,14 +159,14 @@ def fixed_commands(
         if not is_fixed(script):
             name = getattr(script, "name", type(script).__name__)
             raise InvalidInput(
-                f"{who}: vehicle_{i + 1} is controlled by {name!r}, whose command is not fixed at the alert{advice}"
+                f"{who}: vehicle_{i + 1} is driven by {name!r}, whose command is not fixed at the alert{advice}"
             )
         command[:, i], _ = ask_script(script, worlds, begin_script(script, worlds, i, scripts), i)
     pieces = {i: getattr(script, "braking_pieces", ()) for i, script in scripts.items() if i != vehicle}
     if not np.array_equal(worlds.play_pieces(pieces).vehicles.pieces, worlds.vehicles.pieces):
         raise InvalidInput(
-            f"{who}: the braking profiles in these worlds differ from the profiles of the scripts; draw or read the"
-            " worlds with the same scenario"
+            f"{who}: in these worlds, vehicles follow other braking profiles than the scripts of the scenario do; draw"
+            " or read the worlds with the same scenario"
         )
     return command
 
@@ -286,7 +286,7 @@ class Team:
     def __init__(self, drivers: Mapping[int, Agent], name: str, shield: Shielding | None = None) -> None:
         for vehicle, agent in drivers.items():
             if isinstance(vehicle, bool) or not isinstance(vehicle, int | np.integer) or not vehicle >= 0:
-                raise InvalidInput(f"team {name!r}: key {vehicle!r}: must be the index of a vehicle, 0 or more")
+                raise InvalidInput(f"team {name!r}: key {vehicle!r}: must be the index of a vehicle, at least 0")
             if not isinstance(agent, Agent):
                 raise InvalidInput(
                     f"team {name!r}: {agent!r} of vehicle_{vehicle + 1}: must be an agent, for instance one from"

@@ -228,7 +228,7 @@ def register_agent(
 
     """
     if ScriptSpec.parse(name) != ScriptSpec(name, None) or "@" in name:
-        raise InvalidInput(f"agent name {name!r}: must be a plain name without argument")
+        raise InvalidInput(f"agent name {name!r}: must be a name without ':' and '@', for instance my_agent")
     if name in group_names():
         raise AlreadyExists(f"agent {name!r}: is the name of a group of agents; choose another name")
     form = f"{name}[:ARGUMENT]{'[@POLICY]' * takes_policy}" if form is None else form
@@ -270,7 +270,9 @@ def register_shield(
 
     """
     if not isinstance(name, str) or not _PLAIN.fullmatch(name):
-        raise InvalidInput(f"shield name {name!r}: must be a plain name without argument")
+        raise InvalidInput(
+            f"shield name {name!r}: must begin with a letter a-z and have only the characters a-z, 0-9, _, . and -"
+        )
     form = f"+{name}[:ARGUMENT]" if form is None else form
     entry = Entry(name, form, about, knows, wrapper, inner, teams, needs or {}, options)
     SHIELDS.add(name, entry, lambda entry: entry.make is wrapper)

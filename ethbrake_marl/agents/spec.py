@@ -148,7 +148,7 @@ def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
     if len(shields) > 1 or any(each not in shields for each in around[1:]):
         searches = [each for each in around_forms() if around_entry(each).inner]
         raise InvalidInput(
-            f"agent {spec!r}: must have at most one +{', +'.join(searches)}, then at most one shield"
+            f"agent {spec!r}: may have at most one search (+{', +'.join(searches)}), then at most one shield"
             f" (+{', +'.join(shield_forms())}), for instance ppo+search+step"
         )
     return core, tuple(around)

@@ -32,12 +32,14 @@ ScenarioOption = Annotated[
 
 SettingsOption = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Change a setting: mass_t=40. Can be given several times."),
+    typer.Option("--set", metavar="KEY=VALUE", help="Change a setting, such as mass_t=40. Can be given several times."),
 ]
 
 StepsOption = Annotated[
     int | None,
-    typer.Option(help="Training steps (decisions), rounded up to whole updates.", show_default="as in the recipe"),
+    typer.Option(
+        help="Number of training steps (decisions), rounded up to whole updates.", show_default="as in the recipe"
+    ),
 ]
 
 AgentsOption = Annotated[
@@ -51,7 +53,8 @@ JobsOption = Annotated[
 ]
 
 RayOption = Annotated[
-    str | None, typer.Option(metavar="local|ADDRESS", help="Compute with Ray, on this machine or a running cluster.")
+    str | None,
+    typer.Option(metavar="local|ADDRESS", help="Compute with Ray: on this machine, or on the cluster at ADDRESS."),
 ]
 
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing files.")]

@@ -323,7 +323,7 @@ def _moving(rows: Sequence[evaluation.SummaryRow]) -> dict[str, int]:
     return {row.agent: row.horizon_ends for row in rows if row.policy_share is not None}
 
 
-_FILE = typer.Argument(metavar="RESULTS.json", help="File results.json of evaluate or run, or output of --json.")
+_FILE = typer.Argument(metavar="RESULTS.json", help="File results.json of `evaluate` or `run`, or output of --json.")
 
 
 def compare_command(first: Annotated[Path, _FILE], second: Annotated[Path, _FILE], as_json: JsonOption = False) -> None:

@@ -283,7 +283,7 @@ def scenario_new(
     based_on: Annotated[
         str, typer.Option(metavar="NAME|PATH", help="Scenario from which the new scenario takes its values.")
     ] = "paper-random",
-    output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of the new file.")] = Path(),
+    output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for the new file.")] = Path(),
     force: ForceOption = False,
 ) -> None:
     """Write a new scenario file, NAME.yaml, with comments.
@@ -353,7 +353,9 @@ def scenario_sample(
     settings: SettingsOption = None,
     output: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="File for the worlds: .csv, .png, .svg or .pdf.", show_default="stdout"),
+        typer.Option(
+            metavar="FILE", help="File for the table (.csv) or the picture (.png, .svg or .pdf).", show_default="stdout"
+        ),
     ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,

@@ -34,7 +34,9 @@ QUICKEST = ("quick", "ppo")  # `ethbrake run` trains the first of these recipes 
 
 QUICKEST_TEAM = ("cooperation", "cooperation-ppo")  # the same for scenarios with several learners
 
-TrainingSeedOption = Annotated[int | None, typer.Option(help="Seed of the training.", show_default="as in the recipe")]
+TrainingSeedOption = Annotated[
+    int | None, typer.Option(help="Seed of the training run.", show_default="as in the recipe")
+]
 
 OutputOption = Annotated[
     Path | None, typer.Option(metavar="FOLDER", help="Folder of the run.", show_default="runs/SCENARIO-RECIPE-seedSEED")
@@ -144,7 +146,7 @@ def train_command(
     seed: TrainingSeedOption = None,
     output: OutputOption = None,
     resume: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Continue the training in this run's folder.")
+        Path | None, typer.Option(metavar="FOLDER", help="Continue the training run in this folder.")
     ] = None,
     other_versions: Annotated[
         bool,
@@ -183,7 +185,7 @@ def train_command(
             _show(out, training.resume(resume, on_progress=out.show_progress, other_versions=other_versions))
             return
         if other_versions:
-            raise InvalidInput("--other-versions: has no effect on a new training; use it only with --resume FOLDER")
+            raise InvalidInput("--other-versions: has no effect on a new run; use it only with --resume FOLDER")
         plan = training.load_recipe(recipe or "ppo")
         changes = training.read_settings(settings, [plan])
         chosen = evaluation.load_runnable(scenario or "paper-random", changes.scenario)

@@ -205,7 +205,7 @@ class Engine:
         self.deciders = self.learners if deciders is None else tuple(deciders)
         if not set(self.deciders) <= set(range(scenario.vehicles)):
             raise InvalidInput(
-                f"engine: deciders = {self.deciders}: all must be vehicle indices from 0 to {scenario.vehicles - 1}"
+                f"engine: deciders = {self.deciders}: must be indices of vehicles, from 0 to {scenario.vehicles - 1}"
             )
         self._terms = Terms(reward, scenario, self.learners or self.deciders, reward_vector)
         self.reward, self.components = self._terms.params, self._terms.components  # components of the vector reward
@@ -493,7 +493,7 @@ class Engine:
         vehicles = self._learner_index if vehicles is None else vehicles
         if not self._alike and len({self.observations[i] for i in vehicles.tolist()}) > 1:
             names = ", ".join(self.scenario.vehicle_names[i] for i in vehicles.tolist())
-            raise InvalidInput(f"observe_all: {names} observe different features; use observe for each vehicle")
+            raise InvalidInput(f"observe_all: {names} observe different features; call observe for each vehicle")
         state = self._now.state
         motion, params, clock = state.motion, state.params, state.clock
         plan: Plan = self._plans[0 if self._alike else int(vehicles[0])]
@@ -511,7 +511,7 @@ class Engine:
         if len(rows) == 0:
             return
         if not 0 <= np.min(rows) <= np.max(rows) < self.n or np.bincount(rows).max() > 1:
-            raise InvalidInput(f"renew: rows = {rows}: must be different numbers from 0 to {self.n - 1}")
+            raise InvalidInput(f"renew: rows = {rows}: must be different row numbers from 0 to {self.n - 1}")
         new = self if self._nobody_refuses_episodes else self._at(self._now.apart())
         (state, roster, stream, *_), now = new._now, new._now
         position = stream.position
@@ -601,7 +601,7 @@ class Engine:
             have = arrays.get(name)
             if have is None or have.shape != needed:
                 what = "is missing" if have is None else f"has the shape {have.shape}"
-                raise InvalidInput(f"engine snapshot: the array {name} {what}; the shape {needed} is needed")
+                raise InvalidInput(f"engine snapshot: the array {name} {what}; must have the shape {needed}")
         impacts = self.state.impacts and self.state.impacts.read(arrays)
         memories = {vehicle: checked_memory(unflat(arrays, f"script.{vehicle}"), self.n) for vehicle in self.memories}
         motion, params, clock, moving, potential = (np.array(arrays[name], np.float64) for name in SNAPSHOT)
@@ -640,7 +640,10 @@ class Engine:
         state = self.state
         if state.impacts is not None:
             names = ", ".join(self._terms.impact_names)
-            raise InvalidInput(f"place: the reward {names} needs every impact, and placed worlds do not contain them")
+            raise InvalidInput(
+                f"place: the reward needs all impacts of an episode (for {names}), but a world that is placed in the"
+                " engine has no record of its impacts"
+            )
         if worlds.speeds_mps.shape != state.wanted.shape:
             n, N = state.wanted.shape
             raise InvalidInput(
@@ -673,7 +676,7 @@ class Engine:
         depend on more than the state.
         """
         if self.reward.shaping > 0.0:
-            raise InvalidInput(f"branch: the reward has shaping = {self.reward.shaping:g}; it must be 0 to branch")
+            raise InvalidInput(f"branch: the reward has shaping = {self.reward.shaping:g}; branch needs shaping = 0")
         n = len(state.motion)
         roster = Roster(n, self.seed, None)
         roster.warns = False

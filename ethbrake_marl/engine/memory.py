@@ -51,7 +51,10 @@ def renew_memory(memory: Memory, rows: Ints, part: Memory) -> Memory:
     if part is None:
         return memory
     if memory is None or (isinstance(part, Mapping) and not part.keys() <= memory.keys()):
-        raise InvalidInput("agent: begin returned a memory with other entries than in earlier episodes")
+        raise InvalidInput(
+            "agent: begin returned a memory with keys that are not in the memory of earlier episodes; must return the"
+            " same keys in every episode"
+        )
     if isinstance(part, Mapping):
         return {key: renew_memory(of, rows, part.get(key)) for key, of in memory.items()}
     if isinstance(part, tuple | list):
@@ -72,7 +75,9 @@ def checked_memory(memory: Memory, n: int, what: str = "state") -> Memory:
     def check(array: Any) -> Any:
         shape = tuple(getattr(array, "shape", ()))
         if not shape or shape[0] != n:
-            raise InvalidInput(f"{what}: {type(array).__name__} of shape {shape}; arrays must have length {n} (worlds)")
+            raise InvalidInput(
+                f"{what}: has {type(array).__name__} of shape {shape}; must have arrays of length {n} (worlds)"
+            )
         if array.dtype.hasobject:
             raise InvalidInput(f"{what}: contains an array of objects; arrays must contain numbers, booleans or texts")
         return array
@@ -82,7 +87,7 @@ def checked_memory(memory: Memory, n: int, what: str = "state") -> Memory:
         if isinstance(part, Mapping):
             for key in part:
                 if not (isinstance(key, str) and key.isidentifier()):
-                    raise InvalidInput(f"{what}: key {key!r}: must be an identifier, for instance 'asked_s'")
+                    raise InvalidInput(f"{what}: key {key!r}: must be a Python identifier, for instance 'asked_s'")
             parts += part.values()
         elif isinstance(part, tuple | list):
             parts += part
@@ -112,7 +117,9 @@ def unflat(arrays: Mapping[str, NDArray[Any]], place: str) -> Memory:
         return np.array(arrays[place]) if arrays[place].shape != (0,) else None
     inner = dict.fromkeys(name[len(place) + 1 :].partition(".")[0] for name in arrays if name.startswith(f"{place}."))
     if not inner:
-        raise InvalidInput(f"engine snapshot: {place} is missing; the memory of this vehicle's script is needed")
+        raise InvalidInput(
+            f"engine snapshot: the array {place} is missing, which contains the memory of a vehicle's script"
+        )
     parts = {name: unflat(arrays, f"{place}.{name}") for name in inner}
     return tuple(parts[str(k)] for k in range(len(parts))) if "0" in parts else parts
 
@@ -126,8 +133,8 @@ def _check_kept(before: Memory, after: Memory, who: str) -> None:
     began, kinds = (map_memory(lambda array: (array.dtype, *array.shape[1:]), each) for each in (before, after))
     if began != kinds:
         raise InvalidInput(
-            f"{who}: act got a memory of the form {began} and returned the form {kinds}; keys, shapes and dtypes must"
-            " stay as begin made them"
+            f"{who}: act got a memory of the form {began}, but returned a memory of the form {kinds}; keys, shapes and"
+            " dtypes must stay as in the memory that begin returned"
         )
 
 
@@ -163,7 +170,9 @@ def begin_script(script: Script, alert: Worlds, vehicle: int, scripts: Mapping[i
         if is_ours(script):
             return begin(alert, vehicle, scripts)
         if len(inspect.signature(script.act).parameters) == 2:
-            raise InvalidInput(f"{_who(script, vehicle)}: the agent has begin, but act takes no memory; {_SHAPES}")
+            raise InvalidInput(
+                f"{_who(script, vehicle)}: the agent has begin, but act has no argument memory; {_SHAPES}"
+            )
         with _as_it_was(script, vehicle):
             return checked_memory(
                 begin(alert.read_only(), vehicle, scripts), alert.n, f"{_who(script, vehicle)}: memory"
@@ -203,7 +212,7 @@ def ask_script(script: Script, worlds: Worlds, memory: Memory, vehicle: int) -> 
             getattr(script, "name", type(script).__name__),
             row if worlds.n else None,
             f"vehicle_{vehicle + 1} at {worlds.time_s[row : row + 1].min(initial=np.inf):.2f} s: act returned"
-            f" {commands.dtype} of shape {commands.shape}; one number per world is needed, shape ({worlds.n},)",
+            f" {commands.dtype} of shape {commands.shape}; must return one number per world, shape ({worlds.n},)",
         )
     return command, memory
 
@@ -270,6 +279,6 @@ def within_capacity(
             getattr(script, "name", type(script).__name__),
             k,
             f"vehicle_{vehicle + 1} at {worlds.time_s[k]:.2f} s: command {command_mps2[k]:g} m/s2; must be in"
-            f" [{low[k]:g}, {high[k]:g}]",
+            f" [{low[k]:g}, {high[k]:g}] m/s2",
         )
     return command_mps2

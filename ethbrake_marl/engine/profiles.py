@@ -213,7 +213,10 @@ class ProfileProblem(NamedTuple):
             profiles.ends[:, -1] == self.last_step
         ).all()
         if not ordered:
-            raise InvalidInput("profiles: phases must end one after the other, the last one at the last step")
+            raise InvalidInput(
+                "profiles: ends, the steps at which the phases end, must not decrease along a row, and the last phase"
+                " of each row must end at the last step"
+            )
 
 
 def profile_problem(
@@ -251,12 +254,12 @@ def profile_problem(
     check_harm_count(harm_count)
     if not (0.0 < time_step_s < math.inf and 0.0 < horizon_s < math.inf):
         raise InvalidInput(
-            f"time_step_s = {time_step_s!r}, horizon_s = {horizon_s!r}: both must be positive numbers of seconds"
+            f"time_step_s = {time_step_s!r}, horizon_s = {horizon_s!r}: must be finite numbers of seconds above 0"
         )
     v = worlds.vehicles
     command = -v.braking_capacity_mps2 if others_mps2 is None else np.array(others_mps2, np.float64)
     if command.shape != worlds.speeds_mps.shape:
-        raise InvalidInput(f"others_mps2: shape {command.shape}; the shape {worlds.speeds_mps.shape} is needed")
+        raise InvalidInput(f"others_mps2: has shape {command.shape}; must have shape {worlds.speeds_mps.shape}")
     command[:, chosen] = 0.0
     obstacle = worlds.obstacle_ahead
     if obstacle.any() or written_out:

@@ -77,8 +77,8 @@ def _drawn_again(engine: Engine, numbers: Ints) -> Sample:
     if not same.all():
         k = int(rows[np.argmin(same)])
         raise InvalidInput(
-            f"describe_worlds: the random draw of row {k} is unknown, because the physics failed in world"
-            f" {engine.roster.numbers[k]} of seed {engine.roster.seed} before its first decision, and another world"
-            " replaced it; call reset"
+            f"describe_worlds: the random draw of row {k} is unknown: the physics failed in world"
+            f" {engine.roster.numbers[k]} of seed {engine.roster.seed} before its first decision, so another world"
+            " replaced this world; call reset"
         )
     return sample

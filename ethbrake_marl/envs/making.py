@@ -92,8 +92,8 @@ def make_engine(
     loaded = load_scenario(scenario)
     if not (observation is None or isinstance(observation, ObservationSpec | list | tuple | Mapping)):
         raise InvalidInput(
-            f"observation = {observation!r}: must be an ObservationSpec, for instance ObservationSpec(1, 1), its fields"
-            " as a mapping, or a list of groups and features, for instance ['own', 'front_1']"
+            f"observation = {observation!r}: must be a list of groups and features such as ['own', 'front_1'], an"
+            " ObservationSpec such as ObservationSpec(1, 1), or a mapping with the fields of an ObservationSpec"
         )
     if learners is not None and not isinstance(learners, Iterable):
         raise InvalidInput(f"learners = {learners!r}: must be a list of vehicle names, for instance ['vehicle_2']")

@@ -195,7 +195,8 @@ class EthBrakeVecEnv(Begun, VecEnv):
         engine, learners = self.engine, self._learners
         if actions.size != self.num_envs:
             raise InvalidInput(
-                f"step: actions have the shape {actions.shape}: must have one action per row, ({self.num_envs}, 1)"
+                f"step: actions have the shape {actions.shape}; must have the shape ({self.num_envs}, 1), one action"
+                " for each learner of each world"
             )
         if self.actions is not None:
             actions = checked_action(actions, actions.shape, "the learners", self.actions)
@@ -344,7 +345,8 @@ class EthBrakeVecEnv(Begun, VecEnv):
         options = [row or {} for row in self._options]
         if len(options) != self.num_envs:
             raise InvalidInput(
-                f"set_options: the list has {len(options)} entries: must have one for each of the {self.num_envs} rows"
+                f"set_options: the list has {len(options)} entries; must have {self.num_envs}, one for each learner of"
+                " each world"
             )
         warn_of_unknown((name for row in options for name in row), (INITIAL_STATE,))
         if not any(INITIAL_STATE in row for row in options):
@@ -358,8 +360,8 @@ class EthBrakeVecEnv(Begun, VecEnv):
             )
             if start is None or (k % width and bytes_of(start) != bytes_of(starts[-1])):
                 raise InvalidInput(
-                    f"set_options: row {k} has {row!r}; give {INITIAL_STATE} in all rows or in none, and the same state"
-                    " in all rows of a world"
+                    f"set_options: entry {k} of the list is {row!r}; give {INITIAL_STATE} in all entries or in none,"
+                    " and the same state for all learners of a world"
                 )
             starts += [] if k % width else [start]
         return Worlds.concatenate(starts)
@@ -367,5 +369,5 @@ class EthBrakeVecEnv(Begun, VecEnv):
     def _refuse_some_rows(self, what: str, indices: VecEnvIndices) -> None:
         if list(self._get_indices(indices)) != list(range(self.num_envs)):
             raise InvalidInput(
-                f"{what}: indices = {indices!r}: must not be passed, because all rows belong to one environment"
+                f"{what}: indices = {indices!r}: must not be passed, because all worlds are simulated by one object"
             )

@@ -149,7 +149,7 @@ def _worlds_of_both(first: Result, second: Result, common: Sequence[str]) -> tup
                 stated = result.rows[agent].get(name)
                 if stated is not None and not math.isclose(stated, mean, rel_tol=1e-9, abs_tol=1e-9):
                     raise InvalidInput(
-                        f"{result.path}: {agent}: {name} = {stated:g}, but the mean over the worlds in the file with"
-                        f" one row per world is {mean:g}; one of the two files was changed, so evaluate again"
+                        f"{result.path}: {agent}: {name} = {stated:g}, but its mean over the file with one row per"
+                        f" world is {mean:g}; one of the two files was changed, so evaluate again"
                     )
     return harms, None

@@ -78,8 +78,8 @@ def make_lineup(
         if each in written[:k]:
             raise InvalidInput(f"agent {str(each)!r} is listed twice; list each agent once")
     if uncertainty is not None and not any("uncertainty" in settings_needed(each.shield) for each in written):
-        using = "".join(f"; agents with +{shield} do: ppo@PATH+{shield}" for shield in shields_with("uncertainty"))
-        raise InvalidInput(f"uncertainty {uncertainty}: none of the agents uses an uncertainty{using}")
+        using = "".join(f"; agents with +{shield} use it: ppo@PATH+{shield}" for shield in shields_with("uncertainty"))
+        raise InvalidInput(f"uncertainty {uncertainty}: none of the agents uses this setting{using}")
     lineup = {
         str(each): make_agent(str(each), scenario=scenario, harm_count=harm_count, uncertainty=uncertainty)
         for each in written

@@ -238,12 +238,18 @@ def read_result(path: Path) -> Result:
                 )
         who = f"{path}: {row['agent']}"
         if not 1 <= row["episodes"] <= _MOST_EPISODES or isinstance(row["episodes"], bool):
-            raise InvalidInput(f"{who}: episodes = {row['episodes']!s:.40}: must be 1 to {_MOST_EPISODES:,}")
+            raise InvalidInput(f"{who}: episodes = {row['episodes']!s:.40}: must be from 1 to {_MOST_EPISODES:,}")
         if not 0 <= row["horizon_ends"] <= row["episodes"]:
-            raise InvalidInput(f"{who}: horizon_ends = {row['horizon_ends']!s:.40}: must be 0 to {row['episodes']:,}")
+            raise InvalidInput(
+                f"{who}: horizon_ends = {row['horizon_ends']!s:.40}: must be the number of episodes in which a vehicle"
+                f" still moves at the horizon, from 0 to {row['episodes']:,}"
+            )
         draws = recorded_value(row, "recordings") or f"{row['episodes']}"
         if not (draws.isdecimal() and len(draws) < 14 and 1 <= int(draws) <= row["episodes"]):
-            raise InvalidInput(f"{who}: recordings = {draws:.40}: must be 1 to {row['episodes']:,}, or be missing")
+            raise InvalidInput(
+                f"{who}: recordings = {draws:.40}: must be the number of recordings from which the worlds come, from 1"
+                f" to {row['episodes']:,}, or be missing"
+            )
         shoved = row.get("vehicle_1_shoved_m")
         if shoved is not None and not (type(shoved) in (int, float) and abs(shoved) <= _MOST_HARM):
             raise InvalidInput(f"{who}: vehicle_1_shoved_m = {shoved!r:.40}: must be a number of metres, or null")
@@ -254,7 +260,9 @@ def read_result(path: Path) -> Result:
                     " must be a mean harm, and an interval [low, high] that contains the mean"
                 )
     if len({tuple(recorded_value(row, key) for key in SAME) for row in rows}) > 1:
-        raise InvalidInput(f"{path}: the agents drove different worlds; write the results of each test to its own file")
+        raise InvalidInput(
+            f"{path}: the agents were evaluated in different worlds; write the results of each test to its own file"
+        )
     named = [
         f"{row['agent']} ({row['mode']})" if row["kind"] == "shield" and "mode" in row else str(row["agent"])
         for row in rows
@@ -294,16 +302,20 @@ def _rows_of(path: Path, content: Any) -> list[dict[str, Any]]:
     """
     several = [content] if isinstance(content, dict) else content
     if not isinstance(several, list) or not several or not all(isinstance(row, dict) for row in several):
-        raise InvalidInput(f"{path}: is not a results file of ethbrake evaluate --json")
+        raise InvalidInput(f"{path}: is not a results file; give a file with the output of ethbrake evaluate --json")
     for row in several:
         kind = row.get("kind")
         if not isinstance(kind, str):
-            raise InvalidInput(f"{path}: is not a results file of ethbrake evaluate --json (kind is missing)")
+            raise InvalidInput(
+                f"{path}: is not a results file, because the key kind is missing; give a file with the output of"
+                " ethbrake evaluate --json"
+            )
         if kind not in get_args(Kind):
             raise InvalidInput(f"{path}: {unknown_name('kind of results', kind, get_args(Kind))}")
         if kind not in COMPARED:
             raise InvalidInput(
-                f"{path}: results of the kind {kind} cannot be compared; results of {' and '.join(COMPARED)} can"
+                f"{path}: results of the kind {kind} cannot be compared; give results of the kind"
+                f" {' or '.join(COMPARED)}"
             )
     if not isinstance(content, dict):
         return several

@@ -163,7 +163,8 @@ def _check_request(worlds: object, agents: object, chunk: object) -> None:
     """Raise ``InvalidInput`` if one of these arguments of ``evaluate`` has a wrong type or value."""
     if not isinstance(worlds, Worlds | Sample):
         raise InvalidInput(
-            f"evaluate: worlds = {worlds!r}: must be Worlds or a Sample, for instance scenario.sample(100, seed=7)"
+            f"evaluate: worlds = {worlds!r}: must be a Worlds or Sample object, for instance scenario.sample(100,"
+            " seed=7)"
         )
     if not isinstance(agents, Mapping):
         raise InvalidInput(

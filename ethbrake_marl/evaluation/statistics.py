@@ -56,7 +56,8 @@ def cluster_sums(values: Floats, clusters: Texts) -> dict[str, tuple[int, Fracti
     wholes, powers = _in_wholes(values)
     if clusters.shape != powers.shape:
         raise InvalidInput(
-            f"statistics: clusters has {len(clusters)} entries for {len(powers)} values: must have one per value"
+            f"statistics: clusters has {len(clusters)} entries, but there are {len(powers)} values; must have one entry"
+            " per value"
         )
     names, which, counts = np.unique(clusters, return_inverse=True, return_counts=True)
     least, sums = powers.min(), np.zeros(len(names), np.object_)
@@ -69,7 +70,7 @@ def _in_wholes(values: Floats) -> tuple[NDArray[np.object_], Ints]:
     """Return integers [n] and exponents [n] such that ``values == integers * 2 ** exponents`` exactly."""
     data = np.asarray(values, np.float64)
     if data.ndim != 1 or not np.isfinite(data).all():
-        raise InvalidInput(f"exact sum: values of shape {data.shape}: must be finite numbers of shape [n]")
+        raise InvalidInput(f"exact sum: values has shape {data.shape}; must have finite numbers of shape [n]")
     fractions, powers = np.frexp(data)
     return np.ldexp(fractions, 53).astype(np.int64).astype(np.object_), powers.astype(np.int64) - 53
 
@@ -387,7 +388,7 @@ def check(values: ArrayLike, who: str = "statistics", each: str = "world") -> Fl
     data = np.asarray(values, np.float64)
     if data.ndim != 1 or len(data) < 1 or not np.isfinite(data).all():
         raise InvalidInput(
-            f"{who}: values of shape {data.shape}: must be one finite number per {each}, shape [n] with n at least 1"
+            f"{who}: values has shape {data.shape}; must have one finite number per {each}: shape [n] with n >= 1"
         )
     return data
 
@@ -397,7 +398,7 @@ def _check_pair(values: Floats, baseline: Floats, clusters: Texts | None) -> tup
     data, reference = check(values), check(baseline)
     if data.shape != reference.shape:
         raise InvalidInput(
-            f"statistics: {len(data)} values and {len(reference)} values of the baseline: both must have the same"
-            " number of values"
+            f"statistics: there are {len(data)} values, but {len(reference)} values of the baseline; the two numbers"
+            " must be equal"
         )
     return Moments.of(data, clusters), Moments.of(reference, clusters), exact_sum(data, reference)

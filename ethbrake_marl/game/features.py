@@ -189,8 +189,8 @@ class RegisteredFeature:
         value = np.asarray(self.function(*arguments))
         if value.shape != (worlds.n,) or value.dtype.kind not in "fiub":
             raise InvalidInput(
-                f"feature {name!r}: its function returned {value.dtype} of shape {value.shape}; must return numbers of"
-                f" shape ({worlds.n},), one per world"
+                f"feature {name!r}: its function returned {value.dtype} values of shape {value.shape}; must return"
+                f" numbers of shape ({worlds.n},), one per world"
             )
         values = np.where(counts, value, self.unknown)
         if not np.isfinite(values).all():
@@ -519,14 +519,14 @@ def register_feature(
     _check_numbers(name, scale=scale, low=low, high=high, unknown=unknown)
     if of not in get_args(Of) or (of == "own" and unknown != 0.0):
         raise InvalidInput(
-            f"feature {name!r}: of = {of!r}, unknown = {unknown:g}: of must be 'own' or 'neighbour'; if of is 'own',"
+            f"feature {name!r}: of = {of!r}, unknown = {unknown:g}: of must be 'own' or 'neighbour'; with of = 'own',"
             " unknown must be 0"
         )
 
     if reads is not None and not (of == "neighbour" and not isinstance(reads, str) and set(reads) <= set(PIECES)):
         raise InvalidInput(
-            f"feature {name!r}: reads = {reads!r}: must be a list of names from {', '.join(PIECES)}, and can be given"
-            " only for a feature of a neighbour"
+            f"feature {name!r}: reads = {reads!r}: must be a list with some of the names {', '.join(PIECES)}, and is"
+            " possible only with of='neighbour'"
         )
 
     feature = Feature(name, str(unit), float(scale), float(low), float(high), " ".join(str(function.__doc__).split()))

@@ -161,8 +161,8 @@ def _add(name: str, function: MeasureFunction, *, unit: str = "1", by: By = "imp
     """Add a measure that evaluations show on request only. The arguments are those of ``register_measure``."""
     if not isinstance(name, str) or _NAME.fullmatch(name) is None:
         raise InvalidInput(
-            f"measure {name!r:.80}: the name must be 1 to 64 characters a-z, 0-9 and _, begin with a letter, and not"
-            " end in _interval, _low, _high, or _ and a number"
+            f"measure {name!r:.80}: the name must be 1 to 64 characters a-z, 0-9 and _, and must begin with a letter;"
+            " it must not end in _interval, in _low, in _high, or in _ and a number"
         )
     if by not in get_args(By):
         raise InvalidInput(f"measure {name!r}: by = {by!r}: must be {' or '.join(map(repr, get_args(By)))}")

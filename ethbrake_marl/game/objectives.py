@@ -146,7 +146,8 @@ def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
     each = (declared,) * vehicles if isinstance(declared, str) else tuple(declared)
     if len(each) != vehicles:
         raise InvalidInput(
-            f"objective: has {len(each)} entries; must have {vehicles}, one per vehicle, or be a single entry for all"
+            f"objective: the list has {len(each)} entries; must have {vehicles}, one per vehicle; or give one objective"
+            " for all vehicles, without a list"
         )
     parsed = tuple(parse_objective(text) for text in each)
     for text, objective in zip(each, parsed, strict=True):
@@ -258,8 +259,8 @@ def register_objective(name: str, function: ObjectiveFunction) -> None:
         worlds = len(harm.whole)
         if harms.shape != (worlds,) or harms.dtype.kind not in "fiub":
             raise InvalidInput(
-                f"objective {name!r}: its function returned {harms.dtype} of shape {harms.shape}; must return numbers"
-                f" of shape ({worlds},), one per world"
+                f"objective {name!r}: its function returned {harms.dtype} values of shape {harms.shape}; must return"
+                f" numbers of shape ({worlds},), one per world"
             )
         if not np.isfinite(harms).all():
             world = int(np.argmin(np.isfinite(harms)))

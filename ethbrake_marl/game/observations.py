@@ -80,10 +80,13 @@ class ObservationSpec:
             if not isinstance(shown, bool):
                 raise InvalidInput(f"observation: {name} = {shown!r}: must be True or False")
         if self.time_step_s is not None and not 0.0 < self.time_step_s < math.inf:
-            raise InvalidInput(f"observation: time_step_s = {self.time_step_s!r}: must be a positive number of seconds")
+            raise InvalidInput(
+                f"observation: time_step_s = {self.time_step_s!r}: must be a finite number of seconds above 0"
+            )
         if self.chosen and _reach(self.chosen) != (self.front, self.rear, self.role, self.obstacle, self.contact):
             raise InvalidInput(
-                "observation: chosen: the other fields contradict the chosen features; use eb.choose_observation([...])"
+                "observation: the fields front, rear, role, obstacle and contact contradict the features in chosen;"
+                " make the observation with eb.choose_observation([...])"
             )
 
     @property
@@ -155,7 +158,7 @@ def choose_observation(listed: Observation, time_step_s: float | None = None) ->
                 raise unknown_name("observation", name, known)
         chosen = listed.get("chosen", ())
         if not isinstance(chosen, list | tuple):
-            raise InvalidInput(f"observation: chosen = {chosen!r}: must be a list of features")
+            raise InvalidInput(f"observation: chosen = {chosen!r}: must be a list of names of features")
         spec = ObservationSpec(**{**listed, "chosen": listed_features(chosen) if chosen else ()})
     else:
         names = listed_features(listed)
@@ -220,9 +223,9 @@ class Extra(NamedTuple):
         if reads is None:
             for piece in messages.lacks(neighbour):
                 raise InvalidInput(
-                    f"feature {self.entry.feature.name!r}: the messages of vehicle_{neighbour + 1} do not contain its"
-                    f" {piece} (v2x: tells), which the feature may read; list what the feature reads when you register"
-                    " it, as in register_feature(..., reads=['place'])"
+                    f"feature {self.entry.feature.name!r}: may read all that messages can contain, but the messages of"
+                    f" vehicle_{neighbour + 1} do not contain its {piece} (key v2x.tells); add it to v2x.tells, or"
+                    " register the feature with a list of what it reads: register_feature(..., reads=['place'])"
                 )
             return np.ones(worlds.n, np.bool_)
         known = messages.known_pieces(vehicle, worlds.time_s)[:, neighbour]
@@ -311,8 +314,8 @@ def _plan(spec: ObservationSpec, registered: tuple[tuple[str, RegisteredFeature]
     if spec.contact:
         if spec.time_step_s is None:
             raise InvalidInput(
-                "observation: contact features need the time between two decisions; give the argument time_step_s, for"
-                " instance eb.choose_observation([...], time_step_s=scenario.time_step_s)"
+                "observation: features of the groups contact and contact_far need the time between two decisions; pass"
+                " time_step_s, for instance eb.choose_observation([...], time_step_s=scenario.time_step_s)"
             )
         inside = [name.partition(".") for name in spec.chosen or (feature.name for feature in spec.whole)]
         names = [own for group, _, own in inside if group in ("contact", "contact_far")]

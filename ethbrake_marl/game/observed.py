@@ -63,8 +63,8 @@ def common_observation(observations: tuple[ObservationSpec, ...], scenario: Game
         if observations[other] != observations[first]:
             one, two = (scenario.vehicle_names[i] for i in (first, other))
             raise InvalidInput(
-                f"observation: {one} and {two} of {scenario.name!r} observe different features, but here all learners"
-                " must observe the same features; give one list for all vehicles, use a single learner, or use"
-                " parallel_env or scheme: independent"
+                f"observation: {one} and {two} of {scenario.name!r} observe different features, but must observe the"
+                " same features here; give one list for all vehicles, use a single learner, or use parallel_env (in a"
+                " recipe: scheme: independent)"
             )
     return observations[first]

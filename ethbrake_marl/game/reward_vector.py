@@ -47,7 +47,7 @@ def components_of(vector: RewardVector, params: RewardParams, vehicles: int) -> 
     listed = isinstance(vector, Sequence) and not isinstance(vector, str) and all(isinstance(n, str) for n in vector)
     if not listed or not vector or len(set(vector)) < len(vector):
         raise InvalidInput(
-            f"reward_vector = {vector!r}: must be {VEHICLES!r}, or a list of different components, for instance"
+            f"reward_vector = {vector!r}: must be {VEHICLES!r}, or a list of different components of harm, for instance"
             " ['harm_1', 'harm_2', 'harm_3']"
         )
     known = [*each, *(f"pair_{k + 1}_{k + 2}" for k in range(vehicles - 1)), "obstacle", *params.counted]

@@ -193,7 +193,7 @@ def shaped(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
     try:
         return np.array(np.broadcast_to(numbers, shape), order="C")
     except ValueError:
-        raise InvalidInput(f"{name}: shape {numbers.shape}; must be {shape} or broadcast to this shape") from None
+        raise InvalidInput(f"{name}: has shape {numbers.shape}; must have shape {shape} or broadcast to it") from None
 
 
 def refuse_bad(worlds: Worlds, command: Floats, until: Floats, in_time: Bools) -> None:
@@ -213,8 +213,8 @@ def refuse_bad(worlds: Worlds, command: Floats, until: Floats, in_time: Bools) -
     k = int(np.argmin(in_time & in_range.all(axis=1)))
     if not in_time[k]:
         raise InvalidInput(
-            f"advance: world {k} is at {worlds.time_s[k]:g} s; its end time {until[k]:g} s must be finite and not"
-            " earlier"
+            f"advance: world {k} is at t = {worlds.time_s[k]:g} s, and must be advanced to {until[k]:g} s; the end time"
+            " must be finite and not before the present time"
         )
     i = int(np.argmin(in_range[k]))
     raise InvalidInput(f"command_mps2[{k}, {i}] = {command[k, i]:g}: must be in [{low[k, i]:g}, {high[k, i]:g}] m/s2")

@@ -366,9 +366,9 @@ def refuse_untold(
     for sender in (range(worlds.N) if senders is None else senders) if messages.says_contents else ():
         if tuple(vehicles) != (sender,) and (missing := messages.lacks(sender, needs)):
             raise InvalidInput(
-                f"{who}: messages of vehicle_{sender + 1} do not contain its {missing[0]} (v2x: tells), but"
-                f" {', '.join(needs)} of the other vehicles are needed; let messages contain them, or use a policy"
-                " alone, which decides on its observation"
+                f"{who}: messages of vehicle_{sender + 1} do not contain its {missing[0]} (key v2x.tells), but"
+                f" {', '.join(needs)} of the other vehicles are needed; add them to v2x.tells, or use a policy alone,"
+                " which needs only its observation"
             )
 
 

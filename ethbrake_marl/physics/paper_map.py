@@ -306,13 +306,14 @@ def _refuse_unsampled(worlds: Worlds, until: Floats, step_s: float) -> None:
     if not good.all():
         k = int(np.argmin(good))
         raise InvalidInput(
-            f"advance_sampled: world {k} is at {worlds.time_s[k]:g} s, between two of its samples"
-            f" {start[k]:g} s + n * {step_s:g} s; start at a sample or before the first sample"
+            f"advance_sampled: world {k} is at {worlds.time_s[k]:g} s, between two of its sampling times, which are"
+            f" {start[k]:g} s + n * {step_s:g} s for n = 0, 1, ...; start at a sampling time, or before the first"
         )
     good = ~before[:, np.newaxis] | (worlds.speeds_mps >= 0.0)
     if not good.all():
         k = int(np.argmin(good.all(axis=1)))
         raise InvalidInput(
             f"advance_sampled: world {k} has a negative speed at {worlds.time_s[k]:g} s, before its first sample at"
-            f" {start[k]:g} s; the map allows no impacts before the first sample"
+            f" {start[k]:g} s; speeds must be at least 0 there, because impacts before the first sample are not"
+            " part of the fixed-step map"
         )

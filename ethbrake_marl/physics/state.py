@@ -352,13 +352,13 @@ class Worlds:
         slow = self.vehicles.build_up
         if self.vehicles.in_pieces.any():
             raise InvalidInput(
-                f"{who}: a vehicle of world {int(np.argmax(self.vehicles.in_pieces))} follows a braking profile, and"
-                " the result would not be exact; use a constant command"
+                f"{who}: a vehicle of world {int(np.argmax(self.vehicles.in_pieces))} follows a braking profile, for"
+                " which the result would not be exact; use a script with a constant command"
             )
         if slow.any():
             raise InvalidInput(
-                f"{who}: brakes of world {int(np.argmax(slow))} build up (brake_rate_mps3, release_rate_mps3), and"
-                " the result would not be exact; leave these rates out"
+                f"{who}: in world {int(np.argmax(slow))} brakes build up at a finite rate, for which the result would"
+                " not be exact; leave out brake_rate_mps3 and release_rate_mps3"
             )
 
     def first_decision_s(self, deciders: Sequence[int]) -> Floats:
@@ -510,7 +510,7 @@ def real_numbers(value: ArrayLike) -> Floats:
     if isinstance(value, list | tuple):
         parts = [real_numbers(part) for part in value]
         if len({part.shape for part in parts}) > 1:
-            raise ValueError("has rows of different lengths")
+            raise ValueError("has inner lists of different lengths")
         return np.array(parts, np.float64)
     if np.ma.is_masked(value):
         raise ValueError("is masked")
@@ -535,7 +535,7 @@ def checked_numbers(name: str, value: ArrayLike) -> Floats:
     try:
         return real_numbers(value)
     except ValueError as error:
-        raise InvalidInput(f"{name}: {value!r} {error}; a number or an array of numbers is needed") from None
+        raise InvalidInput(f"{name}: {value!r} {error}; must be a number or an array of numbers") from None
 
 
 def make_worlds(
@@ -580,7 +580,7 @@ def make_worlds(
     """
     speeds = np.atleast_2d(checked_numbers("speeds_mps", speeds_mps))
     if speeds.ndim != 2 or speeds.shape[1] < 2:
-        raise InvalidInput(f"speeds_mps: shape {speeds.shape}; must be [n, N] with at least 2 vehicles")
+        raise InvalidInput(f"speeds_mps: has shape {speeds.shape}; must have shape [n, N] with N >= 2 vehicles")
     gaps = checked_numbers("gaps_m", gaps_m)
     n = speeds.shape[0] if gaps.ndim < 2 else max(speeds.shape[0], gaps.shape[0])
     N = speeds.shape[1]
@@ -650,7 +650,7 @@ def _full(
     try:
         full = np.array(np.broadcast_to(numbers, shape), dtype=np.float64, order="C")
     except ValueError:
-        raise InvalidInput(f"{name}: shape {numbers.shape}; must be {shape} or broadcast to this shape") from None
+        raise InvalidInput(f"{name}: has shape {numbers.shape}; must have shape {shape} or broadcast to it") from None
     good = (
         (np.isfinite(full) if finite else ~np.isnan(full))
         & (full <= high)

@@ -104,7 +104,7 @@ class Actor:
         wanted = (observation.shape[0] if observation.ndim else 0, self.spec.observation_size)
         if observation.shape != wanted or observation.dtype != np.float32:
             raise InvalidInput(
-                f"observation: is {observation.dtype} of shape {observation.shape}; must be float32 of shape"
+                f"observation: has type {observation.dtype} and shape {observation.shape}; needs type float32 and shape"
                 f" (n, {self.spec.observation_size}) for this policy"
             )
         if not np.isfinite(observation).all():

@@ -95,10 +95,10 @@ def _check_observed(path: Path, manifest: Manifest) -> None:
     """
     seen = manifest.observation
     for was in seen.registered:
-        observes = f"{path}: the policy observes {was.name!r:.80}"
+        observes = f"{path}: the policy observes the feature {was.name!r:.80}"
         if was.name not in FEATURES:
             raise InvalidInput(
-                f"{observes}, which is not registered; install the package that registers this feature, or register it"
+                f"{observes}, which is not registered; install the package that registers it, or register it yourself"
                 " first with eb.register_feature"
             )
         entry = FEATURES[was.name]
@@ -111,7 +111,7 @@ def _check_observed(path: Path, manifest: Manifest) -> None:
                 )
         if len(was.tried) != len(entry.tried) or not np.allclose(was.tried, entry.tried, rtol=1e-6, atol=1e-6):
             raise InvalidInput(
-                f"{observes}, whose function returns other numbers than in training; register the feature as in"
+                f"{observes}, whose function now returns other numbers than in training; register the feature as in"
                 " training, or train again"
             )
     with suppress(InvalidInput):  # a feature that no longer exists
@@ -120,6 +120,7 @@ def _check_observed(path: Path, manifest: Manifest) -> None:
         if known == today and [each.name for each in seen.registered] == [each.name for each in today.registered]:
             return
     raise CorruptBundle(
-        f"{path}: observation: features or their scaling differ from this version of the package; use version"
-        f" {manifest.versions.get('ethbrake-marl', 'unknown')}, in which the policy was trained, or train again"
+        f"{path}: observation: this version of the package computes or scales features differently than the version"
+        f" in which the policy was trained, {manifest.versions.get('ethbrake-marl', 'unknown')}; use that version, or"
+        " train again"
     )

@@ -113,7 +113,7 @@ class Manifest(_Strict):
         network, features, step = self.network, self.observation.features, self.scenario.get("time_step_s")
         if self.format_version != network.format_version:
             raise ValueError(
-                f"format_version = {self.format_version}: must be {network.format_version} with"
+                f"format_version = {self.format_version}: must be {network.format_version} if"
                 f" networks = {network.networks} and output = {network.output!r}"
             )
         if len(features) != network.observation_size:
@@ -124,7 +124,10 @@ class Manifest(_Strict):
         if any(name.startswith(("contact.", "contact_far.")) for name in features) and (
             isinstance(step, bool) or not isinstance(step, int | float) or not step > 0.0
         ):
-            raise ValueError(f"scenario: time_step_s = {step!r}: must be a number above 0 for contact features")
+            raise ValueError(
+                f"scenario: time_step_s = {step!r}: must be a number of seconds above 0, because the policy observes"
+                " contact features"
+            )
         for name in self.learners:
             if re.fullmatch(r"vehicle_[1-9][0-9]?", name) is None:
                 raise ValueError(f"learners: {name!r}: must be a vehicle's name, such as vehicle_2")

@@ -79,14 +79,14 @@ class NetworkSpec(FileModel):
                 f" output is {self.output!r}"
             )
         if self.choices is not None and (self.value_hidden or self.networks > 1 or self.action_size > 1):
-            raise ValueError("output = 'choice': networks must be 1, value_hidden empty and action_size 1")
+            raise ValueError("output = 'choice': needs networks = 1, action_size = 1 and an empty value_hidden")
         for m, member in enumerate(self.among):
             if self.choices is None or member.among:
-                raise ValueError("among: can only be given if output is 'choice', and only for policies without among")
+                raise ValueError("among: needs output = 'choice', and the policies in the list must have no key among")
             if (member.observation_size, member.action_size) != (self.observation_size, self.action_size):
                 raise ValueError(
                     f"among[{m}]: observation_size and action_size are {member.observation_size} and"
-                    f" {member.action_size}; must be {self.observation_size} and {self.action_size}, as in the network"
+                    f" {member.action_size}; must be {self.observation_size} and {self.action_size}, as for the network"
                     " that chooses among these policies"
                 )
         return self

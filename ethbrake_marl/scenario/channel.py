@@ -223,11 +223,11 @@ class V2X(FileModel):
     )
     senses: Senses | None = Field(default=None, description="direct neighbours in sight: both, front or none")
     link_latency_s: Seconds | None = Field(
-        default=None, description="fixed delay of every link, instead of a drawn one"
+        default=None, description="fixed delay from every sender to every receiver, instead of a random one"
     )
     lost: Share | None = Field(default=None, description="share of links (not of vehicles) on which no message arrives")
     message_period_s: Annotated[float, Field(gt=0.0, le=60.0, allow_inf_nan=False)] | None = Field(
-        default=None, description="T, time between two messages"
+        default=None, description="T, time between two messages of a sender"
     )
     loss_begins: Share | None = Field(
         default=None, description="p, probability per message period that a burst of losses begins"
@@ -235,13 +235,13 @@ class V2X(FileModel):
     loss_ends: Annotated[float, Field(ge=0.01, le=1.0, allow_inf_nan=False)] | None = Field(
         default=None, description="r, probability per message period that a burst of losses ends"
     )
-    radio_s: Seconds | None = Field(default=None, description="L_radio, time of transmission")
+    radio_s: Seconds | None = Field(default=None, description="L_radio, time to transmit a message")
     processing_s: Seconds | None = Field(
         default=None, description="t_proc, time until the receiver has processed a message"
     )
     actuation_s: Seconds | None = Field(default=None, description="t_act, time until the receiver's brakes respond")
     sensing_s: Annotated[tuple[Seconds, Seconds], Field(strict=False)] | None = Field(
-        default=None, description="[low, high]: range of the uniform delay after which a neighbour is seen (a hop)"
+        default=None, description="[low, high]: range of the uniform delay after which a neighbour is seen"
     )
     persistence: Persistence | None = Field(
         default=None,
@@ -258,7 +258,7 @@ class V2X(FileModel):
     vehicles: dict[str, Equipage] | None = Field(
         default=None,
         exclude_if=not_,
-        description="V2X equipment of single vehicles that differs: {vehicle_3: {sends: false, hears: none}}",
+        description="vehicles with other V2X equipment than the rest, such as {vehicle_3: {sends: false, hears: none}}",
     )
 
     @model_validator(mode="before")
@@ -446,8 +446,8 @@ class V2X(FileModel):
             return worlds
         if self.drawn or equipped is None:
             raise InvalidInput(
-                f"{where}: the channel of the scenario (v2x: {self.preset}) is random, so worlds of your own need a"
-                " scenario with a fixed channel, for instance scenario.replace(v2x='paper')"
+                f"{where}: with v2x: {self.preset}, it is random which messages arrive, and when; worlds of your own"
+                " need a scenario in which this is fixed, for instance scenario.replace(v2x='paper')"
             )
         n, N = worlds.speeds_mps.shape
         return self.with_channel(worlds, np.zeros((n, self.width(N))), np.zeros(n), time_step_s, equipped)

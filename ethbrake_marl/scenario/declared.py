@@ -49,7 +49,7 @@ class ScenarioFields(FileModel):
     vehicle_types: VehicleTypes | None = Field(
         default=None,
         exclude_if=not_,
-        description="vehicle types by name, such as car and truck: weight and quantities of each type",
+        description="vehicle types by name, such as car and truck: how likely each type is, and its quantities",
     )
     types: Types | None = Field(
         default=None,
@@ -63,7 +63,7 @@ class ScenarioFields(FileModel):
     table: Table | None = Field(
         default=None,
         exclude_if=not_,
-        description="rows of measured values, one of which every world takes; quantities without a column are drawn",
+        description="table of measured values: every world takes one row; quantities without a column are drawn",
     )
     time_step_s: float = Field(default=0.1, ge=1e-3, allow_inf_nan=False, description="time between two decisions")
     horizon_s: float = Field(
@@ -107,8 +107,7 @@ class ScenarioFields(FileModel):
         description="additional vehicle behind the last vehicle of the line, at the same speed",
     )
     early_impacts: Literal["keep", "reject"] = Field(
-        default="keep",
-        description="keep or reject worlds with an impact no later than the time at which the first learner can act",
+        default="keep", description="keep or reject worlds with an impact at or before the first decision of a learner"
     )
 
     objective: ObjectiveName | Annotated[tuple[ObjectiveName, ...], Field(strict=False)] = Field(
@@ -123,7 +122,7 @@ class ScenarioFields(FileModel):
     )
     v2x: V2X = Field(
         default_factory=V2X,
-        description="what each vehicle knows, and when: name of a preset, or a mapping with the settings that differ",
+        description="what each vehicle knows, and when: name of a preset, or a mapping with settings of your own",
     )
 
     _members: tuple[ScenarioFields, ...] = PrivateAttr(default=())
@@ -444,7 +443,8 @@ class ScenarioFields(FileModel):
         declared: AnyQuantity | tuple[AnyQuantity, ...] | None = getattr(self, QUANTITY.declared[field].name)
         if self.members:
             raise InvalidInput(
-                f"scenario {self.name!r}: is a mixture, so its members declare {field}; see Scenario.members"
+                f"scenario {self.name!r}: is a mixture of scenarios, each of which declares its own {field}; read"
+                f" {field} from a scenario in Scenario.members"
             )
         if declared is None and not self.declares(field):
             raise InvalidInput(

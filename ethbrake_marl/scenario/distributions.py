@@ -275,7 +275,7 @@ class WithLoad(_Distribution):
     ``spread`` is the distribution, around 0, of a random amount that is added to each vehicle's value.
     """
 
-    with_load: Pair = Field(description="[empty, full]: value at load 0, value at load 1")
+    with_load: Pair = Field(description="[empty, full]: value of an empty vehicle, value of a full vehicle")
     spread: Quantity = Field(
         default=0.0, exclude_if=not_, description="distribution around 0 of a random amount that is added to the value"
     )

@@ -210,8 +210,8 @@ _OTHERWISE = _by_name(
     ),
     QuantityRule(
         "alert_s", "s", "world", 3600.0, False, 2, "",
-        "time from the start of the episode, which has the declared gaps and speeds, to the alert; latencies begin at"
-        " the alert", "{uniform: [1, 5]}", stream=SURROUNDINGS,
+        "time from the start of the episode to the alert; the declared gaps and speeds are those at the start, and"
+        " latencies begin at the alert", "{uniform: [1, 5]}", stream=SURROUNDINGS,
     ),
 )  # fmt: skip
 

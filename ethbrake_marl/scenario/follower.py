@@ -62,7 +62,8 @@ def with_follower(document: Document, build: Callable[[Document], Any]) -> Docum
     columns = list(content["table"]["columns"]) if "table" in content else []
     if speed not in columns and low != high:
         raise InvalidInput(
-            f"{where}: the speed of vehicle_{N} is random; it must be a fixed number or a column of the table"
+            f"{where}: the follower has the speed of vehicle_{N}, which is random; this speed must be a fixed number or"
+            " a column of the table"
         )
     if speed in columns or gaps in columns:
         rows = []

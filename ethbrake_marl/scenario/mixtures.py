@@ -125,21 +125,22 @@ def _check_members(document: Document, members: Sequence[ScenarioFields]) -> Non
             if one != other:
                 way = "" if key == "vehicles" else f"; to use one {key} for all, write it next to the key mixture"
                 raise InvalidInput(
-                    f"{where}: {key} must be the same in all scenarios: {first.name} has {one}, {member.name} has"
-                    f" {other}{way}"
+                    f"{where}: {key} must be the same in all scenarios of the mixture, but {first.name} has {one} and"
+                    f" {member.name} has {other}{way}"
                 )
         samples = [each.v2x.channel.samples(each.time_step_s) for each in (first, member)]
         if samples[0] != samples[1]:
             raise InvalidInput(
-                f"{where}: v2x.persistence, and the delay of periodic messages, must be the same in all scenarios:"
-                f" {first.name} and {member.name} differ; to use one v2x for all, write it next to the key mixture"
+                f"{where}: v2x.persistence, and the delay of periodic messages, must be the same in all scenarios of"
+                f" the mixture, but {first.name} and {member.name} differ; to use one v2x for all, write it next to the"
+                " key mixture"
             )
         says = [each.v2x.channel.tells is not None for each in (first, member)]
         if says[0] != says[1]:
             giver, silent = (first, member) if says[0] else (member, first)
             raise InvalidInput(
                 f"{where}: {giver.name} has v2x.tells, but {silent.name} does not; write v2x.tells in every scenario"
-                f" (the default is [{', '.join(USUAL_PIECES)}])"
+                f" of the mixture (the default is [{', '.join(USUAL_PIECES)}])"
             )
 
 

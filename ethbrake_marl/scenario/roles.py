@@ -147,7 +147,7 @@ def checked_pieces(given: object) -> tuple[tuple[float, float], ...]:
         if not numbers or not all(type(each) in (int, float) and 0.0 <= each <= 3600.0 for each in piece):
             raise InvalidInput(f"{right}; {piece!r:.60} is not a list of two numbers in [0, 3600]")
     if given[0][0] != 0.0 or not all(one[0] < other[0] for one, other in pairwise(given)):
-        raise InvalidInput(f"{right}; the first start must be 0, and the starts must increase")
+        raise InvalidInput(f"{right}; the first start must be 0, and each later start must be larger")
     return tuple((float(begins), float(braking)) for begins, braking in given)
 
 

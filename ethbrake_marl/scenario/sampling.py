@@ -66,9 +66,11 @@ def sample(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, chann
     for name, value, least in (("number of worlds", n, 1), ("seed of the list", seed, 0), ("first world", first, 0)):
         check_whole_number(name, value, least)
     if not n <= MOST_AT_ONCE:
-        raise InvalidInput(f"number of worlds = {n}: must be at most {MOST_AT_ONCE:,}; draw a longer list in parts")
+        raise InvalidInput(f"number of worlds = {n}: must be at most {MOST_AT_ONCE:,}; draw more with several calls")
     if not int(first) + int(n) <= _MOST_WORLDS:
-        raise InvalidInput(f"sample: first = {first!r}: first + n must be at most {_MOST_WORLDS}, the length of a list")
+        raise InvalidInput(
+            f"sample: first = {first!r}: first + n must be at most {_MOST_WORLDS}, the number of worlds of one seed"
+        )
     if channel not in CHANNELS:
         raise InvalidInput(f"sample: channel {channel!r}: must be one of {', '.join(CHANNELS)}")
     if scenario.mixture is None:

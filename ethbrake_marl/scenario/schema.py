@@ -217,7 +217,7 @@ class Scenario(ScenarioFields):
 def as_scenario(game: Game) -> Scenario:
     """Return ``game`` itself if it is a ``Scenario``; raise ``InvalidInput`` for any other game."""
     if not isinstance(game, Scenario):
-        raise InvalidInput(f"game {game.name!r}: is a {type(game).__name__}; must be a Scenario here")
+        raise InvalidInput(f"game {game.name!r}: is a {type(game).__name__}, but this function needs a Scenario")
     return game
 
 

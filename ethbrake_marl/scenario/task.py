@@ -33,8 +33,8 @@ class Task:
         """Index of the single controlled vehicle; raises ``InvalidInput`` unless there is exactly one."""
         if len(self.vehicles) != 1:
             raise InvalidInput(
-                f"scenario {self.scenario.name!r}: exactly one vehicle must be controlled here; the controlled vehicles"
-                f" are: {self.names}"
+                f"scenario {self.scenario.name!r}: this function needs exactly one controlled vehicle; the controlled"
+                f" vehicles are: {self.names}"
             )
         return self.vehicles[0]
 

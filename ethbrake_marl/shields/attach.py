@@ -57,7 +57,7 @@ def proposing_agents(
         return dict.fromkeys(vehicles, agent)
     if set(drivers) != set(vehicles):
         names = ", ".join(f"vehicle_{i + 1}" for i in vehicles)
-        raise InvalidInput(f"{where}: policy: must have one policy for each of {names}, and for no other vehicle")
+        raise InvalidInput(f"{where}: policy must have one policy for each of {names}, and for no other vehicle")
     return {i: drivers[i] for i in vehicles}
 
 
@@ -135,7 +135,7 @@ class Attached:
         if engine.components and self.options.intervention_penalty > 0.0:
             raise InvalidInput(
                 f"{where}: intervention_penalty = {self.options.intervention_penalty:g}: cannot be subtracted, because"
-                " the rewards of this environment are vectors; leave the penalty out"
+                " the rewards of this environment are vectors; leave intervention_penalty out"
             )
         self.engine, self._left = engine, Guarded(None, {})
         self.guard = guard_of(engine, policy, self.options)

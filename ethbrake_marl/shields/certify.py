@@ -487,11 +487,11 @@ def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) 
     shape = (n, *backup.plan.shape[2:])
     if not (actions.shape == shape and backup.harm.shape == budget.shape == (n,)):
         raise InvalidInput(
-            f"certify: shape of proposed = {actions.shape}, of backup.harm = {backup.harm.shape}, of budget ="
-            f" {budget.shape}: must be {shape}, ({n},) and ({n},)"
+            f"certify: the shapes of proposed, backup.harm and budget are {actions.shape}, {backup.harm.shape} and"
+            f" {budget.shape}; must be {shape}, ({n},) and ({n},)"
         )
     if not (budget >= backup.harm).all():
-        raise InvalidInput("certify: budget: must be at least backup.harm in every world")
+        raise InvalidInput("certify: in every world, budget must be at least backup.harm (the harm of the plan)")
     plans, after, out = backup.plan.copy(), np.empty_like(running.states), np.empty((n, vehicles, 4))
     over, failed = np.zeros(problem.n, np.bool_), np.zeros(n, np.bool_)
     certify_worlds(
@@ -517,4 +517,4 @@ def _check_plan(running: Running, plan: Floats) -> None:
     fits = vehicles == 1 if plan.ndim == 2 else plan.shape[2:] == (vehicles,)
     if not fits or plan.shape[0] != running.n or plan.shape[1] < most:
         wanted = f"({running.n}, at least {most}{'' if vehicles == 1 else f', {vehicles}'})"
-        raise InvalidInput(f"shield: shape of plan = {plan.shape}: must be {wanted}")
+        raise InvalidInput(f"shield: plan has the shape {plan.shape}; must have the shape {wanted}")

@@ -60,10 +60,10 @@ def difference(predicted: Floats, seen: Floats) -> str:
     vehicles = (len(predicted) + 4) // 6
     for column in np.flatnonzero(~(seen == predicted[: len(seen)])).tolist():
         if column < vehicles:
-            what, unit = f"speed of vehicle {column + 1} of the line", " m/s"
+            what, unit = f"the speed of vehicle {column + 1} of the line", " m/s"
         else:
             group, pair = divmod(column - vehicles, vehicles - 1)
-            what, unit = f"{GROUPS[group][0]} of pair {pair + 1}", GROUPS[group][1]
+            what, unit = f"the {GROUPS[group][0]} of pair {pair + 1}", GROUPS[group][1]
         return f"{what} is {seen[column]:.17g}{unit}, but the shield predicted {predicted[column]:.17g}{unit}"
     return "nothing"
 

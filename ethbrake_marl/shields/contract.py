@@ -225,8 +225,8 @@ class ShieldGuard(ABC):
         left_out = np.isnan(proposed).all(axis=0)
         if left_out.any() and not self._policies:
             raise InvalidInput(
-                "shield: an action is missing, and no policy can propose it; pass the action, or make"
-                " the shield with policy="
+                "shield: the action of a vehicle is missing, and the shield has no policy that could propose it; pass"
+                " the action, or make the shield with policy=..."
             )
         remember = (i for i, agent in self._policies.items() if getattr(agent, "remembers", memories[i] is not None))
         if left_out.any() or any(True for _ in remember):

@@ -53,7 +53,7 @@ class ShieldedDriver(ByPolicy):
         self.options = ShieldOptions(**options)
         if self.options.mode == "episode":
             raise InvalidInput(
-                "shield: mode = 'episode': has an agent of its own; use HybridAgent instead of ShieldedDriver"
+                "shield: mode = 'episode': is not possible with ShieldedDriver; use HybridAgent for this mode"
             )
         check_agent(policy, str(self.options.mode), alone=not isinstance(policy, Team))
         check_scenario(scenario, str(self.options.mode))

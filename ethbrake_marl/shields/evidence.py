@@ -58,11 +58,11 @@ def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
 
     """
     if shield.log is None or shield.memory.running is None:
-        raise InvalidInput("review: the shield has no log; make it with logging=True, and run episodes behind it")
+        raise InvalidInput("review: the shield has no log; make the shield with logging=True, and run episodes")
     if worlds.n != shield.memory.running.n:
         raise InvalidInput(
-            f"review: worlds: has {count_of(worlds.n, 'world')}; must be the"
-            f" {count_of(shield.memory.running.n, 'world')} of the shield's last episodes"
+            f"review: worlds has {count_of(worlds.n, 'world')}; pass the worlds of the shield's last episodes,"
+            f" {count_of(shield.memory.running.n, 'world')}"
         )
     log = [
         entry for entry in shield.log if entry.world < worlds.n and entry.episode == shield.memory.episode[entry.world]

@@ -64,8 +64,8 @@ class StepGuard(ShieldGuard):
     def _started(self, shield: StepShield, alert: Worlds, rows: Ints) -> StepShield:
         if self._told is not None and not (rows < self._told.n).all():
             raise InvalidInput(
-                f"shield: told: has {count_of(self._told.n, 'world')}, but an episode begins in row {rows.max()}; must"
-                " have a world for every row"
+                f"shield: told has {count_of(self._told.n, 'world')}, but an episode begins in row {rows.max()}; told"
+                " must have one world for every row"
             )
         shield.begin(alert if self._told is None else self._told.take(rows), rows, self._policies or None)
         moving = int((~shield.memory.settles[rows]).sum())
@@ -133,7 +133,7 @@ class StepGuard(ShieldGuard):
         if self._told is None:
             k = int(np.argmax(surprising))
             raise UncertifiedStep(
-                f"shield: after this step {difference(running.nominal().states[k], seen[k])} (world {k})"
+                f"shield: after this step of world {k}, {difference(running.nominal().states[k], seen[k])}"
             )
         shield = copy.copy(shield)
         shield.memory = shield.memory._replace(distrusted=distrusted | surprising)

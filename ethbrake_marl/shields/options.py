@@ -88,7 +88,7 @@ class ShieldOptions:
             raise misplaced("bound", self.bound, mode, ["episode"], where)
         caps = get_args(Cap)
         if self.cap is not None and (mode != "step" or self.cap not in caps):
-            allowed = "only mode step has a cap" if self.cap in caps else f"must be {', '.join(caps)} or None"
+            allowed = "cap is possible only in mode step" if self.cap in caps else f"must be {', '.join(caps)} or None"
             raise InvalidInput(f"{where}: cap = {self.cap!r}: {allowed}")
         check_amount("intervention_penalty", self.intervention_penalty, where)
         object.__setattr__(self, "mode", mode)

@@ -132,7 +132,7 @@ class StepShield:
         if not each or any(not isinstance(i, int | np.integer) or isinstance(i, bool) or i not in known for i in each):
             raise InvalidInput(f"shield: vehicle = {vehicle!r}: must be an index from 0 to {scenario.vehicles - 1}")
         if list(each) != sorted(set(each)):
-            raise InvalidInput(f"shield: vehicle = {vehicle!r}: must have each index once, in increasing order")
+            raise InvalidInput(f"shield: vehicle = {vehicle!r}: must be different indices in increasing order")
         if cap not in (None, *get_args(Cap)):
             raise unknown_name("shield cap", cap, get_args(Cap))
         self.vehicles = tuple(map(int, each))
@@ -221,8 +221,8 @@ class StepShield:
         running_rows = len(self.memory.first_bound)
         if not (rows < running_rows).all() and sorted(rows.tolist()) != list(range(len(rows))):
             raise InvalidInput(
-                f"shield: begin in row {rows.max()}, but the batch has {running_rows} rows; to enlarge the batch,"
-                " begin in all rows of the larger batch at once"
+                f"shield: begin was called for row {rows.max()}, but the shield has only {running_rows} rows (worlds);"
+                " to add rows, call begin for all rows, old and new, at once"
             )
         refuse_untold(worlds, self.vehicles, "shield")
         possible = self.members_of(worlds) if possible is None else possible
@@ -260,8 +260,8 @@ class StepShield:
             policies = policy if isinstance(policy, Mapping) else dict.fromkeys(vehicles[:1], policy)
             if set(policies) != set(vehicles):
                 raise InvalidInput(
-                    f"shield: policy: is for the vehicles {sorted(policies)}; must be for exactly the shielded"
-                    f" vehicles, {list(vehicles)}"
+                    f"shield: policy has a policy for the vehicle indices {sorted(policies)}; must have one for each"
+                    f" shielded vehicle, {list(vehicles)}, and for no other"
                 )
             drivers = {i: policies[i] for i in vehicles}
             actions = rolled_out(worlds, drivers, self.scenario, self.vehicle, self._width)
@@ -291,7 +291,8 @@ class StepShield:
         vehicles, horizon_s = self.vehicles, self.scenario.horizon_s
         if members > 1 and self.cap is not None:
             raise InvalidInput(
-                f"shield: cap = {self.cap!r}: must be None, because each world has {members} possible worlds"
+                f"shield: cap = {self.cap!r}: must be None for a shield that considers several possible worlds (here"
+                f" {members}) for each world"
             )
         latest = possible.vehicles.latency_s[:, list(vehicles)].min(axis=1).max()
         if members > 1 and not latest < horizon_s:
@@ -354,7 +355,7 @@ class StepShield:
         if memory.running is None:
             raise InvalidInput("shield: decide() was called before any episode began; call begin first")
         if np.shape(proposed) != (shape := (*memory.distrusted.shape, *memory.backup.plan.shape[2:])):
-            raise InvalidInput(f"shield: shape of proposed = {np.shape(proposed)}: must be {shape}")
+            raise InvalidInput(f"shield: proposed has the shape {np.shape(proposed)}; must have the shape {shape}")
         asked = ~memory.running.finished if only is None else only
         if seen is not None:
             memory = self._compared(memory, seen, asked)

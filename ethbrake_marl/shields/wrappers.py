@@ -86,9 +86,9 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
         if set(asked) != set(self.shielded):
             self.attached.close()
             raise InvalidInput(
-                f"HybridShield: agents = {asked}: must be all learners, {self.shielded}, since the bound holds only if"
-                " every other vehicle follows a script; to give a vehicle a script, leave it out of learners=[...] when"
-                " you make the environment"
+                f"HybridShield: agents = {asked}: must be all learners, {self.shielded}, because the bound is proven"
+                " only if all other vehicles follow scripts; a vehicle that you leave out of learners=[...] when you"
+                " make the environment follows a script"
             )
 
     def reset(
@@ -279,7 +279,8 @@ def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, *
             raise InvalidInput(f"shield: agent {env.name!r} already has a shield")
         if policy is not None or "scenario" not in options:
             raise InvalidInput(
-                f"shield: agent {env.name!r}: pass scenario= (in which actions are certified), and leave out policy="
+                f"shield: to shield the agent {env.name!r}, pass scenario=... (the scenario in which it drives), and"
+                " leave out policy=..."
             )
         return shielded(env, load_scenario(settings.pop("scenario")), **settings)
     if isinstance(env, AECEnv):
@@ -288,8 +289,8 @@ def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, *
             inside = inside.env
         if not isinstance(inside, ParallelEnv):
             raise InvalidInput(
-                f"shield: in {inside} the agents act one after the other; shield the parallel environment inside it"
-                " with eb.shielded_aec(parallel)"
+                f"shield: in {inside} the agents act one after the other; make a shielded environment of this kind from"
+                " a parallel environment: eb.shielded_aec(parallel)"
             )
         return shielded_aec(inside, policy, **settings)
     if isinstance(env, VectorEnv):

@@ -221,7 +221,7 @@ class RunCallback(BaseCallback):
                 )
         except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
             raise CorruptBundle(
-                f"{self.run.checkpoints}: the checkpoint of step {state.steps} does not belong to this training:"
+                f"{self.run.checkpoints}: the checkpoint of step {state.steps} does not fit this training run:"
                 f" {' '.join(str(error).split())}; delete this checkpoint to resume from an earlier one"
             ) from None
         self._is_done_here = True

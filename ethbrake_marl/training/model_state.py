@@ -164,7 +164,8 @@ def _restore_replay(memory: Any, place: Any, arrays: Arrays) -> None:
     position, full = place
     if (type(position), type(full)) != (int, bool) or not 0 <= position < memory.buffer_size:
         raise ValueError(
-            f"replay = {place!r:.60}: must be [position, full], with a position below {memory.buffer_size}"
+            f"replay = {place!r:.60}: must be [position, full]: the next position in the replay buffer, from 0 to below"
+            f" {memory.buffer_size}, and whether the buffer is full"
         )
     memory.pos, memory.full = position, full
     for name in REPLAY:

@@ -48,7 +48,7 @@ class LearningRate(FileModel):
     start: Rate  # learning rate at the beginning
     end: Rate  # learning rate at the end
     schedule: Literal["cosine"] = Field(
-        "cosine", description="end + (start - end) (1 + cos(pi p)) / 2, where p is the fraction of steps done"
+        "cosine", description="learning rate after a fraction p of all steps: end + (start - end) (1 + cos(pi p)) / 2"
     )
 
     def at(self, remaining: float) -> float:
@@ -139,7 +139,7 @@ class TrainingRecipe(FileModel):
     total_steps: int = Field(ge=1, description="number of decisions of all learners together")
     n_envs: int = Field(ge=1, description="number of worlds that are simulated together")
     learning_rate: LearningRate = Field(description="learning rate of the optimiser, which falls from start to end")
-    gamma: Fraction = Field(description="discount factor per time step; equal to reward.shaping_discount")
+    gamma: Fraction = Field(description="discount factor per time step; must be equal to reward.shaping_discount")
     reward: RewardParams = Field(description="weights and constants of the reward's terms (docs/reference/rewards.md)")
     observation: Annotated[ListedFeatures | None, Field(exclude_if=not_)] = Field(
         None,
@@ -226,7 +226,9 @@ class TrainingRecipe(FileModel):
                 " or a scenario with one learner"
             )
         if scheme == "independent" and learners == 1:
-            raise InvalidInput(f"scheme independent: {where} has one learner; use the scheme single")
+            raise InvalidInput(
+                f"scheme independent: needs several learners, but {where} has one; use the scheme single"
+            )
         if scheme not in self.schemes:
             raise InvalidInput(
                 f"scheme {scheme}: the algorithm {self.algorithm} of recipe {self.name!r} does not support this scheme;"

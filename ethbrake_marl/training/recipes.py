@@ -68,8 +68,8 @@ class PpoRecipe(TrainingRecipe):
         updates = -(-self.total_steps // (self.n_envs * learners * self.n_steps))
         if self.turns is not None and self.turns * learners > updates:
             raise InvalidInput(
-                f"recipe {self.name!r}: turns = {self.turns}: {learners} learners need at least"
-                f" {self.turns * learners} updates, but total_steps = {self.total_steps} gives {updates}; raise"
+                f"recipe {self.name!r}: turns = {self.turns} for each of {learners} learners needs at least"
+                f" {self.turns * learners} updates, but total_steps = {self.total_steps} gives only {updates}; raise"
                 " total_steps, or lower turns"
             )
 

@@ -305,8 +305,8 @@ def _check_unfinished(run: RunDirectory, training: Training) -> None:
     resumable = any(run.checkpoints.glob("step_*"))
     if status["status"] == "finished" or (status.get("stage") is not None and not resumable):
         raise InvalidInput(
-            f"{run.path}: this training has finished and cannot be resumed; evaluate its policy with: ethbrake evaluate"
-            f" --scenario {training.scenario.name} --agents full_brake,{training.agent_in(run.path)}"
+            f"{run.path}: this training run has finished and cannot be resumed; evaluate its policy with: ethbrake"
+            f" evaluate --scenario {training.scenario.name} --agents full_brake,{training.agent_in(run.path)}"
         )
 
 
@@ -336,7 +336,7 @@ def _newest_checkpoint(
     if other and not other_versions:
         name = other[0]
         raise InvalidInput(
-            f"{run.path}: this training began with {name} {then.get(name)}, but {name} {now.get(name)} is installed,"
-            " which may compute other numbers; install the old version, or continue anyway (--other-versions)"
+            f"{run.path}: this training run began with {name} {then.get(name)}, but {name} {now.get(name)} is installed"
+            " and may compute other numbers; install the old version, or continue anyway (--other-versions)"
         )
     return state, damaged

@@ -88,7 +88,8 @@ def read_settings(
     measures = for_agents.get("measures", "")
     if not isinstance(measures, str) or ("measures" in for_agents and not measures):
         raise InvalidInput(
-            "--set measures: must be names of measures with commas between them, for instance measures=injury"
+            "--set measures: must be one or more names of measures, with commas between them, for instance"
+            " measures=injury"
         )
     return Settings(
         tuple(texts or ()),

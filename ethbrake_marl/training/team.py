@@ -104,8 +104,8 @@ def load_team(
     file = RunDirectory(path).team
     if not os.path.lexists(file):
         raise InvalidInput(
-            f"{path}: has no {file.name}, so it is not a team; name the folder of a run, or write ppo@{path} for a"
-            " policy bundle"
+            f"{path}: has no file {file.name}, so it is not the folder of a team; give the folder of a training run"
+            f" or, if {path} is a policy bundle, write ppo@{path}"
         )
     team = read_team(file)
     if team.vehicles != scenario.vehicles:

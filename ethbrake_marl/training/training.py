@@ -149,7 +149,9 @@ def recorded_training(run: RunDirectory, config: Mapping[str, Any]) -> Training:
         recipe = TrainingRecipe.of(config["recipe"])
         scenario = Scenario.from_document(Document("scenario", config["scenario"], {}))
     except KeyError as error:
-        raise InvalidInput(f"{run.config}: does not describe a training, because {error} is missing") from None
+        raise InvalidInput(
+            f"{run.config}: does not describe a training run, because the key {error} is missing"
+        ) from None
     except InvalidInput as error:
         raise InvalidInput(f"{run.config}: {error}") from None
     return Training.of(recipe, scenario)
@@ -168,6 +170,6 @@ def check_same_training(run: RunDirectory, training: Training) -> None:
         if key not in before[part] or key not in wanted[part] or before[part][key] != wanted[part][key]
     ]
     raise InvalidInput(
-        f"{run.path}: this folder contains another training, which differs in {', '.join(other)}; choose another folder"
-        " (--output)"
+        f"{run.path}: this folder contains another training run, which differs in {', '.join(other)}; choose another"
+        " folder (--output)"
     )

@@ -64,19 +64,21 @@ def policy(answer: Callable[[int], Any]) -> Any:
 SPECS: dict[str, Callable[[], object]] = {
     "agent 'coast:1': coast takes no argument": lambda: make_agent("coast:1"),
     "agent 'full_brake@': a path must follow '@'": lambda: make_agent("full_brake@"),
-    "agent 'coast@runs/x': coast takes no policy": lambda: make_agent("coast@runs/x"),
+    "agent 'coast@runs/x': coast does not use a policy; leave": lambda: make_agent("coast@runs/x"),
     "agent 'ladder': is the name of a group of agents; write the name of one agent": lambda: make_agent("ladder"),
     "agent 'constant': constant needs a finite deceleration in m/s2 after the colon": lambda: make_agent("constant"),
     "agent 'constant:fast': constant needs a finite deceleration in m/s2 after the colon": lambda: make_agent(
         "constant:fast"
     ),
-    "agent 'e_v2x_bm:total': argument: must be 'coupled' or 'pairwise'": lambda: make_agent("e_v2x_bm:total"),
+    "agent 'e_v2x_bm:total': the argument must be 'coupled' or 'pairwise', then 'estimated'": lambda: make_agent(
+        "e_v2x_bm:total"
+    ),
     "harm_count = 'both': must be 'first' or 'total'": lambda: make_agent("e_v2x_bm", harm_count="both"),
-    "horizon_s = 0.0: must be a positive number of seconds": lambda: make_agent("e_v2x_bm", horizon_s=0.0),
-    "agent name 'mine:x': must be a plain name without argument": lambda: register_agent("mine:x", Own),
+    "horizon_s = 0.0: must be a finite number of seconds above 0": lambda: make_agent("e_v2x_bm", horizon_s=0.0),
+    "agent name 'mine:x': must be a name without ':' and '@', for instance": lambda: register_agent("mine:x", Own),
     "file 'nowhere/none.py': does not exist": lambda: make_agent("nowhere/none.py:make_agent"),
-    "agent 'profile:0=3,1=5+step': a profile can only be a role in a scenario, not an agent": lambda: make_agent(
-        "profile:0=3,1=5+step", scenario=PAPER
+    "agent 'profile:0=3,1=5+step': a braking profile can only be the role of a vehicle in a scenario": lambda: (
+        make_agent("profile:0=3,1=5+step", scenario=PAPER)
     ),
     "agent 'policy' needs a policy: write policy@PATH, where PATH is the folder of": lambda: make_agent(
         "policy+step", scenario=PAPER
@@ -99,10 +101,10 @@ SEARCHES: dict[str, Callable[[], object]] = {
     ),
     "vehicle = 3: must be an index from 0 to 2": lambda: optimise_pairwise(WORLDS, 3),
     "deceleration_mps2[0, 1] = -1: must be finite and >= 0": lambda: pairwise_harm(WORLDS.take([0]), [1.0, -1.0, 1.0]),
-    "team 't': key 'vehicle_2': must be the index of a vehicle, 0 or more": lambda: Team({"vehicle_2": BRAKE}, "t"),
+    "team 't': key 'vehicle_2': must be the index of a vehicle, at least 0": lambda: Team({"vehicle_2": BRAKE}, "t"),
     "team 't': 'coast' of vehicle_2: must be an agent, for instance": lambda: Team({1: "coast"}, "t"),
     "team 't': drives vehicle_2; must drive exactly vehicle_2": lambda: Team.of(Team({1: BRAKE}, "t"), (1, 2)),
-    "scenario 'cooperation-3-pair': exactly one vehicle must be controlled here; the controlled vehicles are": lambda: (
+    "scenario 'cooperation-3-pair': this function needs exactly one controlled vehicle; the controlled": lambda: (
         eb.evaluate(PAIR.sample(2, 0), {"b": BRAKE}, scenario=PAIR).vehicle
     ),
     "agent 'coast' drives vehicle_3, but vehicle_2 of scenario 'cooperation-3-pair'": lambda: eb.evaluate(
@@ -121,29 +123,29 @@ OWN: dict[str, Callable[[], object]] = {
     "agent 'own' of vehicle_2: act on 12 worlds at 0.50 s: ZeroDivisionError: division by zero": lambda: evaluated(
         Own(lambda worlds: 1 / 0)
     ),
-    "memory: act got a memory of the form None and returned the form (dtype('float64'),)": lambda: evaluated(
-        Remembers(lambda n: None, lambda m, n: np.zeros(n))
+    "memory: act got a memory of the form None, but returned a memory of the form (dtype('float64'),);": lambda: (
+        evaluated(Remembers(lambda n: None, lambda m, n: np.zeros(n)))
     ),
-    "and returned the form {'a': (dtype('float64'),), 'b': (dtype('float64'),)}": lambda: evaluated(
+    "but returned a memory of the form {'a': (dtype('float64'),), 'b': (dtype('float64'),)}": lambda: evaluated(
         Remembers(lambda n: {"a": np.zeros(n)}, lambda m, n: m | {"b": np.zeros(n)})
     ),
-    "and returned the form (dtype('int64'),); keys": lambda: evaluated(
+    "but returned a memory of the form (dtype('int64'),); keys": lambda: evaluated(
         Remembers(np.zeros, lambda m, n: np.zeros(n, np.int64))
     ),
-    "and returned the form (dtype('float64'), 2); keys": lambda: evaluated(
+    "but returned a memory of the form (dtype('float64'), 2); keys": lambda: evaluated(
         Remembers(lambda n: np.zeros((n, 1)), lambda m, n: np.zeros((n, 2)))
     ),
-    "agent 'mine' of vehicle_2: memory: key 'b.c': must be an identifier": lambda: evaluated(
+    "agent 'mine' of vehicle_2: memory: key 'b.c': must be a Python identifier, for": lambda: evaluated(
         Remembers(lambda n: {"a": (np.zeros(n), {"b.c": np.zeros(n)})}, lambda m, n: m)
     ),
-    "agent 'mine' of vehicle_2: memory: key 0: must be an identifier": lambda: evaluated(
+    "agent 'mine' of vehicle_2: memory: key 0: must be a Python identifier, for": lambda: evaluated(
         Remembers(lambda n: {0: np.zeros(n)}, lambda m, n: m)
     ),
     "agent 'mine' of vehicle_2: memory: contains an array of objects; arrays must contain numbers": lambda: evaluated(
         Remembers(lambda n: np.array([[]] * n + [[1]], object)[:n], lambda m, n: m)
     ),
-    "the closed form of E-V2X-BM and planner: brakes of world 0 build up (brake_rate_mps3": lambda: evaluated(
-        make_agent("e_v2x_bm:pairwise"), SLOW
+    "the closed form of E-V2X-BM and planner: in world 0 brakes build up at a finite rate, for which": lambda: (
+        evaluated(make_agent("e_v2x_bm:pairwise"), SLOW)
     ),
     "the closed form of E-V2X-BM and planner: a vehicle of world 0 follows a braking profile": lambda: evaluated(
         make_agent("e_v2x_bm:pairwise"), PIECES
@@ -158,7 +160,7 @@ def test_agent_of_a_user__is_refused(message: str) -> None:
 
 
 FAILED: dict[str, Callable[[], object]] = {
-    "agent 'own', world 0, vehicle_2 at 0.50 s: act returned float64 of shape (12, 1); one number per world": lambda: (
+    "agent 'own', world 0, vehicle_2 at 0.50 s: act returned float64 of shape (12, 1); must return one": lambda: (
         evaluated(Own(lambda worlds: np.zeros((worlds.n, 1))))
     ),
     "agent 'own', world 0, vehicle_2 at 0.50 s: act returned float64 of shape ()": lambda: evaluated(
@@ -167,10 +169,10 @@ FAILED: dict[str, Callable[[], object]] = {
     "agent 'own', world 0, vehicle_2 at 0.50 s: act returned object of shape ()": lambda: evaluated(
         Own(lambda worlds: None)
     ),
-    "agent 'own', world 0, vehicle_2 at 0.50 s: act returned <U1 of shape (12,); one": lambda: evaluated(
+    "agent 'own', world 0, vehicle_2 at 0.50 s: act returned <U1 of shape (12,); must return one": lambda: evaluated(
         Own(lambda worlds: ["x"] * worlds.n)
     ),
-    "agent 'own', world 7, vehicle_2 at 0.50 s: act returned float64 of shape (7,); one number per world": lambda: (
+    "agent 'own', world 7, vehicle_2 at 0.50 s: act returned float64 of shape (7,); must return one number": lambda: (
         evaluated(Own(lambda worlds: np.zeros(7)))
     ),
     "agent 'own', world 4, vehicle_2 at 0.50 s: command nan m/s2; must be in [-7, 7]": lambda: evaluated(
@@ -194,15 +196,15 @@ def test_agent__fails_with_its_world_and_step(message: str) -> None:
 @pytest.mark.parametrize(
     ("answer", "world", "reason"),
     [
-        (lambda n: np.zeros((n, 2)), 0, "; must be one number per world, shape (12, 1)"),
-        (lambda n: np.zeros(n), 0, "; must be one number per world, shape (12, 1)"),
-        (lambda n: np.zeros((n, 1))[:5], 5, "; must be one number per world, shape (12, 1)"),
+        (lambda n: np.zeros((n, 2)), 0, "; must return one number per world, shape (12, 1)"),
+        (lambda n: np.zeros(n), 0, "; must return one number per world, shape (12, 1)"),
+        (lambda n: np.zeros((n, 1))[:5], 5, "; must return one number per world, shape (12, 1)"),
         (
             lambda n: np.where(np.arange(n) == 3, np.nan, -1.0)[:, None],
             3,
-            "; the action of this world is nan; must be in [-1, 1]",
+            "; the action for this world is nan; must be in [-1, 1]",
         ),
-        (lambda n: 1.5 * np.eye(n)[:, 2:3], 2, "; the action of this world is 1.5; must be in [-1, 1]; clip=True"),
+        (lambda n: 1.5 * np.eye(n)[:, 2:3], 2, "; the action for this world is 1.5; must be in [-1, 1]; clip=True"),
     ],
     ids=["two columns", "no column", "too few", "nan", "beyond 1"],
 )
@@ -216,7 +218,7 @@ def test_policy__fails_with_its_world_and_step(answer: Callable[[int], Any], wor
 POLICIES: dict[str, Callable[[], object]] = {
     "agent 'int': policy = 3: must be a function of observations, an object": lambda: eb.policy_agent(3),
     "agent 'none': policy = 'none.onnx': there is no such file": lambda: eb.policy_agent(Path("none.onnx")),
-    "agent 'ActorCriticPolicy': the policy takes observations of shape (27,), but this observation has 37": lambda: (
+    "agent 'ActorCriticPolicy': the policy was trained for observations of shape (27,), but would get": lambda: (
         eb.policy_agent(PPO("MlpPolicy", eb.EthBrakeEnv()).policy, observation=eb.ObservationSpec(front=2))
     ),
     "agent 'PPO': initial_state: can only be used with a function (observation,": lambda: eb.policy_agent(
@@ -298,7 +300,7 @@ def test_agent_that_is_registered__takes_a_policy_only_if_it_says_so() -> None:
     with refused("agent 'ppo' is registered already", AlreadyExists):
         register_agent("ppo", Own)
     register_agent("leads", lambda argument, settings: make_agent(f"constant:{argument}"))
-    with refused("agent 'leads@anything': leads takes no policy; to allow one, register the agent"):
+    with refused("agent 'leads@anything': leads does not use a policy; leave out @ and what follows; to allow"):
         make_agent("leads@anything")
 
 
@@ -311,7 +313,7 @@ def test_agent_that_is_registered__takes_a_policy_only_if_it_says_so() -> None:
     ids=["own", "e_v2x_bm"],
 )
 def test_looking_ahead__needs_commands_that_are_fixed_at_the_alert(drives: Callable[[], object], third: str) -> None:
-    with refused(f"vehicle_3 is controlled by '{third}', whose command is not fixed at the alert"):
+    with refused(f"vehicle_3 is driven by '{third}', whose command is not fixed at the alert"):
         drives()
 
 
@@ -340,7 +342,9 @@ def test_agent__has_a_name_and_its_act_takes_a_memory_if_it_begins_with_one() ->
         def begin(self, worlds: Any) -> None:
             return None
 
-    with refused("agent 'own' of vehicle_2: the agent has begin, but act takes no memory; an agent with memory has"):
+    with refused(
+        "agent 'own' of vehicle_2: the agent has begin, but act has no argument memory; an agent with memory has"
+    ):
         evaluated(Begins(len))
 
 
@@ -355,12 +359,12 @@ def test_policy__gives_one_action_per_world_and_a_state_per_world() -> None:
         def predict(self, seen: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False) -> Any:
             return np.zeros((len(seen), 1)), np.zeros((1, 8))
 
-    with refused("learned: shape of actions = (12, 2): must be (12, 1), one action per world"):
+    with refused("learned: actions have shape (12, 2); must have shape (12, 1), one action per world"):
         LearnedAgent(Fixed()).act(WORLDS, 1)
-    with refused("predict fails for 27 features: a state array has shape (1, 8) for two worlds and (1, 8) for three"):
+    with refused("27 features: an array of the policy's state has shape (1, 8) for two worlds and (1, 8) for three"):
         eb.policy_agent(Shared())
     states = eb.policy_agent(lambda seen, state: (seen, state), name="mine", initial_state=lambda n: np.zeros(3))
-    with refused("initial_state(12): state: ndarray of shape (3,); arrays must have length 12", AgentFailed):
+    with refused("initial_state(12): state: has ndarray of shape (3,); must have arrays of length 12", AgentFailed):
         states.begin(WORLDS, 1, {})
 
 
@@ -397,8 +401,10 @@ def test_model_of_stable_baselines3__was_trained_on_the_features_that_it_is_give
     with refused("agent 'PPO': the model was trained with the observation ObservationSpec(front=2, rear=0"):
         eb.policy_agent(PPO("MlpPolicy", rows), observation=eb.ObservationSpec())
     numbered = PPO("MlpPolicy", eb.make_sb3_vec_env(PAIR, 2, appended="number")).policy
-    with refused("the policy takes observations of shape (28,), but this observation has 27 features; pass scenario"):
+    with refused(
+        "the policy was trained for observations of shape (28,), but would get observations of 27 features; pass the"
+    ):
         eb.policy_agent(numbered, scenario=PAIR)
     stated = PPO("MlpPolicy", eb.make_sb3_vec_env(PAIR, 2, appended="state")).policy
-    with refused("agent 'ActorCriticPolicy': appended = 'state': pass scenario=, the training scenario"):
+    with refused("agent 'ActorCriticPolicy': appended = 'state' needs the scenario of the training; pass it"):
         eb.policy_agent(stated, appended="state")

@@ -327,7 +327,7 @@ def test_command_of_a_program__appears_runs_and_takes_no_other_place(ethbrake, m
 
 def test_measures__asked_for_wrongly_are_one_line(ethbrake):
     check_refused(
-        ethbrake("evaluate", "--set", "measures="), "--set measures: must be names of measures with commas between them"
+        ethbrake("evaluate", "--set", "measures="), "--set measures: must be one or more names of measures, with commas"
     )
     check_refused(
         ethbrake("evaluate", "--scenario", "benchmark", "--set", "measures=injury"),

@@ -85,7 +85,7 @@ EVALUATIONS = [
     ),
     (
         "evaluate --agents team@.",
-        ".: has no team.json, so it is not a team; name the folder of a run, or write ppo@. for a policy",
+        ".: has no file team.json, so it is not the folder of a team; give the folder of a training run",
     ),
     ("evaluate --agents policy@shipped+step", "'policy@shipped' is now written universal (the policies"),
     ("evaluate --agents ppo@shipped/ppo", "'ppo@shipped/ppo' is now written ppo"),

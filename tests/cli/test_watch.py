@@ -195,7 +195,7 @@ def test_compare__marks_who_exploits_what_harm_does_not_count(ethbrake: Command,
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [
-        ({"horizon_ends": -1}, "horizon_ends = -1: must be 0 to "),
+        ({"horizon_ends": -1}, "horizon_ends = -1: must be the number of episodes"),
         ({"horizon_ends": "3"}, "horizon_ends is missing or not of type int"),
         ({"vehicle_1_shoved_m": "far"}, "vehicle_1_shoved_m = 'far': must be a number of metres, or null"),
     ],

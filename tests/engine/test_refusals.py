@@ -66,13 +66,13 @@ OBSERVATIONS: dict[str, Callable[[], object]] = {
     "observe: vehicle = 4: must be an index from 0 to 2": lambda: observe(
         load_scenario("paper-random").sample(1, 7).worlds, 4, ObservationSpec()
     ),
-    "observation: contact features need the time between two decisions; give the argument time_step_s": lambda: observe(
-        WORLDS, 1, choose_observation(["own", "contact"])
+    "observation: features of the groups contact and contact_far need the time between two decisions; pass": lambda: (
+        observe(WORLDS, 1, choose_observation(["own", "contact"]))
     ),
-    "observation: time_step_s = -1.0: must be a positive number of seconds": lambda: ObservationSpec(
+    "observation: time_step_s = -1.0: must be a finite number of seconds above 0": lambda: ObservationSpec(
         contact=True, time_step_s=-1.0
     ),
-    "policy: scenario: time_step_s = None: must be a number above 0": lambda: make_policy(
+    "policy: scenario: time_step_s = None: must be a number of seconds above 0,": lambda: make_policy(
         choose_observation(["own", "contact"]), {}
     ),
 }
@@ -127,7 +127,7 @@ OBJECTIVES: dict[str, Callable[[], object]] = {
     "scenario 'paper-random': objective = \"weighted:1,2\": objective 'weighted:1,2': has 2 weights; must": lambda: (
         PAPER.replace(objective="weighted:1,2")
     ),
-    "2 entries; must have 3, one per vehicle, or be a single entry for all": lambda: PAPER.replace(
+    "2 entries; must have 3, one per vehicle; or give one objective for all vehicles,": lambda: PAPER.replace(
         objective=["own", "own"]
     ),
     "objective = 5: must be the name of an objective, for instance own or social:45, or a list with one name": lambda: (
@@ -164,15 +164,15 @@ def test_objective__is_refused(message: str) -> None:
 
 
 ENGINE: dict[str, Callable[[], object]] = {
-    "engine: deciders = (3,): all must be vehicle indices": lambda: Engine(
+    "engine: deciders = (3,): must be indices of vehicles, from 0 to": lambda: Engine(
         PAPER, 1, learners=(), scripts=SCRIPTS, deciders=(3,)
     ),
-    "engine snapshot: the array state has the shape (6, 20); the shape (7, 20) is": lambda: make_engine(
+    "engine snapshot: the array state has the shape (6, 20); must have the shape (7, 20)": lambda: make_engine(
         PAPER, 7
     ).restore(make_engine(PAPER, 6).snapshot()),
-    "renew: rows = [1, 9]: must be different numbers from 0 to 5": lambda: make_engine(PAPER, 6).renew([1, 9]),
+    "renew: rows = [1, 9]: must be different row numbers from 0 to 5": lambda: make_engine(PAPER, 6).renew([1, 9]),
     "observe: vehicle = 'vehicle_2': must be a vehicle index": lambda: make_engine(PAPER, 6).observe("vehicle_2"),
-    "since: the earlier ledger is not of the same episodes; call since before a": lambda: make_engine(
+    "since: before is not an earlier ledger (record of harm) of the same episodes; call since": lambda: make_engine(
         PAPER, 6
     ).ledger.since(make_engine(PAPER, 1).ledger),
 }
@@ -210,14 +210,14 @@ def test_episode__starts_at_the_alert_without_an_impact() -> None:
 
 def test_branch__has_an_end_and_no_shaping() -> None:
     shaped = make_engine(PAPER, 2, reward={"harm": 1.0, "shaping": 0.1})
-    with refused("branch: the reward has shaping = 0.1; it must be 0 to branch"):
+    with refused("branch: the reward has shaping = 0.1; branch needs shaping = 0"):
         shaped.branch(shaped.moment())
 
 
 def test_snapshot__of_another_engine_is_refused() -> None:
     kept = make_engine(PAPER, 6).snapshot()
-    with refused("engine snapshot: the array params has the shape (6, 25); the shape (6, 37) is needed"):
+    with refused("engine snapshot: the array params has the shape (6, 25); must have the shape (6, 37)"):
         make_engine(load_scenario("cooperation-2-blocked"), 6).restore(kept)
     del kept["params"]
-    with refused("engine snapshot: the array params is missing; the shape (6, 25) is needed"):
+    with refused("engine snapshot: the array params is missing; must have the shape (6, 25)"):
         make_engine(PAPER, 6).restore(kept)

@@ -266,7 +266,7 @@ def test_dqn__of_two_learners_and_of_supersuit_drives() -> None:
 def test_copies__with_other_numbers_of_actions_are_refused() -> None:
     model = small(make_vec_env("EthBrake-v1", n_envs=2, env_kwargs={"actions": 9}))
     model.get_env().envs[1] = gymnasium.make("EthBrake-v1", actions=17)
-    with pytest.raises(InvalidInput, match="the copies of the model's environment have different numbers of actions"):
+    with pytest.raises(InvalidInput, match="have different numbers of discrete actions"):
         eb.policy_agent(model)
 
 
@@ -284,9 +284,9 @@ def test_function__of_indices_drives(shape: tuple[int, ...]) -> None:
     [
         (
             lambda n: np.full(n, 9),
-            r"world 0, step 1 \(0.50 s\): .* the index of this world is 9; must be a whole number",
+            r"world 0, step 1 \(0.50 s\): .* the action index for this world is 9; must be a whole number",
         ),
-        (lambda n: np.full(n, -1), "the index of this world is -1"),
+        (lambda n: np.full(n, -1), "the action index for this world is -1"),
         (lambda n: np.full(n, 2.0), "returned float64 of shape"),
         (lambda n: np.full(n, True), "returned bool of shape"),
         (lambda n: np.full(n + 1, 2), r"from 0 to 8 per world with actions=9, shape \(3,\) or \(3, 1\)"),

@@ -37,13 +37,13 @@ MADE: dict[str, Callable[[], object]] = {
         {**load_scenario("paper-random").declared(), "mass_t": -1.0}
     ),
     "must be a name (harm, total-harm, paper), a mapping such as {'harm': 1.0}": lambda: parallel_env(reward=5),
-    "observation = 'x': must be an ObservationSpec, for instance ObservationSpec(1, 1), its fields": lambda: (
+    "observation = 'x': must be a list of groups and features such as ['own', 'front_1'], an ObservationSpec": lambda: (
         parallel_env(observation="x")
     ),
     "observation: front = 'two': must be a whole number from 0 to 64": lambda: parallel_env(
         observation={"front": "two"}
     ),
-    "observation: chosen = 3: must be a list of features": lambda: parallel_env(observation={"chosen": 3}),
+    "observation: chosen = 3: must be a list of names of features": lambda: parallel_env(observation={"chosen": 3}),
     "agents = 'scripted': must be 'all' or 'learners'": lambda: parallel_env(agents="scripted"),
     "agents = 'learners': scenario 'paper-random' has no learner; pass": lambda: parallel_env(
         agents="learners", learners=[]
@@ -77,16 +77,16 @@ MADE: dict[str, Callable[[], object]] = {
     "reset: seed = -1: must be None or a whole number, at least 0": lambda: eb.make_sb3_vec_env(PAPER, 1, seed=-1),
     "appended = 'x': must be 'number', 'state' or None": lambda: eb.make_sb3_vec_env(FIVE, 3, appended="x"),
     "step: no episode is running; call reset first": lambda: eb.make_sb3_vec_env(PAPER, 2).step_wait(),
-    "set_attr: indices = 0: must not be passed, because all rows belong to one environment": lambda: (
+    "set_attr: indices = 0: must not be passed, because all worlds are simulated by one object": lambda: (
         eb.make_sb3_vec_env(PAPER, 3).set_attr("label", 8, indices=0)
     ),
     "must be an environment made by gymnasium.make_vec('EthBrake-v1')": lambda: eb.ShieldedVectorEnv(parallel_env()),
-    "observation: vehicle_2 and vehicle_3 of 'five' observe different features, but here all learners": lambda: (
+    "observation: vehicle_2 and vehicle_3 of 'five' observe different features, but must observe the same": lambda: (
         eb.make_sb3_vec_env(FIVE, 3, learners=PAIR, observation={"vehicle_3": ["own"]})
     ),
-    "observe_all: vehicle_2, vehicle_3 observe different features; use observe for each": lambda: eb.make_engine(
-        FIVE, 3, learners=PAIR, observation={"vehicle_3": ["own"]}
-    ).observe_all(),
+    "observe_all: vehicle_2, vehicle_3 observe different features; call observe for each vehicle": lambda: (
+        eb.make_engine(FIVE, 3, learners=PAIR, observation={"vehicle_3": ["own"]}).observe_all()
+    ),
     "scenario 'paper-random': observation.vehicle_4: unknown vehicle": lambda: PAPER.replace(
         observation={"vehicle_2": ["own"], "vehicle_4": ["own"]}
     ),
@@ -94,8 +94,13 @@ MADE: dict[str, Callable[[], object]] = {
         PAPER.replace(observation={"vehicle_2": ["own", "own.speed"]})
     ),
     "scenario 'paper-random': observation = {}: must be a list of groups": lambda: PAPER.replace(observation={}),
-    "observe different features, but here all learners must observe the same features; give one list": lambda: eb.train(
-        "cooperation-ppo", FIVE.with_learners(PAIR).replace(observation={"vehicle_2": ["own"]}), "run", scheme="shared"
+    "observe different features, but must observe the same features here; give one list for all vehicles,": lambda: (
+        eb.train(
+            "cooperation-ppo",
+            FIVE.with_learners(PAIR).replace(observation={"vehicle_2": ["own"]}),
+            "run",
+            scheme="shared",
+        )
     ),
 }
 
@@ -144,12 +149,18 @@ STEPS: dict[str, Callable[[], object]] = {
     "action of vehicle_2 = nan: must be from -1 (full braking) to 1 (full driving)": lambda: started(
         eb.EthBrakeVectorEnv(2)
     ).step(np.full((2, 1), np.nan)),
-    "env_method: indices = [1]: must not be passed, because all rows belong to one environment": lambda: (
+    "env_method: indices = [1]: must not be passed, because all worlds are simulated by one object": lambda: (
         eb.make_sb3_vec_env(PAPER, 3).env_method("seed", 4, indices=[1])
     ),
-    "set_options: row 1 has {'initial_state': {'gaps_m': array([4.])}}": lambda: rows(FAR, NEAR, NEAR, NEAR).reset(),
-    "set_options: row 1 has {}; give initial_state in all rows or in none": lambda: rows(FAR, {}, NEAR, NEAR).reset(),
-    "set_options: the list has 2 entries: must have one for each of the 4 rows": lambda: rows(FAR, FAR).reset(),
+    "set_options: entry 1 of the list is {'initial_state': {'gaps_m': array([4.])}};": lambda: rows(
+        FAR, NEAR, NEAR, NEAR
+    ).reset(),
+    "set_options: entry 1 of the list is {}; give initial_state in all entries or in": lambda: rows(
+        FAR, {}, NEAR, NEAR
+    ).reset(),
+    "set_options: the list has 2 entries; must have 4, one for each learner of each world": lambda: rows(
+        FAR, FAR
+    ).reset(),
 }
 
 
@@ -211,7 +222,9 @@ def test_worlds__that_go_on_from_a_snapshot_are_not_described() -> None:
 def test_world__that_was_left_out_is_not_described() -> None:
     env = started(eb.EthBrakeVectorEnv(2, "realistic-mixed"))
     env.engine.roster.numbers[1] = 40  # as if world 40 had been left out
-    with refused("describe_worlds: the random draw of row 1 is unknown, because the physics failed in world 40 of"):
+    with refused(
+        "describe_worlds: the random draw of row 1 is unknown: the physics failed in world 40 of seed 3 before its"
+    ):
         env.describe_worlds()
 
 

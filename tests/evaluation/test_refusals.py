@@ -79,7 +79,7 @@ EVALUATIONS: dict[str, Callable[[], object]] = {
     "reset: world 0 is at 0.1 s; episodes start at the alert, t = 0, without any impact": lambda: eb.evaluate(
         advance(WORLDS, -WORLDS.vehicles.braking_capacity_mps2, until_s=0.1)[0], BRAKE, scenario=PAPER
     ),
-    "must be Worlds or a Sample, for instance scenario.sample(100, seed=7)": lambda: eb.evaluate(
+    "must be a Worlds or Sample object, for instance scenario.sample(100, seed=7)": lambda: eb.evaluate(
         5, BRAKE, scenario=PAPER
     ),
     "must be specs such as 'full_brake,ppo', or a mapping": lambda: eb.evaluate(WORLDS, 5, scenario=PAPER),
@@ -94,8 +94,8 @@ EVALUATIONS: dict[str, Callable[[], object]] = {
     "agent 'confused': predicted_harm in its memory has type float64 and shape (3, 2); must be one": lambda: (
         eb.evaluate(WORLDS, {"x": Confused((3, 2))}, scenario=PAPER)
     ),
-    "agent 'confused' of vehicle_2: memory: ndarray of shape (2,); arrays must have length 3": lambda: eb.evaluate(
-        WORLDS, {"x": Confused((2,))}, scenario=PAPER
+    "agent 'confused' of vehicle_2: memory: has ndarray of shape (2,); must have arrays of length 3 (worlds)": lambda: (
+        eb.evaluate(WORLDS, {"x": Confused((2,))}, scenario=PAPER)
     ),
     "agent 'ppo' was not evaluated; evaluated agents: full_brake": lambda: eb.evaluate(
         WORLDS, BRAKE, scenario=PAPER
@@ -168,11 +168,11 @@ def row(**changes: Any) -> dict[str, Any]:
 
 RESULTS: dict[str, Callable[[], object]] = {
     "x.json: is not JSON, or is incomplete: Expecting value: line 1 column 2 (char 1)": lambda: result("["),
-    "x.json: is not a results file of ethbrake evaluate --json (kind is missing)": lambda: result("{}"),
-    "x.json: is not a results file of ethbrake evaluate --json": lambda: result("3"),
+    "x.json: is not a results file, because the key kind is missing; give a file with the output": lambda: result("{}"),
+    "x.json: is not a results file; give a file with the output of ethbrake evaluate": lambda: result("3"),
     "x.json: unknown kind of results 'evalute'; did you mean 'evaluate'?": lambda: result('[{"kind": "evalute"}]'),
-    "x.json: results of the kind best-harm cannot be compared; results of evaluate and shield": lambda: result(
-        '{"kind": "best-harm"}'
+    "x.json: results of the kind best-harm cannot be compared; give results of the kind evaluate or shield": lambda: (
+        result('{"kind": "best-harm"}')
     ),
     "x.json: agents is missing or not a list of objects; the file is incomplete": lambda: result(
         '{"kind": "evaluate", "seed": 7}'
@@ -183,8 +183,8 @@ RESULTS: dict[str, Callable[[], object]] = {
     "x.json: full_brake: first_impact_harm = 27.178703352274425, first_impact_harm_interval = [0.0,": lambda: result(
         [row(episodes=1)]
     ),
-    "x.json: full_brake: episodes = 0: must be 1 to 1,000,000,000,000": lambda: result([row(episodes=0)]),
-    "x.json: full_brake: episodes = True: must be 1 to 1,000,000,000,000": lambda: result([row(episodes=True)]),
+    "x.json: full_brake: episodes = 0: must be from 1 to 1,000,000,000,000": lambda: result([row(episodes=0)]),
+    "x.json: full_brake: episodes = True: must be from 1 to 1,000,000,000,000": lambda: result([row(episodes=True)]),
     "x.json: lists the agent full_brake twice; evaluate each agent once": lambda: result([row(), row()]),
 }
 
@@ -236,7 +236,7 @@ def test_results__whose_mean_is_not_that_of_their_worlds_are_not_compared(empty_
     changed = {**told, "first_impact_harm": 3.0, "first_impact_harm_interval": [2.0, 4.0]}
     Path("a/x.json").write_text(json.dumps([changed]))
     with refused(
-        "a/x.json: full_brake: first_impact_harm = 3, but the mean over the worlds in the file with one row per"
+        "a/x.json: full_brake: first_impact_harm = 3, but its mean over the file with one row per world is 27.1787; one"
     ):
         compare_results(read_result(Path("a/results.json")), read_result(Path("a/x.json")))
 
@@ -253,26 +253,26 @@ def test_record__is_of_one_world_at_a_positive_time(sample_s: float) -> None:
 
 
 STATISTICS: dict[str, Callable[[], object]] = {
-    "exact sum: values of shape (1,): must be finite numbers of shape [n]": lambda: exact_sum(np.array([nan])),
-    "exact sum: values of shape (1, 1): must be finite numbers of shape [n]": lambda: exact_sum(np.array([[1.0]])),
+    "exact sum: values has shape (1,); must have finite numbers of shape [n]": lambda: exact_sum(np.array([nan])),
+    "exact sum: values has shape (1, 1); must have finite numbers of shape [n]": lambda: exact_sum(np.array([[1.0]])),
     "rate: successes = -1, count = 10: must be 0 <= successes <= count, and count at least 1": lambda: rate(-1, 10),
     "rate: successes = 11, count = 10: must be 0 <= successes <= count, and count at least 1": lambda: rate(11, 10),
     "rate: successes = 0, count = 0: must be 0 <= successes <= count, and count at least 1": lambda: rate(0, 0),
-    "statistics: values of shape (0,): must be one finite number per world, shape [n] with n at least 1": lambda: mean(
+    "statistics: values has shape (0,); must have one finite number per world: shape [n] with n >= 1": lambda: mean(
         np.array([])
     ),
-    "statistics: values of shape (2,): must be one finite number per world, shape [n] with n at": lambda: mean(
+    "statistics: values has shape (2,); must have one finite number per world: shape [n] with n >= 1": lambda: mean(
         np.array([1.0, nan])
     ),
-    "statistics: 3 values and 2 values of the baseline: both must have the same": lambda: paired_difference(
+    "statistics: there are 3 values, but 2 values of the baseline; the two numbers must be": lambda: paired_difference(
         np.zeros(3), np.zeros(2)
     ),
     "interquartile_mean: tasks is empty; pass the results of at least one task": lambda: interquartile_mean([]),
-    "interquartile_mean: task 0: values of shape (0,): must be one finite number per seed, shape [n]": lambda: (
+    "interquartile_mean: task 0: values has shape (0,); must have one finite number per seed: shape [n] with": lambda: (
         interquartile_mean([[]])
     ),
-    "interquartile_mean: task 0: values of shape (2,): must be one finite number per seed,": lambda: interquartile_mean(
-        [[1.0, nan]]
+    "interquartile_mean: task 0: values has shape (2,); must have one finite number per seed: shape [n]": lambda: (
+        interquartile_mean([[1.0, nan]])
     ),
     "mean_over_seeds: the arrays have the shapes (1, 2) and (1, 3): must be [seeds, worlds] with the same": lambda: (
         mean_over_seeds([[1.0, 2.0]], [[1.0, 2.0, 3.0]])

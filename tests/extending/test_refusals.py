@@ -48,13 +48,13 @@ PARTS: dict[str, Callable[[], object]] = {
     "feature 'mine': high = nan: must be a finite number": lambda: eb.register_feature(
         "mine", TIME, **SCALED | {"high": float("nan")}
     ),
-    "of = 'both', unknown = 0: of must be 'own' or 'neighbour'; if of is": lambda: eb.register_feature(
+    "of = 'both', unknown = 0: of must be 'own' or 'neighbour'; with of = 'own'": lambda: eb.register_feature(
         "mine", TIME, **SCALED, of="both"
     ),
-    "of = 'own', unknown = 1: of must be 'own' or 'neighbour'; if of is": lambda: eb.register_feature(
+    "of = 'own', unknown = 1: of must be 'own' or 'neighbour'; with of = 'own'": lambda: eb.register_feature(
         "mine", TIME, **SCALED, unknown=1.0
     ),
-    "feature 'mine': its function returned float64 of shape (); must return numbers of shape (3,), one": lambda: (
+    "feature 'mine': its function returned float64 values of shape (); must return numbers of shape (3,),": lambda: (
         eb.register_feature("mine", gives(1.0), **SCALED)
     ),
     "feature 'mine': its value is nan for vehicle_1 in world 0 at 0 s; must be finite": lambda: eb.register_feature(
@@ -95,13 +95,13 @@ PARTS: dict[str, Callable[[], object]] = {
     "objective 'mine': must be a function with a docstring that describes the objective": lambda: eb.register_objective(
         "mine", 3
     ),
-    "measure 'Squared': the name must be 1 to 64 characters a-z, 0-9 and _, begin with a letter, and not end": lambda: (
+    "measure 'Squared': the name must be 1 to 64 characters a-z, 0-9 and _, and must begin with a letter; it": lambda: (
         eb.register_measure("Squared", NOTHING, unit="1")
     ),
-    "measure 'delta_v_2': the name must be 1 to 64 characters a-z, 0-9 and _, begin with a letter, and not": lambda: (
+    "measure 'delta_v_2': the name must be 1 to 64 characters a-z, 0-9 and _, and must begin with a letter;": lambda: (
         eb.register_measure("delta_v_2", NOTHING, unit="1")
     ),
-    "measure 'delta_v_interval': the name must be 1 to 64 characters a-z, 0-9 and _, begin with a": lambda: (
+    "measure 'delta_v_interval': the name must be 1 to 64 characters a-z, 0-9 and _, and must begin with a": lambda: (
         eb.register_measure("delta_v_interval", NOTHING, unit="1")
     ),
     "measure 'mine': must be a function with a docstring that describes the measure": lambda: eb.register_measure(
@@ -231,7 +231,7 @@ def test_measure_by_step__gives_a_finite_number_per_vehicle(given: Any, message:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (1.0, "its function returned float64 of shape (); must return numbers of shape (1,), one"),
+        (1.0, "its function returned float64 values of shape (); must return numbers of shape (1,), one"),
         (lambda harm: np.full(len(harm.whole), np.nan), "its function returned nan for vehicle_1 in world 0; must be"),
         (lambda harm: harm.borne.fill(0.0), "its function fails for vehicle_1: ValueError: assignment destination is"),
     ],
@@ -264,9 +264,9 @@ def test_feature__that_is_not_finite_later_is_told_with_its_world_and_step() -> 
 @pytest.mark.parametrize(
     ("urgency", "message"),
     [
-        (None, "observes 'urgency', which is not registered; install the package that registers"),
-        ((1.0, 3.0), "observes 'urgency', whose scale was 2.0 in training and is 3.0 now"),
-        ((1.001, 2.0), "observes 'urgency', whose function returns other numbers than in training"),
+        (None, "observes the feature 'urgency', which is not registered; install the package that registers"),
+        ((1.0, 3.0), "observes the feature 'urgency', whose scale was 2.0 in training and is 3.0 now"),
+        ((1.001, 2.0), "observes the feature 'urgency', whose function now returns other numbers than in training"),
     ],
     ids=["missing", "other scale", "other numbers"],
 )

@@ -148,7 +148,7 @@ TRAININGS: dict[str, Callable[[], object]] = {
     "scheme single: scenario 'cooperation-3-pair' has 2 learners; use the scheme shared, independent or": lambda: train(
         TINY_PPO, PAIR, Path("run"), scheme="single"
     ),
-    "scheme independent: scenario 'paper-random' has one learner; use the scheme single": lambda: train(
+    "scheme independent: needs several learners, but scenario 'paper-random' has one; use the scheme": lambda: train(
         TINY_PPO, PAPER, Path("run"), scheme="independent"
     ),
     "scheme independent: the algorithm sac of recipe 'sac' does not support this scheme; use a recipe for": lambda: (
@@ -160,12 +160,12 @@ TRAININGS: dict[str, Callable[[], object]] = {
     "recipe 'ppo': turns = 3: is allowed with scheme: independent only; remove the key turns": lambda: train(
         TINY_PPO, PAIR, Path("run"), scheme="shared", turns=3
     ),
-    "recipe 'ppo': turns = 5: 2 learners need at least 10 updates, but total_steps = 2048 gives 8; raise": lambda: (
+    "recipe 'ppo': turns = 5 for each of 2 learners needs at least 10 updates, but total_steps = 2048 gives": lambda: (
         train(TINY_PPO, PAIR, Path("run"), scheme="independent", steps=2048, turns=5)
     ),
     ".: is not the folder of a run; name the folder of a run, for instance": lambda: resume(Path()),
-    ".: has no team.json, so it is not a team; name the folder of a run, or write ppo@. for a policy": lambda: (
-        load_team(Path(), PAIR)
+    ".: has no file team.json, so it is not the folder of a team; give the folder of a training run": lambda: load_team(
+        Path(), PAIR
     ),
 }
 
@@ -260,7 +260,7 @@ def test_folder__that_is_there_is_not_replaced_unasked(run: RunDirectory) -> Non
 def test_folder__of_another_training_is_refused(
     training: Callable[[], Training], other: str, run: RunDirectory
 ) -> None:
-    with refused(f"run: this folder contains another training, which differs in {other}; choose another folder"):
+    with refused(f"run: this folder contains another training run, which differs in {other}; choose another folder"):
         check_same_training(run, training())
 
 
@@ -290,7 +290,7 @@ def test_status_of_a_run__is_refused(status: str | None, message: str, run: RunD
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"recipe": None}, "run/config.json: does not describe a training, because 'recipe' is missing"),
+        ({"recipe": None}, "run/config.json: does not describe a training run, because the key 'recipe' is missing"),
         ({"recipe": 3}, "run/config.json: recipe: must be a mapping of keys to values, for instance algorithm: ppo"),
         ({"scenario": {"name": "paper-random"}}, "run/config.json: scenario: braking_capacity_mps2: missing"),
         ({"library": "benchmarl"}, "run: this run was trained by benchmarl and cannot be resumed; train again"),

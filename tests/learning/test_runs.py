@@ -602,7 +602,7 @@ def test_resume__with_other_versions_is_refused_unless_it_is_asked_for(
 ) -> None:
     monkeypatch.setattr(train_module, "installed_versions", lambda: {"torch": "99.0"})
     with pytest.raises(
-        InvalidInput, match=r"this training began with ethbrake-marl .*, which may compute other numbers"
+        InvalidInput, match=r"this training run began with ethbrake-marl .* and may compute other numbers"
     ):
         resume(run)
     assert json.loads((run / "run.json").read_text())["status"] == "interrupted"
@@ -671,7 +671,7 @@ def test_resume__a_checkpoint_that_does_not_fit_is_refused_and_stays(
         shutil.rmtree(place)
         arrays = state.arrays | {"policy.log_std": np.zeros(2, np.float32)}
         write_checkpoint(place, TrainingState(state.numbers, arrays))
-        told = rf"the checkpoint of step {state.steps} does not belong to this training: .*log_std.*; delete this"
+        told = rf"the checkpoint of step {state.steps} does not fit this training run: .*log_std.*; delete this"
     before = {file: file.read_bytes() for file in run.rglob("*") if file.is_file() and file.name != "run.lock"}
     with pytest.raises(EthBrakeError, match=told) as error:
         resume(run, measure=measure)
@@ -706,7 +706,7 @@ def test_resume__a_forged_checkpoint_is_refused_in_one_line(run: Path, name: str
         del arrays[name]
     write_checkpoint(place, TrainingState(numbers, arrays))
     with pytest.raises(
-        EthBrakeError, match=rf"does not belong to this training: .*{told}.*; delete this checkpoint to resume"
+        EthBrakeError, match=rf"does not fit this training run: .*{told}.*; delete this checkpoint to resume"
     ) as error:
         resume(run, measure=measure)
     assert "\n" not in str(error.value)
@@ -723,7 +723,9 @@ def test_restore__a_forged_replay_memory_of_sac_is_refused() -> None:
         restore = partial(model_state.restore_model, model, algorithm)
         restore(TrainingState(numbers, arrays))
         for forged in ([-1, False], [1.5, False], [1 << 40, True], [0, 1]):
-            with pytest.raises(ValueError, match=r"replay = .*: must be .position, full., with a position below 50"):
+            with pytest.raises(
+                ValueError, match=r"replay = .*: must be .position, full.: the next position .* below 50"
+            ):
                 restore(TrainingState(numbers | {"replay": forged}, arrays))
         with pytest.raises(ValueError, match=r"replay.observations: must be finite numbers"):
             restore(TrainingState(numbers | {"replay": [3, False]}, arrays))

@@ -32,9 +32,9 @@ WORLDS: dict[str, Callable[[], object]] = {
     "restitution[0] = 1.5: must be finite and in [0, 1]": lambda: line([5.0], [9.0, 9.0], restitution=1.5),
     "obstacle_gap_m[0] = -0.5: must be finite and in [0, inf]": lambda: line([5.0], [9.0, 9.0], obstacle_gap_m=-0.5),
     "obstacle_gap_m[0] = inf: must be finite and in [0, inf]": lambda: line([5.0], [9.0, 9.0], obstacle_gap_m=inf),
-    "mass_t: shape (2,); must be (1, 3)": lambda: line([5.0, 6.0], [9.0, 9.0, 9.0], mass_t=[1.0, 2.0]),
-    "speeds_mps: shape (1, 1); must be [n, N] with at least 2 vehicles": lambda: line([5.0, 6.0], [10.0]),
-    "speeds_mps: shape (2, 3); must be (3, 3)": lambda: line(np.ones((3, 2)), np.zeros((2, 3))),
+    "mass_t: has shape (2,); must have shape (1, 3)": lambda: line([5.0, 6.0], [9.0, 9.0, 9.0], mass_t=[1.0, 2.0]),
+    "speeds_mps: has shape (1, 1); must have shape [n, N] with N >= 2 vehicles": lambda: line([5.0, 6.0], [10.0]),
+    "speeds_mps: has shape (2, 3); must have shape (3, 3)": lambda: line(np.ones((3, 2)), np.zeros((2, 3))),
     "brake_rate_mps3[0, 1] = 0: must be in (0, inf]": lambda: line([5.0], [9.0, 9.0], brake_rate_mps3=[9.0, 0.0]),
     "release_rate_mps3[0, 0] = nan: must be in (0, inf]": lambda: line([5.0], [9.0, 9.0], release_rate_mps3=nan),
 }
@@ -52,10 +52,12 @@ ADVANCES: dict[str, Callable[[], object]] = {
         line([5.0], [[9.0, 9.0], [9.0, 9.0]], obstacle_gap_m=9.0), [[0.0, 0.0], [0.0, -17.0]], 1.0, threads=2
     ),
     "command_mps2[0, 0] = nan: must be in [-10, 10] m/s2": lambda: advance(PAIR, [nan, 0.0], 1.0),
-    "command_mps2: shape (3,); must be (1, 2)": lambda: advance(PAIR, [0.0, 0.0, 0.0], 1.0),
-    "advance: world 0 is at 0 s; its end time -1 s must be": lambda: advance(PAIR, 0.0, -1.0),
-    "advance: world 1 is at 0 s; its end time -1 s must be": lambda: advance(FOUR, 0.0, until_s=[1.0, -1.0, 1.0, 1.0]),
-    "advance: world 0 is at 0 s; its end time inf s must be": lambda: advance(PAIR, 0.0, until_s=inf),
+    "command_mps2: has shape (3,); must have shape (1, 2)": lambda: advance(PAIR, [0.0, 0.0, 0.0], 1.0),
+    "advance: world 0 is at t = 0 s, and must be advanced to -1 s; the": lambda: advance(PAIR, 0.0, -1.0),
+    "advance: world 1 is at t = 0 s, and must be advanced to -1 s; the": lambda: advance(
+        FOUR, 0.0, until_s=[1.0, -1.0, 1.0, 1.0]
+    ),
+    "advance: world 0 is at t = 0 s, and must be advanced to inf s; the": lambda: advance(PAIR, 0.0, until_s=inf),
     "advance: pass either duration_s or until_s": lambda: advance(PAIR, 0.0),
     "threads = 0: must be a whole number, at least 1": lambda: advance(PAIR, 0.0, 1.0, threads=0),
     "threads = True: must be a whole number, at least 1": lambda: advance(PAIR, 0.0, 1.0, threads=True),
@@ -80,7 +82,7 @@ def test_advance_and_forecast__are_refused(message: str) -> None:
 
 SAMPLED: dict[str, Callable[[], object]] = {
     "command_mps2[0, 2] = -9: must be in [-6, 16] m/s2": lambda: advance_sampled(FOUR, [0.0, 0.0, -9.0], until_s=1.0),
-    "command_mps2: shape (2,); must be (4, 3)": lambda: advance_sampled(FOUR, [0.0, 0.0], until_s=1.0),
+    "command_mps2: has shape (2,); must have shape (4, 3)": lambda: advance_sampled(FOUR, [0.0, 0.0], until_s=1.0),
     "advance_sampled: world 0 cannot be advanced from 0 s to -1 s; this must take 0 to 1,000": lambda: advance_sampled(
         FOUR, 0.0, until_s=-1.0
     ),
@@ -92,22 +94,22 @@ SAMPLED: dict[str, Callable[[], object]] = {
     ),
     "step_s = 0: must be finite and at least 1e-06 s": lambda: advance_sampled(FOUR, 0.0, until_s=1.0, step_s=0.0),
     "step_s = nan: must be finite and at least 1e-06 s": lambda: advance_sampled(FOUR, 0.0, until_s=1.0, step_s=nan),
-    "advance_sampled: world 0 is at 0.53 s, between two of its samples 0.5 s + n * 0.1 s; start at": lambda: (
+    "advance_sampled: world 0 is at 0.53 s, between two of its sampling times, which are 0.5 s + n * 0.1 s": lambda: (
         advance_sampled(advance(FOUR, 0.0, until_s=0.53)[0], 0.0, until_s=1.0)
     ),
-    "world 0 is at 1 s, between two of its samples 0 s + n * 1 s": lambda: advance_sampled(
+    "world 0 is at 1 s, between two of its sampling times, which are 0 s + n": lambda: advance_sampled(
         replace(PAIR, time_s=np.array([1.0 + 1.5e-6])), 0.0, until_s=2.0, step_s=1.0
     ),
-    "world 0 is at 0.999999 s, between two of its samples 0 s + n * 1 s": lambda: advance_sampled(
+    "world 0 is at 0.999999 s, between two of its sampling times, which are 0 s + n": lambda: advance_sampled(
         replace(PAIR, time_s=np.array([1.0 - 1.5e-6])), 0.0, until_s=2.0, step_s=1.0
     ),
     "advance_sampled: world 0 has an obstacle ahead (obstacle_gap_m = 10)": lambda: advance_sampled(
         line([5.0], [9.0, 9.0], obstacle_gap_m=10.0), -6.0, until_s=1.0
     ),
-    "advance_sampled: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3)": lambda: advance_sampled(
-        line([5.0], [9.0, 9.0], brake_rate_mps3=9.0), [[0.0, 0.0]], until_s=1.0
+    "advance_sampled: in world 0 brakes build up at a finite rate, for which the result would not": lambda: (
+        advance_sampled(line([5.0], [9.0, 9.0], brake_rate_mps3=9.0), [[0.0, 0.0]], until_s=1.0)
     ),
-    "advance_sampled: a vehicle of world 0 follows a braking profile, and the result would not be exact": lambda: (
+    "advance_sampled: a vehicle of world 0 follows a braking profile, for which the result would not be": lambda: (
         advance_sampled(line([5.0], [9.0, 9.0]).play_pieces({1: [(0, 3), (1, 5)]}), [[0.0, 0.0]], until_s=1.0)
     ),
 }

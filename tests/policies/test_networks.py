@@ -168,8 +168,8 @@ def test_among__acts_as_the_policy_or_the_action_of_the_highest_score(
     (action,) = onnx_of(policy).run(["action"], {"observation": seen})
     np.testing.assert_allclose(action, policy(seen), rtol=0.0, atol=1e-5)
     for wrong, why in (
-        ({"output": "clip", "choices": None}, "among: can only be given if output is 'choice'"),
-        ({"among": (spec,)}, "and only for policies without among"),
+        ({"output": "clip", "choices": None}, "among: needs output = 'choice', and the policies in the list"),
+        ({"among": (spec,)}, "must have no key among"),
         (
             {"among": (squashed.model_copy(update={"observation_size": 26}),)},
             r"among\[0\]: observation_size and action_size are",
@@ -367,11 +367,11 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "future_version": (_edit(format_version=6), r"manifest.json: format_version: must be 2, 3, 4 or 5"),
     "version_of_several_networks": (
         _edit(format_version=3),
-        r"manifest.json: format_version = 3: must be 2 with networks = 1 and output = 'clip'",
+        r"manifest.json: format_version = 3: must be 2 if networks = 1 and output = 'clip'",
     ),
     "several_networks_in_an_old_version": (
         _edit(network__networks=2, network__gate_hidden=[4], network__value_hidden=[]),
-        r"manifest.json: format_version = 2: must be 3 with networks = 2 and output = 'clip'",
+        r"manifest.json: format_version = 2: must be 3 if networks = 2 and output = 'clip'",
     ),
     "several_networks_without_a_gate": (
         _edit(format_version=3, network__networks=2, network__value_hidden=[]),
@@ -389,11 +389,11 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "choices_that_nobody_takes": (_edit(network__choices=9), r"manifest.json: network: choices = 9: must be a number"),
     "critic_beside_choices": (
         _edit(format_version=4, network__output="choice", network__choices=9),
-        r"manifest.json: network: output = 'choice': networks must be 1, value_hidden empty",
+        r"manifest.json: network: output = 'choice': needs networks = 1, action_size = 1 and an empty value_hidden",
     ),
     "choices_in_an_old_version": (
         _edit(network__output="choice", network__choices=9, network__value_hidden=[]),
-        r"manifest.json: format_version = 2: must be 4 with networks = 1 and output = 'choice'",
+        r"manifest.json: format_version = 2: must be 4 if networks = 1 and output = 'choice'",
     ),
     "too_many_networks": (_edit(network__networks=17), r"manifest.json: network.networks"),
     "networks_without_their_tensors": (
@@ -408,7 +408,10 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
         r"manifest.json: observation.features: has 27 features; must have 4",
     ),
     "other_features": (_edit(observation__features=[f"own.{k}" for k in range(27)]), r"manifest.json: observation: "),
-    "other_scaling": (_edit(observation__scaling_sha256="0" * 64), r"manifest.json: observation: features or their"),
+    "other_scaling": (
+        _edit(observation__scaling_sha256="0" * 64),
+        r"manifest.json: observation: this version of the package computes",
+    ),
     "older_version": (_edit(format_version=1), r"manifest.json: format_version: must be 2, 3, 4 or 5"),
     "other_activation": (_edit(rehash=False, network__activation="tanh"), r"manifest.json: the content has SHA-256"),
     "other_output": (_edit(rehash=False, network__output="tanh"), r"manifest.json: the content has SHA-256"),

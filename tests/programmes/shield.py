@@ -185,7 +185,7 @@ def pieces(which: tuple[int, int], decisions: int, seed: int) -> Told:
             begun(scenario, scenario.sample(2, seed).worlds)
         except InvalidInput as error:
             refused += 1
-            wrong += "(v2x: tells)" not in str(error)
+            wrong += "(key v2x.tells)" not in str(error)
         else:
             taken.append(scenario)
         (told,) = tells.values() if isinstance(tells, dict) else [tells]

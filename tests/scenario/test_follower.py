@@ -67,10 +67,10 @@ MISTAKES: dict[str, Callable[[], object]] = {
     "bad.yaml, line 9: follower.gap: unknown key": lambda: written("follower: {gap: 5}"),
     "bad.yaml, line 9: follower = 3": lambda: written("follower: 3"),
     "bad.yaml, line 3: gaps_m = -1": lambda: written("follower: {}", gaps_m=-1),
-    "bad.yaml, line 9: follower: the speed of vehicle_2 is random; it must be a fixed number or a column of the": (
+    "bad.yaml, line 9: follower: the follower has the speed of vehicle_2, which is random; this speed must be a": (
         lambda: written("follower: {}", speeds_mps="{uniform: [18, 22]}")
     ),
-    "mixture[0] (stress-wide): follower: the speed of vehicle_3 is random; it must": (
+    "mixture[0] (stress-wide): follower: the follower has the speed of vehicle_3, which is random;": (
         lambda: eb.load_scenario("mixture-paper").replace(follower={})
     ),
     "follower: cannot be combined with vehicle_types; instead of the follower": (

@@ -130,7 +130,7 @@ QUANTITIES_AND_ROLES: dict[str, Callable[[], object]] = {
     'line 13: roles.vehicle_1 = "profile:0=3,1=6.5": must not be above the braking_capacity_mps2': lambda: given(
         roles="{vehicle_1: {profile: [[0, 3], [1, 6.5]]}, vehicle_2: learner}"
     ),
-    "such as [[0, 3], [1, 7]]; the first start must be 0, and the starts must increase": lambda: given(
+    "such as [[0, 3], [1, 7]]; the first start must be 0, and each later start must be larger": lambda: given(
         roles="{vehicle_1: {profile: [[0.5, 3]]}, vehicle_2: learner}"
     ),
     "[1, -1] is not a list of two numbers in [0, 3600]": lambda: given(
@@ -273,11 +273,11 @@ MIXTURES: dict[str, Callable[[], object]] = {
     "mine.yaml, line 2: mixture[1]: paper-random is listed twice; list it once, with the sum of its weights": lambda: (
         loaded("mixture: [{scenario: paper-random}, {scenario: paper-random}]")
     ),
-    "mine.yaml, line 2: mixture: horizon_s must be the same in all scenarios: paper-random has 8": lambda: loaded(
+    "mine.yaml, line 2: mixture: horizon_s must be the same in all scenarios of the mixture, but": lambda: loaded(
         "mixture: [{scenario: paper-random}, {scenario: stress-wide}]"
     ),
-    "mine.yaml, line 2: mixture: vehicles must be the same in all scenarios: paper-random has 3": lambda: loaded(
-        "mixture: [{scenario: paper-random}, {scenario: cooperation-4-five}]"
+    "mine.yaml, line 2: mixture: vehicles must be the same in all scenarios of the mixture, but paper-random": lambda: (
+        loaded("mixture: [{scenario: paper-random}, {scenario: cooperation-4-five}]")
     ),
     "mine.yaml, line 2: mixture: vehicles = 5: must be 3, the number of vehicles in its scenarios; a": lambda: loaded(
         "mixture: [{scenario: paper-random}]\nvehicles: 5"
@@ -311,7 +311,9 @@ CALLS: dict[str, Callable[[], object]] = {
     "scenario 'x': mixture[0].scenario = paper-random: must be the content of a scenario as a": lambda: Scenario(
         name="x", mixture=[{"scenario": "paper-random"}]
     ),
-    "scenario 'mixture-delays': is a mixture, so its members declare mass_t; see": lambda: DELAYS.quantities("mass_t"),
+    "scenario 'mixture-delays': is a mixture of scenarios, each of which declares its own mass_t;": lambda: (
+        DELAYS.quantities("mass_t")
+    ),
     "initial_state: scenario 'mixture-delays' is a mixture, so it is unknown to which of": lambda: worlds_from_state(
         DELAYS, {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}
     ),

@@ -76,10 +76,10 @@ def test_table__is_refused_with_its_line_and_column(message: str) -> None:
 
 
 GIVEN: dict[str, Callable[[], object]] = {
-    "initial states: all columns must be lists of the same length; their shapes are gap_1_m [2], gap_2_m [3]": lambda: (
+    "initial states: all columns must be lists of one length; they have the shapes gap_1_m [2], gap_2_m [3],": lambda: (
         worlds_from_table(PAPER, COLUMNS | {"gap_1_m": [1, 2]})
     ),
-    "initial states: all columns must be lists of the same length; their shapes are gap_1_m [], gap_2_m [3]": lambda: (
+    "initial states: all columns must be lists of one length; they have the shapes gap_1_m [], gap_2_m [3],": lambda: (
         worlds_from_table(PAPER, COLUMNS | {"gap_1_m": 1})
     ),
     "initial states: gap_1_m = ['1', '2', '3']: is not a number; must be a number or a list of numbers": lambda: (
@@ -88,7 +88,7 @@ GIVEN: dict[str, Callable[[], object]] = {
     "initial states: gap_1_m = [True, True, True]: is a boolean; must be a number or a list": lambda: worlds_from_table(
         PAPER, COLUMNS | {"gap_1_m": [True, True, True]}
     ),
-    "initial states: gap_1_m = [[1], [2, 3]]: has rows of different lengths; must be a number or a list": lambda: (
+    "initial states: gap_1_m = [[1], [2, 3]]: has inner lists of different lengths; must be a number or a": lambda: (
         worlds_from_table(PAPER, COLUMNS | {"gap_1_m": [[1], [2, 3]]})
     ),
     "initial states, row 1, column speed_2_mps = nan: must be finite and in [0, 200] m/s (metres": lambda: (
@@ -97,8 +97,8 @@ GIVEN: dict[str, Callable[[], object]] = {
     "initial states: unknown column 'gaps_1_m'; did you mean gap_1_m (metres)?": lambda: worlds_from_table(
         PAPER, COLUMNS | {"gaps_1_m": [1, 2, 3]}
     ),
-    "initial states: column 'recording' cannot be read here, and without it confidence intervals would treat all "
-    "worlds as independent; put the table into the scenario (key table)": lambda: worlds_from_table(
+    "initial states: column 'recording' is possible only in the table of a scenario; put this table into a scenario "
+    "(key table), or remove the column, but then confidence intervals treat all": lambda: worlds_from_table(
         PAPER, COLUMNS | {"recording": ["a", "a", "b"]}
     ),
     "initial states: column obstacle_gap_m is missing; scenario": lambda: worlds_from_table(OBSTACLE, COLUMNS),
@@ -124,7 +124,7 @@ GIVEN: dict[str, Callable[[], object]] = {
     "initial_state: gaps_m[1] = 12000: must be finite and in [0, 10000] m (metres)": lambda: worlds_from_state(
         PAPER.replace(time_gaps_s=[1, 60]), {"speeds_mps": [20, 20, 200], "speed_limit_mps": 200}
     ),
-    "initial_state: the channel of the scenario (v2x: nominal) is random, so worlds of your": lambda: worlds_from_state(
+    "initial_state: with v2x: nominal, it is random which messages arrive, and when; worlds": lambda: worlds_from_state(
         PAPER.replace(v2x="nominal", early_impacts="keep"), {"gaps_m": 7, "speeds_mps": 20}
     ),
 }
@@ -139,7 +139,7 @@ def test_given_worlds__are_refused(message: str) -> None:
 LISTS: dict[str, Callable[[], object]] = {
     "number of worlds = 0: must be a whole number, at least 1": lambda: PAPER.sample(n=0, seed=1),
     "number of worlds = True: must be a whole number, at least 1": lambda: PAPER.sample(n=True, seed=1),
-    "at most 10,000,000; draw a longer list in parts": lambda: PAPER.sample(n=10000001, seed=1),
+    "at most 10,000,000; draw more with several calls": lambda: PAPER.sample(n=10000001, seed=1),
     "seed of the list = None: must be a whole number, at least 0": lambda: PAPER.sample(n=1, seed=None),
     "first world = -1: must be a whole number, at least 0": lambda: PAPER.sample(n=1, seed=1, first=-1),
     "sample: first = 4611686018427387904: first + n must be at most 4611686018427387904": lambda: PAPER.sample(

@@ -56,40 +56,40 @@ STEP_SHIELD: dict[str, Callable[[], object]] = {
     "shield: decide() was called before any episode began; call begin first": lambda: StepShield(PAPER, 1).decide(
         np.zeros(3)
     ),
-    "shield: shape of proposed = (3,): must be (5,)": lambda: started().decide(np.zeros(3)),
-    "shield: begin in row 7, but the batch has 5 rows; to enlarge the batch, begin in all rows": lambda: (
+    "shield: proposed has the shape (3,); must have the shape (5,)": lambda: started().decide(np.zeros(3)),
+    "shield: begin was called for row 7, but the shield has only 5 rows (worlds); to add rows, call begin": lambda: (
         started().begin(WORLDS.take([0, 1]), np.array([3, 7]))
     ),
-    "certify: shape of proposed = (2,), of backup.harm = (5,), of budget = (5,): must be (5,), (5,)": lambda: certify(
-        started().memory.running, np.zeros(2), started().memory.backup, started().bound
+    "certify: the shapes of proposed, backup.harm and budget are (2,), (5,) and (5,); must be (5,), (5,) and": lambda: (
+        certify(started().memory.running, np.zeros(2), started().memory.backup, started().bound)
     ),
-    "certify: budget: must be at least backup.harm in every world": lambda: certify(
+    "certify: in every world, budget must be at least backup.harm (the harm of": lambda: certify(
         started().memory.running, np.zeros(5), started().memory.backup, started().bound - 1.0
     ),
-    "shield: shape of plan = (5, 3): must be (5, at least 75)": lambda: plan_harm(
+    "shield: plan has the shape (5, 3); must have the shape (5, at least": lambda: plan_harm(
         started().memory.running, np.zeros((5, 3))
     ),
-    "certify: shape of proposed = (1,), of backup.harm = (1,), of budget = (1,): must be (1, 2), (1,)": lambda: certify(
-        team().memory.running, np.zeros(1), team().memory.backup, team().bound
+    "certify: the shapes of proposed, backup.harm and budget are (1,), (1,) and (1,); must be (1, 2), (1,)": lambda: (
+        certify(team().memory.running, np.zeros(1), team().memory.backup, team().bound)
     ),
-    "shield: shape of plan = (1, 81): must be (1, at least 75, 2)": lambda: plan_harm(
+    "shield: plan has the shape (1, 81); must have the shape (1, at least 75,": lambda: plan_harm(
         team().memory.running, np.zeros((1, 81))
     ),
-    "shield: vehicle = (2, 1): must have each index once, in increasing order": lambda: StepShield(PAIR, (2, 1)),
+    "shield: vehicle = (2, 1): must be different indices in increasing order": lambda: StepShield(PAIR, (2, 1)),
     "shield: vehicle = (): must be an index from 0 to 2": lambda: StepShield(PAIR, ()),
-    "shield: cap = 'baseline': must be None, because each world has 5": lambda: StepShield(
+    "shield: cap = 'baseline': must be None for a shield that considers several possible": lambda: StepShield(
         PAPER, 1, cap="baseline"
     ).begin(WORLDS.take([0]), np.arange(1), BRAKE, possible=WORLDS),
-    "shield: policy: is for the vehicles [1]; must be for exactly the shielded vehicles, [1, 2]": lambda: StepShield(
-        PAIR, (1, 2)
-    ).begin(PAIR.sample(1, 0).worlds, np.arange(1), COAST),
-    "shield: told: has 2 worlds, but an episode begins in row 4; must have a world for every": lambda: drive(
+    "shield: policy has a policy for the vehicle indices [1]; must have one for each shielded vehicle, [1,": lambda: (
+        StepShield(PAIR, (1, 2)).begin(PAIR.sample(1, 0).worlds, np.arange(1), COAST)
+    ),
+    "shield: told has 2 worlds, but an episode begins in row 4; told must have one world for every row": lambda: drive(
         WORLDS, ShieldedDriver(COAST, PAPER, told=WORLDS.take([0, 1])), PAPER, 1
     ),
-    "review: the shield has no log; make it with logging=True, and run episodes behind it": lambda: review(
+    "review: the shield has no log; make the shield with logging=True, and run episodes": lambda: review(
         drive(WORLDS, ShieldedDriver(COAST, PAPER), PAPER, 1).guarded.shield, COAST, WORLDS
     ),
-    "review: worlds: has 5 worlds; must be the 1 world of the shield's last episodes": lambda: review(
+    "review: worlds has 5 worlds; pass the worlds of the shield's last episodes, 1 world": lambda: review(
         drive(WORLDS.take([0]), ShieldedDriver(COAST, PAPER, logging=True), PAPER, 1).guarded.shield, COAST, WORLDS
     ),
 }
@@ -106,7 +106,7 @@ AGENTS: dict[str, Callable[[], object]] = {
     "step: told = 3: must be a Worlds object (the worlds at the alert) or None": lambda: ShieldedDriver(
         COAST, PAPER, told=3
     ),
-    "shield: mode = 'episode': has an agent of its own; use HybridAgent": lambda: ShieldedDriver(
+    "shield: mode = 'episode': is not possible with ShieldedDriver; use HybridAgent": lambda: ShieldedDriver(
         COAST, PAPER, mode="episode"
     ),
     "agent 'coast+step' drives vehicle_2, but vehicle_3 of scenario 'cooperation-3-pair'": lambda: drive(
@@ -117,8 +117,8 @@ AGENTS: dict[str, Callable[[], object]] = {
     ),
     "e_v2x_bm: mode = 'couple': must be 'coupled' or 'pairwise'": lambda: HybridAgent(BRAKE, PAPER, bound="couple"),
     "harm_count = 'both': must be 'first' or 'total'": lambda: HybridAgent(BRAKE, PAPER, harm_count="both"),
-    "shield: agent 'coast': pass scenario= (in which actions are certified), and leave out policy=": lambda: eb.shield(
-        COAST
+    "shield: to shield the agent 'coast', pass scenario=... (the scenario in which it drives), and leave out": lambda: (
+        eb.shield(COAST)
     ),
     "shield: agent 'coast+step' already has a shield": lambda: eb.shield(
         make_agent("coast+step", scenario=PAPER), scenario=PAPER
@@ -133,7 +133,9 @@ def test_agent_behind_a_shield__is_refused(message: str) -> None:
 
 
 OPTIONS: dict[str, Callable[[], object]] = {
-    "shield: cap = 'baseline': only mode step has a cap": lambda: ShieldOptions(mode="episode", cap="baseline"),
+    "shield: cap = 'baseline': cap is possible only in mode step": lambda: ShieldOptions(
+        mode="episode", cap="baseline"
+    ),
     "shield: bound = 'pairwise': not a setting of mode step; use mode episode": lambda: ShieldOptions(
         mode="step", bound="pairwise"
     ),
@@ -165,10 +167,10 @@ AROUND: dict[str, Callable[[], object]] = {
         HybridShield(parallel_env(), "ppo")
     ),
     "HybridShield: agents = 5: must be a list of vehicle names": lambda: HybridShield(parallel_env(), BRAKE, agents=5),
-    "HybridShield: agents = ('vehicle_1',): must be all learners, ('vehicle_2',), since the bound": lambda: (
+    "HybridShield: agents = ('vehicle_1',): must be all learners, ('vehicle_2',), because the bound is": lambda: (
         HybridShield(parallel_env(), BRAKE, agents=["vehicle_1"])
     ),
-    "HybridShield: policy: must have one policy for each of vehicle_2, vehicle_3, and for no other": lambda: (
+    "HybridShield: policy must have one policy for each of vehicle_2, vehicle_3, and for no other vehicle": lambda: (
         HybridShield(parallel_env(PAIR), {"vehicle_2": COAST}, mode="step")
     ),
     "scenario 'cooperation-3-pair' has 2 learners (vehicle_2, vehicle_3); HybridShield needs exactly one": lambda: (
@@ -180,7 +182,7 @@ AROUND: dict[str, Callable[[], object]] = {
     "HybridShield: ethbrake_v1: must be an environment made by eb.parallel_env; eb.shield(env) chooses": lambda: (
         HybridShield(aec_env(), mode="step")
     ),
-    "shield: in BaseWrapper<ethbrake_v1> the agents act one after the other; shield the parallel": lambda: eb.shield(
+    "shield: in BaseWrapper<ethbrake_v1> the agents act one after the other; make a shielded": lambda: eb.shield(
         BaseWrapper(aec_env())
     ),
     "shield: None: must be an agent, a team, or an environment made by eb.parallel_env, eb.env": lambda: eb.shield(
@@ -231,7 +233,10 @@ def test_second_shield__is_refused_because_a_bound_holds_for_one_alone(interface
 @pytest.mark.parametrize(
     ("actions", "message"),
     [
-        ({}, "shield: an action is missing, and no policy can propose it; pass the action, or make the shield with"),
+        (
+            {},
+            "shield: the action of a vehicle is missing, and the shield has no policy that could propose it; pass the",
+        ),
         ([0.0], "step: actions = [0.0]: must be a mapping from agent to action, such as {'vehicle_2': [-1.0]}"),
         ({"vehicle_2": np.array([np.nan])}, "action of vehicle_2 = nan: must be from -1 (full braking) to 1 (full"),
         ({"vehicle_2": np.array([1.5])}, "action of vehicle_2 = 1.5: must be from -1 (full braking) to 1 (full"),

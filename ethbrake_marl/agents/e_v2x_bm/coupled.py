@@ -221,7 +221,7 @@ class EV2XBM:
 
         others = fixed_commands(
             scripts, alert, f"agent {self.name!r}", vehicle=vehicle, is_fixed=is_fixed,
-            advice=f" before vehicle_{vehicle + 1} chooses; use e_v2x_bm:pairwise, which does not need the other"
+            advice=f", or only after vehicle_{vehicle + 1} chose; use e_v2x_bm:pairwise, which does not need the other"
             " vehicles' commands, for one of the two vehicles",
         )  # fmt: skip
         coupled = optimise_coupled(
@@ -241,6 +241,6 @@ def make_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
     """
     if argument not in (None, "coupled", "pairwise"):
         then = "".join(f", then {variant!r}" for variant in variants_of("e_v2x_bm"))
-        raise InvalidInput(f"agent {settings.spec!r}: argument: must be 'coupled' or 'pairwise'{then}")
+        raise InvalidInput(f"agent {settings.spec!r}: the argument must be 'coupled' or 'pairwise'{then}")
     mode: Mode = "pairwise" if argument == "pairwise" else "coupled"
     return EV2XBM(mode, harm_count=settings.harm_count, horizon_s=settings.horizon_s)

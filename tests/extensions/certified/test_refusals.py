@@ -89,7 +89,7 @@ SHIELDS: dict[str, Callable[[], object]] = {
     "mode robust needs an uncertainty, for instance braking_capacity_mps2=5%": lambda: make_agent(
         "full_brake+robust", scenario=PAIR
     ),
-    "agent 'coast+step:estimated+robust': must have at most one +search, then at most one shield (+episode": lambda: (
+    "agent 'coast+step:estimated+robust': may have at most one search (+search), then at most one shield": lambda: (
         make_agent("coast+step:estimated+robust", scenario=PERIODIC)
     ),
     "agent 'e_v2x_bm:estimated+episode:estimated': e_v2x_bm:estimated already decides on received": lambda: make_agent(
@@ -215,7 +215,7 @@ def test_interior__takes_no_command_beyond_the_least_capacity() -> None:
 
 def test_uncertainty__is_for_an_agent_that_certifies_against_it() -> None:
     with refused(
-        "uncertainty gaps_m=1: none of the agents uses an uncertainty; agents with +robust do: ppo@PATH+robust"
+        "uncertainty gaps_m=1: none of the agents uses this setting; agents with +robust use it: ppo@PATH+robust"
     ):
         make_lineup(["coast"], PAPER, uncertainty="gaps_m=1")
 
@@ -230,11 +230,11 @@ AGENTS: dict[str, Callable[[], object]] = {
     "scenario 'mixture-delays' is a mixture: an unknown vehicle could belong to any": lambda: make_agent(
         "e_v2x_bm:estimated", scenario=eb.load_scenario("mixture-delays")
     ),
-    ":estimated: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3), and the result": lambda: evaluated(
-        make_agent("full_brake+step:estimated", scenario=SLOW), SLOW
+    ":estimated: in world 0 brakes build up at a finite rate, for which the result would not be exact; leave": lambda: (
+        evaluated(make_agent("full_brake+step:estimated", scenario=SLOW), SLOW)
     ),
-    ":estimated: a vehicle of world 0 follows a braking profile, and the result would not be exact": lambda: evaluated(
-        make_agent("full_brake+step:estimated", scenario=PIECES), PIECES
+    ":estimated: a vehicle of world 0 follows a braking profile, for which the result would not be exact;": lambda: (
+        evaluated(make_agent("full_brake+step:estimated", scenario=PIECES), PIECES)
     ),
     "shield: robust interior: vehicle_1 follows 'profile:0=3,1=5'; must be full_brake": lambda: evaluated(
         make_agent("full_brake+robust:interior", scenario=PIECES, uncertainty="latency_s=0.1"), PIECES

@@ -204,7 +204,7 @@ def test_price__is_the_ratio_of_the_means_over_worlds_where_something_converged(
         ("cooperation-3-pair", {"rounds": 0}, "rounds = 0: must be a whole number, at least 1"),
         ("cooperation-3-pair", {"budget": 0}, "budget = 0: must be a whole number, at least 1"),
         ("cooperation-3-pair", {"seed": -1}, "seed = -1: must be a whole number, at least 0"),
-        ("cooperation-3-pair", {"objective": ["own"]}, "objective: has 1 entries; must have 3"),
+        ("cooperation-3-pair", {"objective": ["own"]}, "objective: the list has 1 entries; must have 3"),
         ("cooperation-3-pair", {"objective": "injury:lr4s"}, "is not a weighted sum of the vehicles' harm; use"),
         ("cooperation-3-pair", {"harm_count": "last"}, "last"),
     ],

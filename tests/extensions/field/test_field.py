@@ -131,7 +131,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     "agent 'acc:T': T must be a number 0 or more, for instance T=1.1": lambda: make_agent("acc:T"),
     "agent 'r157_fsm:b_min=7': b_min = 7: must be at most b_max, which is 6": lambda: make_agent("r157_fsm:b_min=7"),
     "unknown agent 'idm:t=1': parameter 't'": lambda: make_agent("idm:t=1"),
-    "vehicle_3 is controlled by 'idm', whose command is not fixed at the alert": lambda: make_agent("e_v2x_bm").begin(
+    "vehicle_3 is driven by 'idm', whose command is not fixed at the alert": lambda: make_agent("e_v2x_bm").begin(
         eb.load_scenario("paper-random").sample(12, 7).worlds, 1, {2: make_agent("idm")}
     ),
 }

@@ -68,10 +68,10 @@ PROOFS: dict[str, Callable[[], object]] = {
     "team_bound: vehicle_1 follows the script 'coast'; must be 'full_brake'": lambda: team_bound(
         TEAM, (1, 2), scripts={0: "coast"}
     ),
-    "avoidability: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3), and the result": lambda: (
+    "avoidability: in world 0 brakes build up at a finite rate, for which the result would not be exact;": lambda: (
         avoidability(PAPER.replace(brake_rate_mps3=9).sample(2, 7).worlds)
     ),
-    "avoidability: a vehicle of world 0 follows a braking profile, and the result would not be exact": lambda: (
+    "avoidability: a vehicle of world 0 follows a braking profile, for which the result would not be exact;": lambda: (
         avoidability(PAPER.replace(roles={"vehicle_1": "profile:0=3,1=5", "vehicle_2": "learner"}).sample(2, 7).worlds)
     ),
 }
@@ -87,7 +87,7 @@ SEARCHES: dict[str, Callable[[], object]] = {
     "horizon_s = 0.4: must be after the first decision at 0.5 s": lambda: profile_problem(WORLDS, [1], horizon_s=0.4),
     "task: vehicles (3,): must be different indices from 0 to 2": lambda: Task(PAPER, (3,)),
     "task: vehicles (0, 0): must be different indices from 0 to 2": lambda: Task(PAPER, (0, 0)),
-    "scenario 'paper-random': exactly one vehicle must be controlled here; the controlled": lambda: (
+    "scenario 'paper-random': this function needs exactly one controlled vehicle; the controlled vehicles": lambda: (
         Task(PAPER, (0, 1)).vehicle
     ),
     "vehicles = (): must be one or more vehicle indices from 0 to 2": lambda: best_harm(PAPER, WORLDS, vehicles=()),
@@ -97,11 +97,11 @@ SEARCHES: dict[str, Callable[[], object]] = {
     "profiles: command -7.1 m/s2 is beyond a vehicle's capacity": lambda: problem().follow(
         problem().constant(np.array([[[-7.1]]]))
     ),
-    "profiles: phases must end one after the other, the last one at the last step": lambda: problem().follow(
-        Profiles(np.array([[9, 5, 75]]), np.zeros((1, 3, 1)))
+    "profiles: ends, the steps at which the phases end, must not decrease along a row, and the": lambda: (
+        problem().follow(Profiles(np.array([[9, 5, 75]]), np.zeros((1, 3, 1))))
     ),
     "t.npz: there is no such file": lambda: BestHarmTable.load(Path("t.npz")),
-    "the braking profiles in these worlds differ from the profiles of the scripts; draw": lambda: best_harm(
+    "in these worlds, vehicles follow other braking profiles than the scripts of": lambda: best_harm(
         PAPER.replace(roles={"vehicle_1": "profile:0=3,1=5", "vehicle_2": "learner"}), PAPER.sample(2, 7).worlds
     ),
 }

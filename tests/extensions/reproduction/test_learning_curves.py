@@ -69,7 +69,7 @@ def test_curves__another_training_or_an_edited_scenario_is_told_before_any_is_be
         (f"{tiny_recipe}:1", "horizon_s: 9", "scenario horizon_s"),
         (f"ppo:1,{other}:1", "horizon_s: 8", "recipe gamma"),
     ):
-        told = f"tiny-seed0: this folder contains another training, which differs in {what}; choose another folder"
+        told = f"tiny-seed0: this folder contains another training run, which differs in {what}; choose another folder"
         with pytest.raises(InvalidInput, match=re.escape(told)):
             curves(recipes, "horizon_s: 8", horizon)
     assert (folder / "learning_curves.json").stat().st_mtime_ns == drawn and not (folder / "ppo-seed0").exists()

@@ -27,7 +27,7 @@ def problem(*vehicles: int) -> ProfileProblem:
 
 
 REFUSED: dict[str, Callable[[], object]] = {
-    "agent 'planner+step+episode': must have at most one +search, then at most one shield (+episode": lambda: (
+    "agent 'planner+step+episode': may have at most one search (+search), then at most one shield (+episode,": lambda: (
         make_agent("planner+step+episode", scenario=PAPER)
     ),
     "agent 'planner:0': the text after the colon must be a number of candidates per decision": lambda: make_agent(
@@ -75,5 +75,5 @@ PLANS = PAPER.replace(
 
 
 def test_looking_ahead__needs_commands_that_are_fixed_at_the_alert() -> None:
-    with refused("vehicle_3 is controlled by 'planner:8', whose command is not fixed at the alert"):
+    with refused("vehicle_3 is driven by 'planner:8', whose command is not fixed at the alert; to look ahead,"):
         drive(WORLDS, Searched(BRAKE, PLANS), PLANS, 1)

@@ -226,7 +226,7 @@ LAST = "trainings/cooperation-3-congested-tiny-shared-seed1"
         (
             f"{LAST}/config.json",
             ('"total_steps": 256', '"total_steps": 512'),
-            "this folder contains another training, which differs in recipe total_steps; choose another folder",
+            "this folder contains another training run, which differs in recipe total_steps; choose another folder",
         ),
         (f"{LAST}/run.json", None, "the folder is not that of a training"),
         (f"{LAST}/team.json", ('"scheme"', '"shceme"'), "team.json"),

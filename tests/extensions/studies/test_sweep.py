@@ -132,7 +132,7 @@ def test_run__of_another_training_is_not_done(again, capsys) -> None:
     other.write_text(json.dumps({**config, "recipe": {**config["recipe"], "gamma": 0.9}}))
     assert sweep(file, folder) == 2
     (told,) = capsys.readouterr().err.splitlines()
-    assert f"{other.parent}: this folder contains another training, which differs in recipe gamma" in told
+    assert f"{other.parent}: this folder contains another training run, which differs in recipe gamma" in told
 
 
 @pytest.mark.parametrize("name", [TABLE, "failures.csv"])
