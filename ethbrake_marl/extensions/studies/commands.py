@@ -356,8 +356,8 @@ def _drive_again(out: Out, file: Path, agent: str | None) -> None:
     for spec in (*([named.agent] if agent is None else []), *([named.against] if named.against else [])):
         if (code := parse_spec(spec).file) is not None:
             raise InvalidInput(
-                f"{file}: the code of the agent {spec!r} is in {code[0]}, and no code that a file names is run. For the"
-                " key 'agent', use --agent; the key 'against' can be changed only in the file"
+                f"{file}: the file names the agent {spec!r}, whose code is in {code[0]}. Code that only a file names"
+                " is not run; replace the agent with --agent, or change the key 'against' in the file"
             )
     chosen = evaluation.load_runnable(named.scenario, training.read_settings(named.settings).scenario, drives="some")
     measured_by = Measure.of(named.measure, agent or named.agent, named.against, chosen, named.harm_count)
