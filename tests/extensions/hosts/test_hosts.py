@@ -510,7 +510,7 @@ def test_host__that_does_not_fit_is_refused_before_anything_moves(host, message)
     ("scenario", "agent", "message"),
     [
         ("paper-random", "full_brake", "host: 'str' is not an agent, because it has no name and no act; to make"),
-        ("paper-random-obstacle", None, "host: scenario 'paper-random-obstacle': has an obstacle ahead (obstacle_gap"),
+        ("paper-random-obstacle", None, "host: scenario 'paper-random-obstacle' has an obstacle ahead (obstacle_gap"),
         ("paper-random-buildup", None, "host: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3), and"),
         (PAPER.with_learners([]), None, "host: scenario 'paper-random' has no learner; give one with a learner"),
         (PAPER, PAPER, "is not an agent"),
