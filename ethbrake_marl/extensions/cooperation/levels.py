@@ -280,7 +280,7 @@ class Plan:
 
     def study_folder(self) -> StudyFolder:
         """Return the folder of the ablation, which refuses results of an ablation with other settings."""
-        advice = f"give another folder (--output); to reuse the trainings, give a copy of the folder without {SETTINGS}"
+        advice = f"give another folder (--output); to reuse its trained policies, give a copy without {SETTINGS}"
         written = (*FIGURES, *SWEEP_FIGURES, *(f"ablation.{ending}" for ending in ("html", "md", "csv", "json")))
         return StudyFolder(self.folder, "an ablation", self.settings(), record=SETTINGS, advice=advice, writes=written)
 

@@ -82,7 +82,7 @@ def reproduce_command(
         out.result([result.in_words() for result in results], Sheet("", ("Item", "Verdict", "Because"), verdicts))
         out.note(f"page: {output / 'index.html'}")
         if not finished:
-            out.interrupted(f"interrupted: the items use the trainings that are finished; {REMAINS}")
+            out.interrupted(f"interrupted: the results use only the finished training runs; {REMAINS}")
 
 
 REPRODUCE = Part(reproduce_command, epilog=example("reproduce random-table harm-distance --quick --output runs/paper"))

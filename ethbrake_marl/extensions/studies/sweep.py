@@ -265,7 +265,8 @@ class SweepPlan:
             identity = Training.identity_of(content)
             if identity in seen:
                 raise InvalidInput(
-                    f"{file.where(asked)}: {asked}: is the same training as {seen[identity]}; delete one of the jobs"
+                    f"{file.where(asked)}: {asked}: this job trains the same policy as {seen[identity]}; delete one"
+                    " of the two"
                 )
             seen[identity] = asked
             name = f"{first.scenario.name}-{first.recipe.name}-seed{asked.seed}-{identity[:16]}"
