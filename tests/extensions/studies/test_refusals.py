@@ -200,14 +200,14 @@ SWEEPS: dict[str, Callable[[], object]] = {
     "s.yaml, line 5: jobs[0] (paper-random, ppo, seed 0, =3): --set '=3': must be KEY=VALUE": lambda: sweep(
         {"set": {"": 3}, "jobs": [GRID]}
     ),
-    "jobs[1] (paper-random, ppo, seed 0): this job trains the same policy as jobs[0] (paper-random, ppo, seed 0)": lambda: (
-        sweep({"jobs": [GRID, {**GRID, "seed": 0}]})
+    "jobs[1] (paper-random, ppo, seed 0): this job trains the same policy as jobs[0] (paper-random": lambda: sweep(
+        {"jobs": [GRID, {**GRID, "seed": 0}]}
     ),
     "grid (paper-random, ppo, seed 0): this job trains the same policy as grid (paper-random, ppo, seed 0)": lambda: (
         sweep({"grid": {**GRID, "seed": [0, 0]}})
     ),
-    "jobs[1] (paper-random, ppo, seed 0, gamma=0.995): this job trains the same policy as jobs[0] (paper-random": lambda: (
-        sweep({"jobs": [GRID, {**GRID, "set": {"gamma": 0.995}}]})
+    "jobs[1] (paper-random, ppo, seed 0, gamma=0.995): this job trains the same policy as jobs[0]": lambda: sweep(
+        {"jobs": [GRID, {**GRID, "set": {"gamma": 0.995}}]}
     ),
     "scenario 'cooperation-0-sensors' has no learner; give at least one vehicle the role learner": lambda: sweep(
         {"jobs": [{"scenario": "cooperation-0-sensors", "recipe": "ppo"}]}
