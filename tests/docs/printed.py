@@ -173,18 +173,18 @@ TABLES: dict[str, How] = {
         "ethbrake evaluate --scenario recorded-openacc --agents full_brake,e_v2x_bm,idm,universal,best_harm --json",
     ),
     "| no. | label | the paper": _by(BY_HAND),
-    "| `--draw` | full_brake": _by(SUITE, "tests/extensions/recorded/test_recorded.py"),
+    "| `--draw` | harm of `full_brake`": _by(SUITE, "tests/extensions/recorded/test_recorded.py"),
     "| agent | our physics | SUMO": _by(SUITE, "tests/extensions/hosts/test_sumo.py"),
     "| work | has | lacks": _by(BY_HAND),
-    "| you write | values": _by(BY_HAND),
+    "| `--sweep` | values that are compared": _by(BY_HAND),
     "| agent | what it does | knows": _by(
         NIGHTLY, "ethbrake evaluate --agents ladder --scenario paper-random --episodes 10000 --seed 7 --json"
     ),
-    "| for | recipe | scenario | settings that differ": _by(BY_HAND),
+    "| trained for | recipe | scenario | settings that differ": _by(BY_HAND),
     "| Vehicle 2 minimises": _by(SEARCH),
-    "| | equal weights | the other weights": _by(SEARCH),
+    "| agent | ratio: equal weights": _by(SEARCH),
     "| who learns, objective": _by(SEARCH),
-    "| | processor time | hypervolume": _by(SEARCH),
+    "| trained with | processor time | hypervolume": _by(SEARCH),
 }
 
 PICTURES: dict[str, How] = {

@@ -148,8 +148,9 @@ class LineTask(TaskClass):  # type: ignore[misc]
         config, actions = self.config, self.config.get("actions")
         if continuous_actions != (actions is None):
             raise InvalidInput(
-                f"task {self.name}: continuous_actions = {continuous_actions} does not fit to actions = {actions}; for"
-                " continuous actions set actions to None, for discrete actions to a whole number of at least 2"
+                f"task {self.name}: continuous_actions = {continuous_actions} contradicts actions = {actions}; for"
+                " continuous actions, set actions to None; for discrete actions, set actions to the number of actions"
+                " (at least 2)"
             )
         settings = config["reward"], config["horizon_is_end"], config.get("shield"), actions
         return lambda: LineEnv(config["scenario"], num_envs, seed or 0, *settings)

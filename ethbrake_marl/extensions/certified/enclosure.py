@@ -493,8 +493,8 @@ class Boxes(NamedTuple):
             name = getattr(script, "name", type(script).__name__)
             if name.split(":")[0] not in SCRIPTS:
                 raise InvalidInput(
-                    f"shield: robust interior: vehicle_{i + 1} follows {name!r}; must be full_brake, coast or"
-                    " constant:A (robust corners accepts every script)"
+                    f"shield: robust interior: vehicle_{i + 1} follows the script {name!r}; the script must be"
+                    " full_brake, coast or constant:A; for other scripts, use robust corners"
                 )
 
     @classmethod
@@ -519,9 +519,9 @@ class Boxes(NamedTuple):
         if possible.obstacle_ahead.any():
             raise _refusal("an obstacle ahead")
         if v.in_pieces.any():
-            raise _refusal("a vehicle that brakes in pieces (profile)")
+            raise _refusal("a vehicle that follows a braking profile")
         if v.build_up.any() and possible.command_mps2.any():
-            raise _refusal("brakes that began to build up before the alert")
+            raise _refusal("a vehicle whose brakes began to build up before the alert")
         command, constant = problem.command.reshape(n, members, N), np.full((n, N), np.nan)
         for i, script in others.items():
             name = getattr(script, "name", type(script).__name__)
@@ -529,8 +529,9 @@ class Boxes(NamedTuple):
                 continue
             if not (command[:, :, i] == command[:, :1, i]).all():
                 raise InvalidInput(
-                    f"shield: robust interior: vehicle_{i + 1} follows {name!r}, whose command differs between worlds"
-                    " of the box; must be full_brake, coast, or constant:A with A at most every capacity of the box"
+                    f"shield: robust interior: vehicle_{i + 1} follows the script {name!r}, whose command differs"
+                    " between the possible worlds; the script must be full_brake, coast, or constant:A with A at most"
+                    " the smallest capacity of this vehicle"
                 )
             constant[:, i] = command[:, 0, i]
         numbers = np.concatenate(

@@ -168,8 +168,8 @@ class Ranges:
         if scenario.members:
             names = ", ".join(member.name for member in scenario.members)
             raise InvalidInput(
-                f"scenario {scenario.name!r} is a mixture: an unknown vehicle could belong to any of {names}; estimated"
-                " agents and shields need one of these scenarios"
+                f"scenario {scenario.name!r} is a mixture of scenarios, but estimated agents and shields need the"
+                f" ranges of one scenario; give one of {names}"
             )
         world = middle_world(scenario)
         low, high = ({key: np.array(scenario.bounds(key)).T[k] for key in ("gaps_m", *OF_OTHERS[1:5])} for k in (0, 1))

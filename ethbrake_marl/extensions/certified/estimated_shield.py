@@ -109,8 +109,9 @@ class EstimatedShield:
         numbers = len(self._ranges.uncertain)
         if self.robust is not None and 2**numbers > MOST_CORNERS:
             raise InvalidInput(
-                f"robust:estimated: scenario {scenario.name!r} has {numbers} uncertain numbers of other vehicles, which"
-                f" make {2**numbers} corners; must be at most {MOST_CORNERS} corners"
+                f"robust:estimated: scenario {scenario.name!r} has {numbers} unknown quantities of other vehicles;"
+                f" their smallest and largest values make {2**numbers} combinations (corners), but at most"
+                f" {MOST_CORNERS} are allowed; give fewer quantities a range"
             )
         self.shield = self._make()
 

@@ -68,8 +68,7 @@ def shield_steps_as_estimated(policy: Driver, argument: str | None, settings: Ag
     scenario = settings.needed_scenario()
     if isinstance(policy, Team) or len(scenario.learners) > 1:
         raise InvalidInput(
-            f"agent {settings.spec!r}: :estimated shields only one learner; +step shields several learners if messages"
-            " contain every piece"
+            f"agent {settings.spec!r}: :estimated can shield only one learner; to shield several learners, use +step"
         )
     return shielded(policy, scenario, "step", harm_count=settings.harm_count, estimated=True)
 
@@ -90,7 +89,10 @@ def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: 
     """
     hybrid = shield_episodes(policy, argument, settings)
     if isinstance(policy, Estimating):
-        raise InvalidInput(f"agent {settings.spec!r}: {policy.name} already decides on received information; use +step")
+        raise InvalidInput(
+            f"agent {settings.spec!r}: {policy.name} already decides only on received information, so a second"
+            " :estimated has no effect; shield this agent with +step"
+        )
     return EstimatingHybrid(hybrid, settings.needed_scenario())
 
 

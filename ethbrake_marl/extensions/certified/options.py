@@ -124,8 +124,8 @@ class RobustOptions(ShieldOptions):
         if self.estimated:
             if len(engine.learners) > 1:
                 raise InvalidInput(
-                    f"{where}: estimated = True: shields only one learner; pass one, for instance"
-                    " learners=['vehicle_2'], to the environment"
+                    f"{where}: estimated = True: the shield can control only one learner; make the environment with one"
+                    " learner, for instance learners=['vehicle_2']"
                 )
             mode = RobustMode.ROBUST if self.mode == "robust" else ShieldMode.STEP
             shield = self.shield(scenario, engine.learners[0], scripts)
@@ -158,11 +158,7 @@ def mode_uncertainty(mode: str, given: object, where: str) -> Uncertainty | None
     """
     uncertainty = checked_uncertainty(given)
     if (mode == "robust") != (uncertainty is not None):
-        needed = f"needs an uncertainty, for instance {UNCERTAINTY_EXAMPLE}"
-        what = (
-            needed
-            if uncertainty is None
-            else "does not use an uncertainty; use mode robust, or leave the uncertainty out"
-        )
+        needed = f"needs a value of uncertainty, for instance {UNCERTAINTY_EXAMPLE}"
+        what = needed if uncertainty is None else "does not use uncertainty; use mode robust, or leave uncertainty out"
         raise InvalidInput(f"{where}: mode {mode} {what}")
     return uncertainty

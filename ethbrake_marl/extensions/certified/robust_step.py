@@ -59,9 +59,10 @@ class RobustShield(StepShield):
     ) -> None:
         super().__init__(scenario, vehicle, harm_count=harm_count, others=others, **settings)
         if uncertainty is not None and (len(self.vehicles) > 1 or self.cap is not None):
-            what = "several vehicles" if self.cap is None else "a cap"
+            what = "several shielded vehicles" if self.cap is None else "a cap"
             raise InvalidInput(
-                f"shield: an uncertainty cannot be combined with {what}; shield one vehicle without a cap"
+                f"shield: uncertainty cannot be combined with {what}; shield one vehicle without a cap, or leave"
+                " uncertainty out"
             )
         self.uncertainty, self.robust = uncertainty, checked_robust(robust, "shield")
         Boxes.check_possible(self.robust, scenario, harm_count, self._others)

@@ -78,13 +78,17 @@ class Interval:
             (1.0, "a share from 0 to below 100 %") if self.relative else (np.inf, "a finite number, at least 0")
         )
         if not is_amount(self.half_width, most):
-            raise InvalidInput(f"uncertainty: {self.quantity}: half-width = {self.half_width!r}: must be {right}")
+            raise InvalidInput(
+                f"uncertainty: half-width of {self.quantity} = {self.half_width!r}: the half-width must be {right}"
+            )
         if self.place is not None and not (isinstance(self.place, int | np.integer) and self.place >= 0):
             raise InvalidInput(
                 f"uncertainty: {self.quantity}: place = {self.place!r}: must be an index of a vehicle or pair, from 0"
             )
         if self.quantity == "friction" and self.place is not None:
-            raise InvalidInput("uncertainty: friction is one number for the whole line; give it without a vehicle")
+            raise InvalidInput(
+                "uncertainty: friction is one number for the whole line; write friction=..., not friction.vehicle_..."
+            )
 
     def __str__(self) -> str:
         kind = "pair" if self.quantity == "gaps_m" else "vehicle"
@@ -143,8 +147,9 @@ class Uncertainty:
         corners = math.prod(map(len, ends)) if sides else 0
         if corners > MOST_CORNERS:
             raise InvalidInput(
-                f"uncertainty: {len(sides)} uncertain numbers in each world make {corners} corners; must be at"
-                f" most {MOST_CORNERS} corners: limit entries to some vehicles or pairs, as in {UNCERTAINTY_EXAMPLE}"
+                f"uncertainty: {len(sides)} intervals in each world make {corners} combinations of values (corners),"
+                f" but at most {MOST_CORNERS} are allowed; limit quantities to some vehicles or pairs, as in"
+                f" {UNCERTAINTY_EXAMPLE}"
             )
         every = [shares[::-1] for shares in product(*ends)] if sides else []
         parts = [worlds] + [_placed(worlds, sides, shares.__getitem__) for shares in every]
@@ -186,12 +191,12 @@ class Uncertainty:
                 continue
             if not np.isfinite(every).all():
                 raise InvalidInput(
-                    f"uncertainty: {interval}: {name} is not known in every world; declare it in the scenario"
+                    f"uncertainty: {interval}: some worlds have no value of {name}; declare {name} in the scenario"
                 )
             if interval.place is not None and interval.place >= every.shape[1]:
                 raise InvalidInput(
-                    f"uncertainty: {interval}: the line has only {every.shape[1]}"
-                    f" {'pairs' if name == 'gaps_m' else 'vehicles'}"
+                    f"uncertainty: {interval}: there is no such {'pair' if name == 'gaps_m' else 'vehicle'}, because"
+                    f" the line has only {every.shape[1]}"
                 )
             for place in range(every.shape[1]) if interval.place is None else (interval.place,):
                 values = every[:, place]

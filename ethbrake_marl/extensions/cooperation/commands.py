@@ -32,30 +32,36 @@ def ablate_command(
     ] = None,
     recipes: Annotated[str, typer.Option(metavar="A,B,...", help="Training recipes.")] = "cooperation",
     seeds: Annotated[
-        int | None, typer.Option(help="Number of trainings (seeds) per level and recipe.", show_default="5", min=1)
+        int | None, typer.Option(help="Number of training runs (seeds) per level and recipe.", show_default="5", min=1)
     ] = None,
     steps: Annotated[
-        int | None, typer.Option(help="Decisions of each learner in a training.", show_default="400000", min=1)
+        int | None,
+        typer.Option(help="Number of decisions of each learner in one training run.", show_default="400000", min=1),
     ] = None,
     episodes: Annotated[
-        int | None, typer.Option(help="Number of worlds for the comparison.", show_default="4000", min=1)
+        int | None, typer.Option(help="Number of worlds in which the levels are compared.", show_default="4000", min=1)
     ] = None,
     search_episodes: Annotated[
         int | None,
         typer.Option(
-            help="Number of worlds (of --episodes) in which to search the joint optimum.", show_default="600", min=1
+            help="Number of worlds, at most --episodes, in which the joint optimum is searched.",
+            show_default="600",
+            min=1,
         ),
     ] = None,
     shield: Annotated[
         str | None,
-        typer.Option(metavar="step", help="Also evaluate all learners with this shield.", show_default="none"),
+        typer.Option(
+            metavar="step", help="Also evaluate the learners of each level with this shield.", show_default="none"
+        ),
     ] = None,
     settings: SettingsOption = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Use few seeds, worlds and decisions.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="For a quick try: few seeds, worlds and decisions.")] = False,
     cost: Annotated[
         bool,
         typer.Option(
-            "--cost", help="Estimate the time by short trials, print the estimate and the output folders, and exit."
+            "--cost",
+            help="Estimate the time of the command by short trials, print it and the output folders, and exit.",
         ),
     ] = False,
     jobs: JobsOption = 1,

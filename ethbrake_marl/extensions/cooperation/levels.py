@@ -134,14 +134,14 @@ def sweep_levels(name: str, sweep: str, settings: Sequence[Override], recipes: S
     if not scenario:
         key = values[0].key
         raise InvalidInput(
-            f"--sweep {key}: the key belongs to a recipe, but must be a key of a scenario; to vary a recipe, use"
-            " ethbrake study sweep"
+            f"--sweep {key}: this is a key of a recipe, but only a key of a scenario can be swept; to vary a recipe,"
+            " use ethbrake study sweep"
         )
     key, path = scenario[0].key, scenario[0].path
     if path[0] in _LINE:
         raise InvalidInput(
-            f"--sweep {key}: levels with different {path[0]} cannot be compared; run one ablation for each value of"
-            f" {path[0]} (--set {path[0]}=..., --output)"
+            f"--sweep {key}: levels with different values of {path[0]} cannot be compared; for each value of"
+            f" {path[0]}, run the command once, with --set {path[0]}=... and an --output of its own"
         )
     if any(each.path[: len(path)] == path for each in settings):
         raise InvalidInput(f"--sweep {key}: --set changes the same key; leave out --sweep or --set")
@@ -280,7 +280,7 @@ class Plan:
 
     def study_folder(self) -> StudyFolder:
         """Return the folder of the ablation, which refuses results of an ablation with other settings."""
-        advice = f"give another folder (--output); to reuse the trainings, give a copy of the folder without {SETTINGS}"
+        advice = f"give another folder (--output); to reuse its trained policies, give a copy without {SETTINGS}"
         written = (*FIGURES, *SWEEP_FIGURES, *(f"ablation.{ending}" for ending in ("html", "md", "csv", "json")))
         return StudyFolder(self.folder, "an ablation", self.settings(), record=SETTINGS, advice=advice, writes=written)
 

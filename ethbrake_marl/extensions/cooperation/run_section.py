@@ -218,9 +218,9 @@ def _train(experiment: Experiment, scenario: Scenario, folder: str, share: int, 
     try:
         result = train(kept, scenario, path, steps=max(recipe.total_steps // share, 1), on_progress=told)
     except EthBrakeError as error:
-        raise Stopped(f"The training {folder} failed ({error})") from error
+        raise Stopped(f"The training run in {folder} failed ({error})") from error
     if result.status == "interrupted":
-        raise Stopped(f"The training {folder} was interrupted", f"the training {folder}")
+        raise Stopped(f"The training run in {folder} was interrupted", f"the training run in {folder}")
     return load_team(path, scenario, folder)
 
 

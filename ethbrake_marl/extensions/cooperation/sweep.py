@@ -52,8 +52,8 @@ class Swept(NamedTuple):
             steps = (high - low) / step if step > 0 else Decimal(0)
             if not 0 < steps < MOST or steps % 1:
                 raise InvalidInput(
-                    f"--sweep {key}: range {item.strip()}: must go up from LOW to HIGH in at most {MOST - 1} whole"
-                    " steps, for instance 0..90:15"
+                    f"--sweep {key}: range {item.strip()}: a range LOW..HIGH:STEP must go up from LOW to HIGH in 1 to"
+                    f" {MOST - 1} equal steps, for instance 0..90:15"
                 )
             numbers += [low + k * step for k in range(int(steps) + 1)]
         if not 2 <= len(numbers) <= MOST:

@@ -327,8 +327,10 @@ def make_controller(argument: str | None, settings: AgentSettings) -> Controller
             raise unknown_name(f"{where}: parameter", key, law.parameters)
         value = parse_numeral(text)
         if value is None or not (0.0 < value < math.inf or (value == 0.0 and key in law.may_be_zero)):
-            least = "0 or more" if key in law.may_be_zero else "above 0"
-            raise InvalidInput(f"{where}: {key} must be a number {least}, for instance {key}={law.parameters[key]:g}")
+            least = "of 0 or more" if key in law.may_be_zero else "above 0"
+            raise InvalidInput(
+                f"{where}: {key} must be a finite number {least}, for instance {key}={law.parameters[key]:g}"
+            )
         if key in parameters:
             raise InvalidInput(f"{where}: parameter {key} is given twice; give it once")
         parameters[key] = value

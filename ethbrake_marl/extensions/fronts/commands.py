@@ -19,7 +19,7 @@ DEFAULT_AGENTS = "e_v2x_bm,universal"  # agents that are compared with the front
 def front_command(
     output: FolderOption,
     scenario: Annotated[
-        str, typer.Option(metavar="NAME|PATH", help="Scenario whose learners the command controls.")
+        str, typer.Option(metavar="NAME|PATH", help="Scenario; the search controls its learners.")
     ] = "paper-random",
     agents: Annotated[
         str | None,
@@ -32,15 +32,19 @@ def front_command(
     weights: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="W1,W2,...", help="One weight for each vehicle. The option may be repeated.", show_default="a grid"
+            metavar="W1,W2,...",
+            help="Choice of weights: one weight for each vehicle. Repeat the option for more choices.",
+            show_default="a grid",
         ),
     ] = None,
     steps: Annotated[
-        int, typer.Option(help="Number of steps from weight 0 to weight 1 in the default grid.", min=1, max=50)
+        int, typer.Option(help="Default grid of weights: number of steps from weight 0 to weight 1.", min=1, max=50)
     ] = 5,
     episodes: Annotated[int, typer.Option(help="Number of worlds.", min=2)] = 500,
     seed: Annotated[int, typer.Option(help="Seed of the list of worlds.", min=0)] = 7,
-    budget: Annotated[int, typer.Option(help="Profiles to try per world and choice of weights.", min=1)] = 3000,
+    budget: Annotated[
+        int, typer.Option(help="Number of profiles that the search tries per world and choice of weights.", min=1)
+    ] = 3000,
     settings: SettingsOption = None,
     jobs: JobsOption = 1,
     force: ForceOption = False,

@@ -38,7 +38,7 @@ def weight_grid(vehicles: int, steps: int = STEPS) -> Floats:
     if number > MOST:
         raise InvalidInput(
             f"{steps} steps: the grid has {number:,} choices of weights for {vehicles} vehicles, but at most"
-            f" {MOST:,} are allowed; give fewer steps, or give a list of weights"
+            f" {MOST:,} are allowed; give fewer steps, or give the choices of weights yourself"
         )
 
     def shares(number: int, left: int) -> Iterator[list[int]]:
@@ -73,11 +73,11 @@ def checked_weights(weights: Sequence[Sequence[float]] | Floats, vehicles: int) 
         if row.shape != (vehicles,) or not (good.all() and row.any()):
             text = ",".join(f"{weight:g}" for weight in row.ravel())
             raise InvalidInput(
-                f"weights[{k}] = {text}: give {vehicles} numbers, one for each vehicle, each 0 or from 1e-6"
-                " to 1e6 and not all 0, for instance 1,4,1"
+                f"weights[{k}] = {text}: give one number for each of the {vehicles} vehicles, each 0 or from"
+                " 1e-6 to 1e6, and not all 0; for instance 1,4,1"
             )
     if not rows:
-        raise InvalidInput("weights: there are no weights; give at least one row, for instance 1,4,1")
+        raise InvalidInput("weights: there are no weights; give at least one choice of weights, for instance 1,4,1")
     return np.array(rows)
 
 

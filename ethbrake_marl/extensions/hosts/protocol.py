@@ -646,7 +646,7 @@ def _check_known(worlds: Worlds, scenario: Scenario, vehicles: tuple[int, ...]) 
     scenario.play_pieces(worlds, vehicles).refuse_build_up("host")
     if worlds.messages.shape[1] or worlds.obstacle_ahead.any():
         what = "periodic messages or tells (v2x)" if worlds.messages.shape[1] else "an obstacle ahead (obstacle_gap_m)"
-        raise InvalidInput(f"host: scenario {scenario.name!r}: has {what}, which hosts do not support")
+        raise InvalidInput(f"host: scenario {scenario.name!r} has {what}, which hosts do not support")
 
 
 def _on_steps(worlds: Worlds, dt: float) -> Vehicles:

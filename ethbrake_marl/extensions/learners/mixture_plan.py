@@ -23,7 +23,10 @@ class Shares(FileModel):
     def _everything(self) -> Shares:
         total = self.pretraining_first + self.pretraining_others + self.gating + self.joint
         if not abs(total - 1.0) <= 1e-9:
-            raise ValueError(f"the sum of the four shares is {total:g}; it must be 1")
+            raise ValueError(
+                "pretraining_first, pretraining_others, gating and joint are shares of all updates: they must sum to 1,"
+                f" but sum to {total:g}"
+            )
         return self
 
 
@@ -38,23 +41,37 @@ class ExpertsPlan(FileModel):
     networks: int = Field(ge=2, le=16, description="number of experts")
     gating: Layers = Field(description="hidden layers of the gating network")
     worlds: int = Field(
-        ge=1, le=1_000_000, description="number of worlds in which templates are compared with the earlier experts"
+        ge=1,
+        le=1_000_000,
+        description="number of worlds in which templates (random braking profiles) are compared with experts",
     )
-    templates: int = Field(ge=1, le=100_000, description="templates (random braking profiles) drawn in each world")
+    templates: int = Field(
+        ge=1, le=100_000, description="number of templates (random braking profiles) drawn in each world"
+    )
     gain: NonNegative = Field(
-        description="an expert imitates a template whose return exceeds the best earlier expert's by more than this"
+        description="a new expert imitates a template if its return exceeds the best earlier expert's return by more"
+        " than this number"
     )
     margin: Positive = Field(
-        description="an expert is trained in worlds in which its return is at most this below the best earlier expert's"
+        description="a new expert is trained in the worlds in which its return is at least the best earlier expert's"
+        " return minus this number"
     )
-    imitation_epochs: int = Field(ge=1, le=1000, description="passes over the decisions of the imitated templates")
+    imitation_epochs: int = Field(
+        ge=1, le=1000, description="number of passes over the decisions of the imitated templates"
+    )
     gating_states: int = Field(
-        ge=1, le=1_000_000, description="number of decisions in each update at which the experts are compared"
+        ge=1,
+        le=1_000_000,
+        description="number of decisions at which the returns of the experts are compared in each update",
     )
-    gating_memory: int = Field(ge=1, le=1_000_000, description="number of compared decisions that are stored")
-    gating_steps: int = Field(ge=1, le=100_000, description="gradient steps of the gating network in each update")
+    gating_memory: int = Field(
+        ge=1, le=1_000_000, description="number of stored decisions at which experts were compared"
+    )
+    gating_steps: int = Field(
+        ge=1, le=100_000, description="number of gradient steps of the gating network in each update"
+    )
     tie_break: NonNegative = Field(
-        description="when experts are compared: weight of the count of harm (first or total) that the reward omits"
+        description="weight, when experts are compared, of the harm count (first or total) that the reward does not use"
     )
     joint_rate: Rate = Field(description="factor on the learning rate in the last stage, in which all networks learn")
-    shares: Shares = Field(description="share of all updates for each stage; the shares sum to 1")
+    shares: Shares = Field(description="share of all updates for each stage of the training; the shares sum to 1")

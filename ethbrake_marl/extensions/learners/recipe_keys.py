@@ -24,7 +24,7 @@ class OffsetRange(FileModel):
     @classmethod
     def _in_order(cls, value: float, info: ValidationInfo) -> float:
         if "smallest" in info.data and not value >= info.data["smallest"]:
-            raise ValueError(f"must be at least as large as smallest, which is {info.data['smallest']:g}")
+            raise ValueError(f"must be at least the value of the key smallest, {info.data['smallest']:g}")
         return value
 
 

@@ -66,8 +66,8 @@ class RolloutClassificationRecipe(TrainingRecipe):
     policies: Annotated[tuple[PolicyName, ...], Field(strict=False, max_length=16, exclude_if=not_)] = Field(
         (), description="trained policies; at a decision the network can let one of them act; left out: none"
     )
-    n_steps: int = Field(ge=1, description="decisions of each world between two updates")
-    tried: int = Field(ge=1, description="number of decisions in a round at which several actions are tried")
+    n_steps: int = Field(ge=1, description="number of decisions in each world between two updates")
+    tried: int = Field(ge=1, description="number of decisions per update at which several actions are tried")
     near: Annotated[tuple[OffsetRange, ...], Field(strict=False, max_length=8)] = Field(
         description="ranges of distances; from each range one distance is drawn, and the actions this far below and"
         " above the policy's action are tried"
@@ -77,26 +77,30 @@ class RolloutClassificationRecipe(TrainingRecipe):
         " network"
     )
     drawn: int = Field(
-        ge=0, le=16, description="number of random choices that are tried too: policies, or actions without policies"
+        ge=0,
+        le=16,
+        description="number of choices that are drawn at random and tried: policies if the key policies is"
+        " set, otherwise actions",
     )
-    holds: Holds = Field(description="numbers of steps for which a tried action lasts; one number is drawn each time")
+    holds: Holds = Field(description="numbers of time steps for which a tried action may last; one of them is drawn")
     largest_cost: Positive = Field(
-        description="limit of an action's extra cost over the best tried action; a larger extra cost is cut to it"
+        description="limit of an action's extra cost (its cost minus the best tried action's cost); a larger extra cost"
+        " is cut to this limit"
     )
     caution: float = Field(
         0.0,
         ge=0.0,
         allow_inf_nan=False,
         exclude_if=not_,
-        description="weight of a further cost: the action's cost minus the cost of full braking to the end, if"
-        " positive; grows from 0 to this value during the training",
+        description="weight of a further cost, which is the action's cost minus the cost of full braking to the end of"
+        " the episode, if positive; the weight grows from 0 to this value during the training",
     )
     tie_break: float = Field(
         0.0,
         ge=0.0,
         allow_inf_nan=False,
         exclude_if=not_,
-        description="weight, in the cost, of the count of harm (first or total) that the reward omits",
+        description="weight, in the cost, of the harm count (first or total) that the reward does not use",
     )
     relative: bool = Field(
         False,
@@ -104,7 +108,7 @@ class RolloutClassificationRecipe(TrainingRecipe):
         description="true: in a mixture of scenarios, a cost is divided by the mean cost in its scenario",
     )
     focus: Focus = Field(
-        0.0, description="share of the decisions to learn from that are drawn in proportion to the largest extra cost"
+        0.0, description="share of the training decisions that are drawn in proportion to their largest extra cost"
     )
     guide: NonNegative = Field(
         description="weight of the convex term of the loss; without it learning can stall at the beginning"
@@ -112,10 +116,10 @@ class RolloutClassificationRecipe(TrainingRecipe):
     memory: int = Field(
         ge=1,
         le=500_000,
-        description="number of decisions in memory to learn from: the last ones at which the tried actions differ in"
-        " cost",
+        description="number of decisions in memory, from which the network learns: the latest decisions at which the"
+        " tried actions differ in cost",
     )
-    gradient_steps: int = Field(ge=1, le=100_000, description="steps of the optimiser in one update")
+    gradient_steps: int = Field(ge=1, le=100_000, description="number of steps of the optimiser in one update")
     batch_size: int = Field(ge=2, description=BATCH_SIZE)
     averaging: Averaging = Field(description=AVERAGING)
     network: ChoosingShape = Field(description=NETWORK)
@@ -164,11 +168,14 @@ class RolloutClassificationRecipe(TrainingRecipe):
             policy = load_policy(path) if path else load_shipped(kind)
             by = policy.manifest.algorithm
             if path and kind not in ("policy", by):
-                raise InvalidInput(f"recipe {self.name!r}: policies: {name} was trained by {by}; write {by}@{path}")
+                raise InvalidInput(
+                    f"recipe {self.name!r}: policies: {name}: this policy was trained by {by}; write {by}@{path}"
+                )
             loaded += policy.among or [policy]
         if loaded and not self.drawn <= len(loaded):
             raise InvalidInput(
-                f"recipe {self.name!r}: drawn = {self.drawn}: must be at most the number of policies, {len(loaded)}"
+                f"recipe {self.name!r}: drawn = {self.drawn}: drawn must be at most {len(loaded)}, the number of"
+                " policies"
             )
         return tuple(loaded)
 

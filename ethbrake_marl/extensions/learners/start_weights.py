@@ -20,14 +20,14 @@ def widened(policy: Policy, training: Training) -> dict[str, NDArray[np.float32]
     network = policy.manifest.network
     if network.networks > 1:
         raise InvalidInput(
-            f"recipe {recipe.name!r}: start: the policy is a mixture of {network.networks} networks; name a policy"
-            " with one network"
+            f"recipe {recipe.name!r}: start: this policy is a mixture of {network.networks} networks; name a policy"
+            " that has one network"
         )
     for name in ("policy_hidden", "activation", "output"):
         if getattr(network, name) != getattr(wanted, name):
             raise InvalidInput(
-                f"recipe {recipe.name!r}: network.{name} is {getattr(wanted, name)}, but {getattr(network, name)} in"
-                " the policy of the key start; change the recipe to the value of the policy"
+                f"recipe {recipe.name!r}: network.{name} is {getattr(wanted, name)}, but must be"
+                f" {getattr(network, name)}, as in the policy that the key start names"
             )
     return padded(policy, training, "start")
 
@@ -49,8 +49,8 @@ def padded(policy: Policy, training: Training, key: str) -> dict[str, NDArray[np
     missing = [name for name in known if name not in names]
     if missing:
         raise InvalidInput(
-            f"recipe {training.recipe.name!r}: observation lacks {', '.join(missing[:5])}, which the policy of the key"
-            f" {key} observes; list all features of this policy"
+            f"recipe {training.recipe.name!r}: the observation lacks the features {', '.join(missing[:5])}, which the"
+            f" policy of the key {key} observes; add them to the observation"
         )
     weights = {name: tensor.copy() for name, tensor in policy.tensors.items() if not name.startswith("value.")}
     for name in [name for name in weights if name.endswith(".0.weight")]:

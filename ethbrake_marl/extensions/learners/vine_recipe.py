@@ -54,19 +54,21 @@ class VineRecipe(TrainingRecipe):
         description="policy to start from, ppo or ppo@PATH; ppo: the shipped policy that was trained on this scenario,"
         " or random weights if no such policy is shipped; left out: random weights",
     )
-    n_steps: int = Field(ge=1, description="decisions of each world between two updates")
-    tried: int = Field(ge=1, description="decisions of a round at which a higher and a lower action are tried")
+    n_steps: int = Field(ge=1, description="number of decisions in each world between two updates")
+    tried: int = Field(
+        ge=1, description="number of decisions per update at which a higher and a lower action are tried"
+    )
     offset: OffsetRange = Field(description="range of the offset between a tried action and the policy's action")
-    holds: Holds = Field(description="numbers of steps for which an offset lasts; one number is drawn each time")
+    holds: Holds = Field(description="numbers of time steps for which a tried offset may last; one of them is drawn")
     gradient_limit: Positive | Literal["auto"] = Field(
-        description="largest gradient (return per unit of action); a larger gradient is cut to it; auto: computed from"
-        " measured gradients"
+        description="largest gradient (return per unit of action); a larger gradient is cut to this limit; auto: the"
+        " limit is computed from measured gradients"
     )
-    trust_radius: Rate = Field(description="largest distance from an action to its target in one update")
+    trust_radius: Rate = Field(description="largest distance, in one update, between an action and its target")
     anchor: Positive = Field(
-        description="weight against changes of an action; with a larger weight small gradients change it less"
+        description="weight that holds actions at their value; with a larger weight, small gradients change them less"
     )
-    n_epochs: int = Field(ge=1, le=1000, description="passes of an update over the tried decisions")
+    n_epochs: int = Field(ge=1, le=1000, description="number of passes of each update over the tried decisions")
     batch_size: int = Field(ge=2, description=BATCH_SIZE)
     averaging: Averaging = Field(description=AVERAGING)
     focus: Focus = Field(

@@ -182,21 +182,24 @@ class Chains:
         for lane, (_, said, product, way) in sorted(self._ways.items()):
             if said >= LEAST_M2 and not (SLOPE[0] < product / said < SLOPE[1] and way > 0.0):
                 raise InvalidInput(
-                    f"{file}: in lane {self._name(lane)}, positions (front) change {product / said:.2f} times as much"
-                    f" as they should by the speeds{'' if way > 0.0 else ', which are below 0'}; front must increase in"
-                    f" the direction of travel, speed must be above 0, and both must be in {entry.units}"
+                    f"{file}: in lane {self._name(lane)}, positions (column front) change by {product / said:.2f} times"
+                    f" the distance that the speeds imply{'' if way > 0.0 else ', and the speeds are negative'}; front"
+                    " must increase in the direction of travel, speeds must be above 0, and both columns must be in"
+                    f" {entry.units}"
                 )
         if self._faults > entry.impossible * self._states:
             raise InvalidInput(
-                f"{self._first_fault}; {self._faults:,} of {self._states:,} vehicles have such faults, but at most"
-                f" {entry.impossible:.0%} are accepted"
+                f"{self._first_fault}; {self._faults:,} of {self._states:,} positions of vehicles are faulty (recorded"
+                " twice, overlapping, or behind a vehicle that is not recorded), but at most"
+                f" {entry.impossible:.0%} may be"
             )
         self.left_out["vehicles that overlap, are recorded twice, or follow one that is not recorded"] += self._faults
         opened, said, product = self._gaps.tolist()
         if product > CORRELATED * math.sqrt(opened * said) > 0.0 and not SLOPE[0] < product / said < SLOPE[1]:
             raise InvalidInput(
-                f"{file}: gaps change {product / said:.2f} times as much as they should by the speeds (3.28: gaps in"
-                f" feet and speeds in m/s; 0.28: gaps in m and speeds in km/h); the file must be in {entry.units}"
+                f"{file}: the recorded gaps change by {product / said:.2f} times the amount that the speeds imply (3.28"
+                " means gaps in feet and speeds in m/s; 0.28 means gaps in m and speeds in km/h); the file must be in"
+                f" {entry.units}"
             )
 
 

@@ -19,10 +19,13 @@ def from_data_command(
     ],
     format: Annotated[
         Literal["highd", "exid", "ngsim", "openacc", "table"],
-        typer.Option(help="Format of the recordings; table: CSV or Parquet files, with --columns."),
+        typer.Option(help="Format of the recordings; table: CSV or Parquet files, described by --columns."),
     ],
     output: Annotated[
-        Path, typer.Option(metavar="FILE", help="Scenario file (.yaml) to write; its rows go to a .csv file beside it.")
+        Path,
+        typer.Option(
+            metavar="FILE", help="Scenario file (.yaml) to write; the recorded rows go to a .csv file beside it."
+        ),
     ],
     columns: Annotated[
         str,
@@ -47,9 +50,9 @@ def from_data_command(
     ] = 1.0,
     draw: Annotated[
         Literal["rows", "normal", "lognormal", "quantiles"],
-        typer.Option(help="Draw whole recorded rows, or each quantity from a distribution fitted to the rows."),
+        typer.Option(help="Draw worlds as whole recorded rows, or from distributions that are fitted to the rows."),
     ] = "rows",
-    strict: Annotated[bool, typer.Option("--strict", help="Write no scenario if some file has errors.")] = False,
+    strict: Annotated[bool, typer.Option("--strict", help="Write no scenario if any file has errors.")] = False,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:

@@ -36,8 +36,8 @@ def fit_rows(rows: Floats, draw: DataDraw) -> dict[str, Any]:
     used = (speeds >= SLOWEST_MPS).all(axis=1) & ((times > 0.0) & (times <= LONGEST_S)).all(axis=1)
     if used.sum() < QUANTILES:
         raise InvalidInput(
-            f"draw = {draw}: only {used.sum()} rows have time gaps above 0 and up to {LONGEST_S:g} s; a fit needs at"
-            f" least {QUANTILES}"
+            f"draw = {draw}: a fit needs at least {QUANTILES} rows with time gaps above 0 and up to {LONGEST_S:g} s,"
+            f" but there are only {used.sum()}; give more recordings, or use draw = rows"
         )
     line = speeds[used].mean(axis=1)
     off = speeds[used] - line[:, None]

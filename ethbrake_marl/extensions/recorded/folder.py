@@ -59,7 +59,7 @@ def read_rows(
     files, refused, twice = _search(folder, entry)
     if not files and (not refused or not folder.is_dir()):
         patterns = " or ".join(entry.files)
-        raise InvalidInput(f"{folder}: must be a folder with files of {entry.title}, whose names match {patterns}")
+        raise InvalidInput(f"{folder}: must be a folder with files of {entry.title}; their names match {patterns}")
     numbers, longest, left_out, others = 2 * vehicles - 1, 0, Counter[str](), dict[str, str]()
     with closing(sqlite3.connect("")) as store:  # a temporary file on disk
         store.execute(f"CREATE TABLE chain({','.join(f'n{k}' for k in range(numbers))},file,vehicles)")
@@ -81,7 +81,9 @@ def read_rows(
             except InvalidInput as error:
                 refused.append(str(error))
             except sqlite3.Error as error:
-                raise InvalidInput(f"{folder}: its data cannot be ordered by time in a database ({error})") from None
+                raise InvalidInput(
+                    f"{folder}: the temporary database that sorts the recorded rows failed ({error})"
+                ) from None
         if len(others) == len(files) and not refused:
             raise InvalidInput(f"{folder}: contains no recording of {entry.title}: {'; '.join(others.values())}")
         ((seen,),) = store.execute("SELECT COUNT(*) FROM chain")

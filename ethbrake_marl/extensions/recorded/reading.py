@@ -126,14 +126,14 @@ def _numbers(
     """
     for line, cells in rows:
         if len(cells) != len(shown):
-            right = f"but the header has {len(shown)} columns; is the file complete?"
+            right = f"but the header names {len(shown)} columns; is the file complete?"
             raise InvalidInput(f"{place_of(file, line)}: the line has {len(cells)} values, {right}")
         k = 0
         try:
             yield line, [reader(cells[k := at]) for at, reader in readers]
         except ValueError:
             cell = cells[k].strip()
-            right = f"{cell!r:.60} is not a number" if cell else "is empty"
+            right = f"{cell!r:.60} is not a number" if cell else "the value is empty"
             raise InvalidInput(f"{place_of(file, line)}, column {shown[k]}: {right}") from None
 
 
@@ -177,7 +177,7 @@ def _text(text: TextIOWrapper, file: Path, entry: Format, columns: Sequence[str]
         numbers = sum(parse_numeral(cell) is not None for cell in row)
         if entry.headless and number == 1 and 2 * numbers > len(row) > 1:
             if len(row) != len(entry.headless):
-                right = f"a text file of {entry.title} without a header has {len(entry.headless)}"
+                right = f"in a text file of {entry.title} without a header each line has {len(entry.headless)}"
                 raise InvalidInput(f"{file}, line {number}: the line has {len(row)} values; {right}")
             used, _ = _match(file, columns, entry.headless)
             return entry.headless, used, _rows(file, chain([(number, line)], lines), " ", entry.elsewhere)
@@ -200,8 +200,10 @@ def _rows(file: Path, lines: Iterator[tuple[int, str]], separator: str, streets:
             seen += 1
             yield number, _cells(line, separator)
     if elsewhere and not seen:
-        why = f"{' or '.join(streets)}, streets with crossings, which are left out"
-        raise InvalidInput(f"{file}: all {elsewhere:,} rows are from {why}")
+        raise InvalidInput(
+            f"{file}: all {elsewhere:,} rows are from {' or '.join(streets)}, but rows from streets with crossings are"
+            " left out; give recordings of a motorway"
+        )
 
 
 def _lines(file: Path, text: TextIOWrapper) -> Iterator[tuple[int, str]]:

@@ -80,7 +80,9 @@ def scenario_from_data(
     if not 0.0 < every_s < math.inf:
         raise InvalidInput(f"every = {every_s:g} s: the time between two moments must be above 0")
     if base.members or base.table is not None:
-        raise InvalidInput(f"based_on = {based_on!r}: must be a scenario without a mixture and without a table")
+        raise InvalidInput(
+            f"based_on = {based_on!r}: the scenario must not be a mixture, and must not draw worlds from a table"
+        )
     vehicles = base.vehicles
     rows = read_rows(folder, entry, every_s, vehicles, progress)
     if rows.refused and (strict or not rows.seen):
@@ -91,11 +93,11 @@ def scenario_from_data(
         raise error
     if not rows.seen:
         longest = (
-            f"; the longest queue has {rows.longest} vehicles: give a scenario with at most as many (--based-on), for"
-            " instance realistic-pair with 2"
+            f"; the longest queue has {rows.longest} vehicles: with --based-on, give a scenario of at most"
+            f" {rows.longest} vehicles, for instance realistic-pair with 2"
         )
         raise InvalidInput(
-            f"{folder}: contains no queue of {vehicles} vehicles at the times that were read"
+            f"{folder}: no {vehicles} vehicles follow each other in a lane at any moment that was read"
             f"{longest * (rows.longest > 1)}"
         )
     recordings, summary = count_of(len({file for file, _ in rows.of}), "recording"), _found(rows, vehicles, every_s)

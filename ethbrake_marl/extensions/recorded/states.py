@@ -50,7 +50,8 @@ def check_every(every_s: float, entry: Format, what: str) -> int:
     off = 0.01 * stride if entry.title == "the table" else 1e-6  # video has 29.97 pictures in a second
     if not (1.0 - 1e-6 <= stride < 1e9 and abs(stride - round(stride)) <= off):
         raise InvalidInput(
-            f"every = {every_s:g} s: must be a multiple of {1 / entry.hertz:g} s, the time step of {what}"
+            f"every = {every_s:g} s: the time between two moments must be a multiple of {1 / entry.hertz:g} s, the time"
+            f" step of {what}"
         )
     return round(stride)
 
@@ -95,8 +96,8 @@ def keep_states(
         cars, states = cars + int(((lengths > CAR_M[0]) & (lengths < CAR_M[1])).sum()), states + len(kept_states)
     if not entry.gaps and cars < LEAST_CARS * states:
         raise InvalidInput(
-            f"{file}: {cars:,} of {states:,} vehicles are {CAR_M[0]:g} to {CAR_M[1]:g} m long, which is less than a"
-            f" third; lengths and speeds must be in {entry.units}"
+            f"{file}: only {cars:,} of {states:,} vehicles are {CAR_M[0]:g} to {CAR_M[1]:g} m long, but at least a"
+            f" third should be; lengths and speeds must be in {entry.units}"
         )
 
 
@@ -179,8 +180,8 @@ def _of_gaps(piece: Piece, entry: Format, ticks: Floats) -> Floats:
     ivs = {k: f"ivs{k - 1}" for k in cars if f"ivs{k - 1}" in at and k - 1 in cars}
     if not ivs:
         raise InvalidInput(
-            f"{piece.file}: no car follows another in the columns {', '.join(piece.columns[1:])}; the file must have"
-            " the columns Speed1, Speed2 and IVS1, or the like with other numbers"
+            f"{piece.file}: none of the columns {', '.join(piece.columns[1:])} is the gap between two cars; the file"
+            " must have the speeds of two cars and the gap between them, such as Speed1, Speed2 and IVS1"
         )
     right = f"m/s: the speed must be at most {FASTEST_MPS:g} m/s; {entry.title} is in {entry.units}"
     for k in cars:

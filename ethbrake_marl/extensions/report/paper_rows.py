@@ -82,10 +82,10 @@ def check_papers_test(task: Task, seed: int | None) -> None:
     """Raise ``InvalidInput`` if an evaluation cannot be compared with the paper's rows (see ``is_papers_test``)."""
     if not is_papers_test(task, seed):
         raise InvalidInput(
-            f"paper: the paper's results are for Vehicle 2 in worlds of {' or '.join(_SHOWN_WITH)} as shipped, but the"
-            f" evaluation has {'worlds without a seed' if seed is None else 'a list'} of {task.scenario.name!r} with"
-            f" the controlled vehicles {task.names};"
-            f" {'give evaluate the seed of the list, or ' if seed is None else ''}leave paper out"
+            f"paper: the paper's results are for Vehicle 2 in the shipped scenario {' or '.join(_SHOWN_WITH)}, but the"
+            f" evaluation has {'worlds without a seed' if seed is None else 'an evaluation list'} of"
+            f" {task.scenario.name!r} with the controlled vehicles {task.names};"
+            f" {'pass the seed of the evaluation list to evaluate, or ' if seed is None else ''}leave paper out"
         )
 
 

@@ -32,7 +32,8 @@ class SeedCurve:
         common = sorted(set.intersection(*(set(training) for training in trainings))) if trainings else []
         if not common:
             raise InvalidInput(
-                "SeedCurve.of: no step is common to all trainings; give trainings that were evaluated at the same steps"
+                "SeedCurve.of: the training runs have no evaluated step in common; give training runs that were"
+                " evaluated at the same steps"
             )
         values = [[training[step] for step in common] for training in trainings]
         return cls(np.array(common, np.float64), np.array(values, np.float64))
@@ -62,7 +63,7 @@ def seed_curves(
 
     """
     if not panels or not all(panels.values()):
-        raise InvalidInput("seed_curves: a panel has no curves; give at least one curve for each quantity")
+        raise InvalidInput("seed_curves: a quantity has no curves; give at least one curve for each quantity")
     figure, every = new_panels((5.0 * len(panels), 4.2), columns=len(panels))
     for axes, (label, curves) in zip(every, panels.items(), strict=True):
         for number, (recipe, curve) in enumerate(curves.items()):

@@ -21,23 +21,29 @@ def reproduce_command(
     names: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="ITEM", help="Figures and tables to reproduce; --list prints names.", show_default="everything"
+            metavar="ITEM",
+            help="Figures and tables to reproduce; --list prints their names.",
+            show_default="everything",
         ),
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Use shipped policies, without training (default).")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Use shipped policies and train none (default).")] = False,
     full: Annotated[
-        bool, typer.Option("--full", help="Also train policies, to draw learning curves and to stop one early.")
+        bool,
+        typer.Option("--full", help="Also train policies: for learning curves, and for a policy before convergence."),
     ] = False,
     output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for all results.")] = Path("runs/reproduction"),
     episodes: Annotated[
-        int, typer.Option(help="Largest number of worlds for an item; the paper has 10,000.", min=2, max=PAPER_EPISODES)
+        int,
+        typer.Option(
+            help="Largest number of worlds for a figure or table; the paper uses 10,000.", min=2, max=PAPER_EPISODES
+        ),
     ] = PAPER_EPISODES,
     docs: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.json", help="JSON file for a copy of all results; figures go beside it."),
+        typer.Option(metavar="FILE.json", help="JSON file for a copy of all results; figures go into the same folder."),
     ] = None,
     cost: Annotated[
-        bool, typer.Option("--cost", help="Print how much work is left and how long it takes, and exit.")
+        bool, typer.Option("--cost", help="Print how much work is left and how long it will take, and exit.")
     ] = False,
     listed: Annotated[bool, typer.Option("--list", help="List all figures and tables, and exit.")] = False,
     force: ForceOption = False,
@@ -76,7 +82,7 @@ def reproduce_command(
         out.result([result.in_words() for result in results], Sheet("", ("Item", "Verdict", "Because"), verdicts))
         out.note(f"page: {output / 'index.html'}")
         if not finished:
-            out.interrupted(f"interrupted: the items use the trainings that are finished; {REMAINS}")
+            out.interrupted(f"interrupted: the results use only the finished training runs; {REMAINS}")
 
 
 REPRODUCE = Part(reproduce_command, epilog=example("reproduce random-table harm-distance --quick --output runs/paper"))

@@ -319,5 +319,7 @@ def checked_result(content: Mapping[str, Any], where: Path | str, name: str) -> 
         }
         wrong = next((what for what, is_right in checks.items() if not is_right), "")
     if wrong:
-        raise InvalidInput(f"{where}: the entry {wrong} is missing or wrong; make the result again (--force)")
+        raise InvalidInput(
+            f"{where}: the key {wrong} is missing or its value is wrong; reproduce the item again (--force)"
+        )
     return result

@@ -80,7 +80,9 @@ def best_harm(
 
     """
     if not counts or not set(counts) <= set(HARM_COUNTS) or len(set(counts)) != len(counts):
-        raise InvalidInput(f"counts = {tuple(counts)}: the counts must be first, total, or both, each once")
+        raise InvalidInput(
+            f"counts = {tuple(counts)}: counts must contain 'first', 'total' or both, and none of them twice"
+        )
     task = Task(scenario, scenario.learners if vehicles is None else tuple(vehicles))
     others, problem = scripted_commands(worlds, task), task_problem(worlds, task)
     identity, aimed = problem.identity, partial(minimising, worlds=worlds, declared=objective, vehicles=task.vehicles)
@@ -418,7 +420,7 @@ def fold_episodes(
     """
     if OBJECTIVE in table.header:
         raise InvalidInput(
-            f"the table holds amounts of the objective {table.header[OBJECTIVE]!r}; give a table of the harm of the"
+            f"the table contains values of the objective {table.header[OBJECTIVE]!r}; give a table of the harm of the"
             " line (objective total)"
         )
     learners = [scenario.vehicle_names[i] for i in scenario.learners]

@@ -129,8 +129,8 @@ class Planner:
         budget = CANDIDATES if argument is None else budget_of(argument)
         if budget is None:
             raise InvalidInput(
-                f"agent 'planner:{argument}': the text after the colon must be a number of candidates per decision from"
-                f" 1 to {MOST_CANDIDATES:,}, for instance planner:{CANDIDATES}"
+                f"agent 'planner:{argument}': after the colon, give the number of profiles to try at each decision,"
+                f" from 1 to {MOST_CANDIDATES:,}, for instance planner:{CANDIDATES}"
             )
         self.name = "planner" if argument is None else f"planner:{argument}"
         self._candidates = budget if most_candidates is None else min(budget, most_candidates)

@@ -46,7 +46,7 @@ def minimising(problem: ProfileProblem, worlds: Worlds, declared: Declared, vehi
     weights, largest = aims[0]
     if any(also != largest or not np.array_equal(other, weights) for other, also in aims[1:]):
         raise InvalidInput(
-            f"objective {declared!r}: the {len(vehicles)} controlled vehicles minimise different amounts, but a search"
+            f"objective {declared!r}: the {len(vehicles)} controlled vehicles have different objectives, but a search"
             " can minimise only one; give all of them the same objective, for instance weighted:1,4,1"
         )
     return problem.minimising(weights, largest=largest)

@@ -86,8 +86,8 @@ class BestHarm:
         budget = PROFILE_BUDGET if argument is None else budget_of(argument)
         if budget is None:
             raise InvalidInput(
-                f"agent 'best_harm:{argument}': the text after the colon must be a number of candidates from 1 to"
-                f" {MOST_CANDIDATES:,}, for instance best_harm:{PROFILE_BUDGET}"
+                f"agent 'best_harm:{argument}': after the colon, give the number of profiles to try in each world,"
+                f" from 1 to {MOST_CANDIDATES:,}, for instance best_harm:{PROFILE_BUDGET}"
             )
         return cls(
             recall, scenario=settings.scenario, harm_count=settings.harm_count, horizon_s=settings.horizon_s,

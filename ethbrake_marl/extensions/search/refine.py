@@ -71,8 +71,8 @@ def refine(problem: ProfileProblem, commands_mps2: Floats, *, budget: int, seed:
     low, high = problem.bounds[:, :1, 0], problem.bounds[:, :1, 1]
     if len(problem.vehicles) != 1 or commands_mps2.shape != (n, steps):
         raise InvalidInput(
-            f"refine: {count_of(len(problem.vehicles), 'controlled vehicle')}, and commands of shape"
-            f" {commands_mps2.shape}: give one controlled vehicle and commands of shape ({n}, {steps})"
+            f"refine: the problem has {count_of(len(problem.vehicles), 'controlled vehicle')}, and the commands have"
+            f" the shape {commands_mps2.shape}; give one controlled vehicle and commands of shape ({n}, {steps})"
         )
     if not ((commands_mps2 >= low) & (commands_mps2 <= high)).all():
         raise InvalidInput(

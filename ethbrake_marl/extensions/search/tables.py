@@ -169,7 +169,9 @@ class BestHarmTable:
                 f"harm_count = {harm_count!r}: the table contains only the harm counts {', '.join(self.best)}"
             )
         if harm.shape != identity.shape:
-            raise InvalidInput(f"harm has the shape {harm.shape}; give one harm for each of {identity.shape} worlds")
+            raise InvalidInput(
+                f"harm has the shape {harm.shape}; give one number for each world, shape {identity.shape}"
+            )
         rows = self.rows(identity)
         old = self.best[harm_count]
         better = (rows >= 0) & (harm < old.harm[rows] - TOLERANCE)
@@ -258,13 +260,14 @@ def _read_best(arrays: Mapping[str, NDArray[Any]], harm_count: HarmCount) -> Bes
         raise ValueError(f"{harm_count}_commands: a command must be a finite number")
     if used.sum() != len(flat):
         raise ValueError(
-            f"{harm_count}_phases: the worlds have {used.sum()} phases in all, but the file has {len(flat)} commands"
+            f"{harm_count}_phases: the profiles of all worlds have {used.sum()} phases (intervals of constant command),"
+            f" but the file has {len(flat)} commands; it must have one for each phase"
         )
     width, controlled = max(int(used.max()), 1), flat.shape[1]
     if not 1 <= controlled <= 64 or len(used) * width * (controlled + 1) > DECODED_LIMIT:
         raise ValueError(
-            f"{len(used)} worlds with {width} phases of {controlled} vehicles: a table may have at most 64 vehicles"
-            f" and {DECODED_LIMIT:,} numbers"
+            f"the table has {controlled} vehicles and up to {width} phases for each of {len(used)} worlds; at most 64"
+            f" vehicles, and {DECODED_LIMIT:,} numbers (worlds x phases x (vehicles + 1)), are allowed"
         )
     inside = np.arange(width) < used[:, np.newaxis]
     ends, commands = np.zeros(inside.shape, np.int64), np.zeros((*inside.shape, controlled))
@@ -276,7 +279,8 @@ def _read_best(arrays: Mapping[str, NDArray[Any]], harm_count: HarmCount) -> Bes
     commands = np.where(inside[..., np.newaxis], commands, commands[rows, last][:, np.newaxis])
     if not ((np.diff(ends, axis=1) >= 0).all() and ((ends[:, -1] > 0) == (used > 0)).all()):
         raise ValueError(
-            f"{harm_count}_ends: the ends of a world's phases must not fall, and the last one must be above 0"
+            f"{harm_count}_ends: the end times of a world's phases must not decrease, and the last end time must be"
+            " above 0"
         )
     return BestKnown(harm, Profiles(ends, commands))
 

@@ -33,7 +33,8 @@ def best_templates(problem: ProfileProblem, bound: Floats, *, number: int, seed:
     check_whole_number("templates", number, 1)
     if len(problem.vehicles) != 1:
         raise InvalidInput(
-            f"templates: {len(problem.vehicles)} controlled vehicles; give a problem with one controlled vehicle"
+            f"templates: the problem has {len(problem.vehicles)} controlled vehicles; give a problem with one"
+            " controlled vehicle"
         )
     commands = np.zeros((problem.n, int(problem.last_step.max(initial=0))))
     steps = np.zeros(problem.n, np.int64)

@@ -24,13 +24,14 @@ MOST_WORKERS = 4096
 FolderOption = Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for all results.")]
 
 RetriesOption = Annotated[
-    int, typer.Option(help="Number of further attempts if the process of a training is lost.", min=0, max=100)
+    int, typer.Option(help="Number of further attempts if the process of a training run dies.", min=0, max=100)
 ]
 
-DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Print the trainings without starting them.")]
+DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Print the planned training runs, and start none.")]
 
 ClusterOption = Annotated[
-    str, typer.Option(metavar="local|ADDRESS", help="local: start Ray on this machine; ADDRESS: use a running cluster.")
+    str,
+    typer.Option(metavar="local|ADDRESS", help="local: start Ray on this machine; ADDRESS: use a running Ray cluster."),
 ]
 
 study_group = typer.Typer(
@@ -43,7 +44,9 @@ study_group = typer.Typer(
 
 @study_group.command("sweep", epilog=example("study sweep sweep.yaml --output runs/sweep"))
 def sweep_command(
-    file: Annotated[Path, typer.Argument(metavar="SWEEP.yaml", help="File with a grid of jobs or a list of jobs.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="SWEEP.yaml", help="File that lists the jobs (training runs), or a grid of them.")
+    ],
     output: FolderOption,
     jobs: Annotated[
         int | None,
@@ -91,18 +94,17 @@ def sweep_command(
 def tune_command(
     file: Annotated[
         Path,
-        typer.Argument(
-            metavar="TUNING.yaml", help="File that describes a training and the range of each setting to search."
-        ),
+        typer.Argument(metavar="TUNING.yaml", help="File that describes a training run and the settings to search."),
     ],
     output: FolderOption,
     trials: Annotated[
-        int, typer.Option(help="Number of trials in the folder at the end, earlier trials included.", min=1, max=10_000)
+        int,
+        typer.Option(help="Total number of trials in the folder, trials of earlier runs included.", min=1, max=10_000),
     ] = 30,
     jobs: Annotated[
         int,
         typer.Option(
-            help="Number of trials that run at once, one process each. This number affects which values are tried.",
+            help="Number of trials that run at once, one process each. Another number leads to other tried values.",
             min=1,
             max=MOST_WORKERS,
         ),
@@ -110,7 +112,8 @@ def tune_command(
     ray: ClusterOption = "local",
     retries: RetriesOption = 2,
     export: Annotated[
-        Path | None, typer.Option(metavar="NAME.yaml", help="File for a recipe with the settings of the best trial.")
+        Path | None,
+        typer.Option(metavar="NAME.yaml", help="File to write: a recipe with the settings of the best trial."),
     ] = None,
     dry_run: DryRunOption = False,
     schema: schema_option("ethbrake_marl.extensions.studies.tuning", "TuningPlan", "tuning") = False,  # type: ignore[valid-type]  # made here
@@ -202,7 +205,7 @@ def falsify_command(
         str | None,
         typer.Option(
             metavar="harm|regret|difference|bound",
-            help="Measure of a world that the search makes as large as possible.",
+            help="Measure of how bad a world is; the search maximises it.",
             show_default="regret",
         ),
     ] = None,
@@ -216,7 +219,9 @@ def falsify_command(
     ] = None,
     scenario: Annotated[
         str | None,
-        typer.Option(metavar="NAME|PATH", help="Scenario whose worlds are searched.", show_default="paper-random"),
+        typer.Option(
+            metavar="NAME|PATH", help="Scenario in which the command searches for worlds.", show_default="paper-random"
+        ),
     ] = None,
     budget: Annotated[int | None, typer.Option(help="Number of worlds to try.", min=1, show_default="4000")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the search.", min=0, show_default="0")] = None,
@@ -225,11 +230,11 @@ def falsify_command(
     ] = None,
     settings: SettingsOption = None,
     output: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.yaml", help="File for the worlds that were found, which --again can read."),
+        Path | None, typer.Option(metavar="FILE.yaml", help="File for the worst worlds; --again reads such a file.")
     ] = None,
     again: Annotated[
-        Path | None, typer.Option(metavar="FILE.yaml", help="Drive the worlds of this file again instead of searching.")
+        Path | None,
+        typer.Option(metavar="FILE.yaml", help="Do not search; drive the worlds of this file (from --output) again."),
     ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -256,7 +261,7 @@ def falsify_command(
             }  # fmt: skip
             for option in (name for name, value in asked.items() if value is not None):
                 raise InvalidInput(
-                    f"{option} cannot be combined with --again, whose file sets what is measured; leave"
+                    f"{option} cannot be combined with --again, because the file of --again sets this; leave"
                     f" {option} out (only --agent may be given)"
                 )
             _drive_again(out, again, agent)
@@ -351,8 +356,8 @@ def _drive_again(out: Out, file: Path, agent: str | None) -> None:
     for spec in (*([named.agent] if agent is None else []), *([named.against] if named.against else [])):
         if (code := parse_spec(spec).file) is not None:
             raise InvalidInput(
-                f"{file}: the file names an agent whose code is in {code[0]}. Such code is not run; give the agent"
-                " with --agent, or edit the key against in the file"
+                f"{file}: the file names the agent {spec!r}, whose code is in {code[0]}. Code that only a file names"
+                " is not run; replace the agent with --agent, or change the key 'against' in the file"
             )
     chosen = evaluation.load_runnable(named.scenario, training.read_settings(named.settings).scenario, drives="some")
     measured_by = Measure.of(named.measure, agent or named.agent, named.against, chosen, named.harm_count)

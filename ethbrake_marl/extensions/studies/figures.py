@@ -78,9 +78,11 @@ def evaluations_of(job: TrainingJob) -> list[dict[str, float]]:
             for row in rows
         ]
         if any(not {*_MEASURED} <= each.keys() or not all(map(math.isfinite, each.values())) for each in evaluations):
-            raise ValueError("a measure is missing or not finite")
+            raise ValueError("a value of an evaluation is missing or not finite")
     except (ValueError, LookupError, csv.Error) as error:
-        raise InvalidInput(f"{run.progress}: is damaged ({error}); delete the run's folder to train again") from None
+        raise InvalidInput(
+            f"{run.progress}: the file is damaged ({error}); delete the run's folder to train again"
+        ) from None
     return evaluations
 
 

@@ -62,8 +62,8 @@ class StudyFolder:
         if self._question is None:
             if self._record.is_file():
                 raise AlreadyExists(
-                    f"{self.path}: the folder is not for {self._kind}: it contains {self._record.name} of another"
-                    f" command; {self._advice}"
+                    f"{self.path}: the folder cannot be used for {self._kind}, because another command has written"
+                    f" {self._record.name} into it; {self._advice}"
                 )
             return False
         if not self._record.is_file():
@@ -80,7 +80,8 @@ class StudyFolder:
         other = _differences({key: stored[key] for key in stored if key not in self._more}, self._question)
         if other:
             raise InvalidInput(
-                f"{self.path}: contains {self._kind} with other settings ({'; '.join(other)}); {self._advice}"
+                f"{self.path}: the folder contains {self._kind} with other settings ({'; '.join(other)});"
+                f" {self._advice}"
             )
         return False
 

@@ -101,9 +101,8 @@ class NamedWorlds(FileModel):
         """
         if scenario_sha256(scenario) != self.scenario_sha256:
             raise InvalidInput(
-                f"{where}: the worlds were found in scenario {self.scenario!r}"
-                f"{''.join(f' with --set {each}' for each in self.settings)}, whose content differs from"
-                f" {scenario.name!r} now; use the scenario as it was, or search again (ethbrake study falsify)"
+                f"{where}: scenario {self.scenario!r}{''.join(f' with --set {each}' for each in self.settings)} has"
+                " changed since these worlds were found; restore the scenario, or search again (ethbrake study falsify)"
             )
         columns = self.worlds[0].state.keys()
         for k, world in enumerate(self.worlds):

@@ -24,7 +24,7 @@ Seed = Annotated[int, Field(ge=0, lt=2**32)]
 class StudyFile(FileModel):
     """Base class for the content of the YAML file of a sweep or tuning."""
 
-    title: str = Field(default="", description="a title of one line, which has no effect")
+    title: str = Field(default="", description="title of one line, for the reader; it has no effect")
     _document: Document = PrivateAttr(Document("the file", {}, {}))  # source document, for messages
 
     @classmethod

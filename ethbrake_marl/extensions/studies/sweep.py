@@ -57,7 +57,7 @@ _Values = Annotated[tuple[Any, ...], Field(strict=False, min_length=1)]
 def _check_keys(value: dict[str, Any]) -> dict[str, Any]:
     for key in value:
         if key in ("seed", "recipe.seed"):
-            raise ValueError("the seed must not be given under set; give it as the key seed, next to the key recipe")
+            raise ValueError("the seed must not stand under set; write the key seed next to the key recipe")
         if "=" in key:
             raise ValueError(f"{flow_text(key, 60)}: a key must not contain the character =; write KEY: VALUE")
     return value
@@ -88,7 +88,7 @@ def _place(path: YamlPath) -> str:
 class SeedRange(FileModel):
     """Seeds of the trainings as a range of ``count`` whole numbers: ``first``, ``first`` + 1, and so on."""
 
-    first: Seed = Field(default=0, description="the smallest seed")
+    first: Seed = Field(default=0, description="smallest seed")
     count: int = Field(ge=1, le=MOST_JOBS, description="number of seeds")
 
 
@@ -103,11 +103,13 @@ class Grid(FileModel):
     """Grid of trainings: one training for every combination of the listed scenarios, recipes, settings and seeds."""
 
     settings: Annotated[dict[str, _Values], AfterValidator(_check_keys)] = Field(
-        default={}, alias="set", description="a list of values for each dotted key"
+        default={},
+        alias="set",
+        description="for each key, written with dots as in ethbrake train --set, a list of values",
     )
-    scenario: _Names = Field(description="names or paths of scenarios, as for train --scenario")
-    recipe: _Names = Field(description="names or paths of recipes, as for train --recipe")
-    seed: _Seeds = Field(default=(0,), description="seeds of the trainings: a number, a list, or a range")
+    scenario: _Names = Field(description="names or paths of scenarios, as in ethbrake train --scenario")
+    recipe: _Names = Field(description="names or paths of recipes, as in ethbrake train --recipe")
+    seed: _Seeds = Field(default=(0,), description="seeds of the training runs: a number, a list, or a range")
 
     @field_validator("scenario", "recipe", "seed", mode="before")
     @classmethod
@@ -125,19 +127,21 @@ class Grid(FileModel):
 class ListedJob(FileModel):
     """One training of the list ``jobs``: a scenario, a recipe, settings and a seed."""
 
-    settings: _Settings = Field(default={}, alias="set", description="settings by dotted key, as for train --set")
-    scenario: str = Field(description="name or path of the scenario, as for train --scenario")
-    recipe: str = Field(description="name or path of the recipe, as for train --recipe")
-    seed: Seed = Field(default=0, description="seed of the training")
+    settings: _Settings = Field(default={}, alias="set", description="settings of this job, as in ethbrake train --set")
+    scenario: str = Field(description="name or path of the scenario, as in ethbrake train --scenario")
+    recipe: str = Field(description="name or path of the recipe, as in ethbrake train --recipe")
+    seed: Seed = Field(default=0, description="seed of the training run")
 
 
 class SweepFile(StudyFile):
     """Content of the YAML file of a sweep: trainings as a grid of combinations, as a list of single jobs, or both."""
 
-    settings: _Settings = Field(default={}, alias="set", description="settings of every job, as for train --set")
-    grid: Grid | None = Field(default=None, description="one training for every combination of the listed values")
+    settings: _Settings = Field(
+        default={}, alias="set", description="settings of every job, as in ethbrake train --set"
+    )
+    grid: Grid | None = Field(default=None, description="one job (training run) for every combination of these values")
     jobs: tuple[ListedJob, ...] = Field(
-        default=(), strict=False, description="single trainings in addition to the grid"
+        default=(), strict=False, description="single jobs (training runs), in addition to the grid"
     )
 
     def size(self) -> int:
@@ -181,7 +185,8 @@ class SweepFile(StudyFile):
             where = self._document.where((*path, "set", twice[0]))
             key = f"{_place(path)}.set.{twice[0]}"
             raise InvalidInput(
-                f"{where}: {key}: the key {twice[0]} is also in the top-level set of the file; delete it in one place"
+                f"{where}: {key}: the file sets {twice[0]} twice: here, and for all jobs at the top of the file;"
+                " delete one of the two"
             )
         return texts_of({**self.settings, **own})
 
@@ -260,7 +265,8 @@ class SweepPlan:
             identity = Training.identity_of(content)
             if identity in seen:
                 raise InvalidInput(
-                    f"{file.where(asked)}: {asked}: is the same training as {seen[identity]}; delete one of the jobs"
+                    f"{file.where(asked)}: {asked}: this job trains the same policy as {seen[identity]}; delete one"
+                    " of the two"
                 )
             seen[identity] = asked
             name = f"{first.scenario.name}-{first.recipe.name}-seed{asked.seed}-{identity[:16]}"

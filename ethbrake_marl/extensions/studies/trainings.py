@@ -71,7 +71,7 @@ class TrainingJob:
         if not run.status.exists():
             if self.folder.exists():
                 raise InvalidInput(
-                    f"{self.folder}: the folder is not that of a training; move the folder, or give another --output"
+                    f"{self.folder}: the folder was not written by a training run; move it, or give another --output"
                 )
             return total
         try:

@@ -76,11 +76,11 @@ class Range(FileModel):
     If both ends are written without a decimal point, the search tries only whole numbers.
     """
 
-    low: _Number = Field(description="the smallest value")
+    low: _Number = Field(description="smallest value to try")
     high: _Number = Field(
-        description="the largest value; if low and high have no decimal point, only whole numbers are tried"
+        description="largest value to try; if low and high have no decimal point, only whole numbers are tried"
     )
-    log: bool = Field(default=False, description="whether values are spread evenly on a logarithmic scale")
+    log: bool = Field(default=False, description="true: values are spread evenly on a logarithmic scale")
 
     def __str__(self) -> str:
         """Return the range as text: ``from 0.001 to 0.1, logarithmic``."""
@@ -95,9 +95,9 @@ class Range(FileModel):
     @model_validator(mode="after")
     def _in_order(self) -> Range:
         if not self.low < self.high:
-            raise ValueError(f"low {flow_text(self.low)} must be less than high {flow_text(self.high)}")
+            raise ValueError(f"low ({flow_text(self.low)}) must be less than high ({flow_text(self.high)})")
         if self.log and not self.low > 0:
-            raise ValueError(f"low {flow_text(self.low)} must be greater than 0, because log is true")
+            raise ValueError(f"low ({flow_text(self.low)}) must be above 0, because log is true")
         return self
 
     @property
@@ -132,7 +132,7 @@ class Choices(FileModel):
     """List of the values that a search may try for one setting. The values may be numbers, texts, lists or mappings."""
 
     choices: tuple[Any, ...] = Field(
-        strict=False, min_length=2, description="values of any kind that the recipe accepts for this key"
+        strict=False, min_length=2, description="values to try, of any kind that the recipe accepts for this key"
     )
 
     def __str__(self) -> str:
@@ -188,12 +188,14 @@ def _check_recipe_keys(value: dict[str, Any]) -> dict[str, Any]:
 class Measuring(FileModel):
     """How trials are evaluated: the worlds that the policies drive, and the number of evaluations per training."""
 
-    # Number of worlds in the list.
-    worlds: int = Field(default=1000, ge=1, le=1_000_000, description="number of worlds in the list")
+    # Number of worlds in which the policies are evaluated.
+    worlds: int = Field(
+        default=1000, ge=1, le=1_000_000, description="number of worlds in which the policies are evaluated"
+    )
     # Seed from which the worlds are drawn.
     seed: Seed = Field(default=4007, description="seed from which the worlds are drawn")
-    # Number of evaluations during a training.
-    times: int = Field(default=10, ge=1, le=1000, description="number of evaluations during a training")
+    # Number of evaluations during a training run.
+    times: int = Field(default=10, ge=1, le=1000, description="number of evaluations during a training run")
 
 
 class Pruning(FileModel):
@@ -208,7 +210,9 @@ class Pruning(FileModel):
         default=5, description="number of other trials that must have reached an evaluation before a trial is stopped"
     )
     # Number of evaluations that every trial completes, not counting the evaluation before the training.
-    after_times: _Count = Field(default=3, description="number of evaluations before which no trial is stopped")
+    after_times: _Count = Field(
+        default=3, description="number of evaluations that each trial completes before it may be stopped"
+    )
 
     def rule(self) -> TrialScheduler:
         """Return Ray Tune's scheduler that applies this rule."""
@@ -246,19 +250,22 @@ class Sampling(FileModel):
 class TuningFile(StudyFile):
     """Content of the YAML file of a tuning: a training, and the settings of its recipe that the search changes."""
 
-    scenario: str = Field(description="name or path of the scenario, as for train --scenario")
-    recipe: str = Field(description="name or path of the recipe, as for train --recipe")
-    seed: Seed = Field(default=0, description="seed of every training")
+    scenario: str = Field(description="name or path of the scenario, as in ethbrake train --scenario")
+    recipe: str = Field(description="name or path of the recipe, as in ethbrake train --recipe")
+    seed: Seed = Field(default=0, description="seed of every training run")
     settings: Annotated[dict[str, Any], AfterValidator(_check_recipe_keys)] = Field(
-        default={}, alias="set", description="settings of every trial, as for train --set"
+        default={}, alias="set", description="settings of every trial, as in ethbrake train --set"
     )
     search: Annotated[dict[str, Dimension], AfterValidator(_check_recipe_keys)] = Field(
-        min_length=1, description="searched keys: for each dotted key of the recipe, a range or a list of choices"
+        min_length=1,
+        description="keys of the recipe to search (for instance learning_rate.start), with a range or list of choices",
     )
     measure: Measuring = Field(
-        default=Measuring(), description="list of worlds for the evaluations, and number of evaluations"
+        default=Measuring(), description="how trials are evaluated: worlds, and number of evaluations"
     )
-    prune: Pruning | None = Field(default=Pruning(), description="rule that stops weak trials early; null: no rule")
+    prune: Pruning | None = Field(
+        default=Pruning(), description="rule that stops weak trials early; null: no trial is stopped"
+    )
     sampler: Sampling = Field(default=Sampling(), description="method that chooses the values of the next trial")
 
     def values(self, proposal: Mapping[str, Any]) -> dict[str, Any]:
@@ -335,7 +342,8 @@ class TuningPlan:
             with at(("set", key)):
                 if key.removeprefix("recipe.").partition(".")[0] in ("seed", "evaluation"):
                     raise InvalidInput(
-                        f"set.{key}: this key is not allowed under set; use the top-level keys seed and measure"
+                        f"set.{key}: this key is not allowed under set; at the top of the file, the keys seed and"
+                        " measure set the seed and the evaluation"
                     )
         asked = file.scenario, file.recipe, texts_of(file.settings)
         try:
@@ -417,7 +425,7 @@ class TuningPlan:
         try:
             self.training(values)
         except InvalidInput as error:
-            raise InvalidInput(f"search: the recipe rejects {', '.join(texts_of(values))}: {error}") from None
+            raise InvalidInput(f"search: {', '.join(texts_of(values))} is not possible: {error}") from None
 
     def folder(self, path: Path) -> StudyFolder:
         """Return the object that checks and locks the folder ``path``.
@@ -443,7 +451,7 @@ class TuningPlan:
                     raise ValueError
         except (TypeError, ValueError, AttributeError, LookupError):
             raise InvalidInput(
-                f"{file}: the file is damaged: a trial has keys or values that the tuning does not search; delete the"
+                f"{file}: the file is damaged: a trial has keys or values that are not in the search space; delete the"
                 " folder to start again"
             ) from None
         return [*known]
@@ -685,8 +693,8 @@ def _check_searched(key: str, recipe: TrainingRecipe, file: TuningFile) -> None:
             raise InvalidInput(f"search.{key}: the file also sets {other}; delete one of the two keys")
     if read_settings([f"{key}=0"], [recipe]).scenario:
         raise InvalidInput(
-            f"search.{key}: this is a key of the scenario; give a key of the recipe, because the harms of trials can be"
-            " compared only in the same scenario"
+            f"search.{key}: this is a key of the scenario, but only keys of the recipe can be searched, because harms"
+            " can be compared only in the same scenario"
         )
 
 

@@ -115,9 +115,9 @@ class Measure:
             worst = worst[tried.scores[worst] > 0.0]
         if not np.isfinite(tried.scores).any():
             raise InvalidInput(
-                f"scenario {self.scenario.name!r}: all {budget:,} tried worlds are invalid: in each world an impact"
-                " comes before any agent may act, or the physics fails; set early_impacts: keep in the scenario, or"
-                " give a larger --budget"
+                f"scenario {self.scenario.name!r}: all {budget:,} tried worlds are invalid: an impact happens before"
+                " any agent may act, or the simulation fails; write 'early_impacts: keep' into the scenario, or give a"
+                " larger --budget"
             )
         above = np.flatnonzero(tried.scores > 0.0)
         sample, shown_worlds = drawn.sample(tried.points[worst])[0], []
@@ -163,5 +163,7 @@ class Measure:
         specs = [agent] if name in ("harm", "bound") else [agent, against or HINDSIGHT]
         lineup = make_lineup(specs, scenario, harm_count=harm_count)
         if len(lineup) != len(specs):
-            raise InvalidInput(f"agent {' or '.join(specs)}: the name stands for several agents; name one agent")
+            raise InvalidInput(
+                f"agent {' or '.join(specs)}: this name means several agents; give the name of one agent"
+            )
         return cls(chosen, lineup, scenario, harm_count)

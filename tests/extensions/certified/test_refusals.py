@@ -41,8 +41,12 @@ UNCERTAINTIES: dict[str, Callable[[], object]] = {
     ),
     "uncertainty: 'latency_s=-0.1': must be quantity=half-width": lambda: parse_uncertainty("latency_s=-0.1"),
     "uncertainty: 'latency_s=nan': must be quantity=half-width": lambda: parse_uncertainty("latency_s=nan"),
-    "uncertainty: latency_s: half-width = inf: must be a finite number": lambda: parse_uncertainty("latency_s=1e999"),
-    "uncertainty: latency_s: half-width = 1.0: must be a share from 0": lambda: parse_uncertainty("latency_s=100%"),
+    "uncertainty: half-width of latency_s = inf: the half-width must be a finite number": lambda: parse_uncertainty(
+        "latency_s=1e999"
+    ),
+    "uncertainty: half-width of latency_s = 1.0: the half-width must be a share from 0": lambda: parse_uncertainty(
+        "latency_s=100%"
+    ),
     "uncertainty: 'latency_s.vehicle_0=0.1': must be quantity=half-width": lambda: parse_uncertainty(
         "latency_s.vehicle_0=0.1"
     ),
@@ -55,22 +59,26 @@ UNCERTAINTIES: dict[str, Callable[[], object]] = {
     "uncertainty: latency_s=0.1 and latency_s.vehicle_2=0.2 are intervals of the same quantity": lambda: (
         parse_uncertainty("latency_s=0.1,latency_s.vehicle_2=0.2")
     ),
-    "uncertainty: mass_t.vehicle_4=0.1: the line has only 3 vehicles": lambda: parse_uncertainty(
-        "mass_t.vehicle_4=0.1"
-    ).members(WORLD),
+    "uncertainty: mass_t.vehicle_4=0.1: there is no such vehicle, because the line has only 3": lambda: (
+        parse_uncertainty("mass_t.vehicle_4=0.1").members(WORLD)
+    ),
     "uncertainty: mass_t=1: the value 1 of vehicle_1 in world 0 may be as low as 0; must be above 0": lambda: (
         parse_uncertainty("mass_t=1").members(WORLD)
     ),
     "=1e+308: the value 10 of vehicle_1 to vehicle_2 in world 0 may be as high as 1e+308; must be finite": lambda: (
         parse_uncertainty("gaps_m=1e308").members(WORLD)
     ),
-    "11 uncertain numbers in each world make 2048 corners; must be at most 1024 corners: limit": lambda: (
+    "11 intervals in each world make 2048 combinations of values (corners), but at most 1024 are": lambda: (
         parse_uncertainty("latency_s=0.1,mass_t=0.1,speeds_mps=1,gaps_m=1").members(WORLD)
     ),
     "uncertainty: no interval; must have at least one": lambda: Uncertainty(()),
     "must be a tuple of Interval objects": lambda: Uncertainty("gaps_m=0.5"),
-    "uncertainty: latency_s: half-width = -1.0: must be a finite number": lambda: Interval("latency_s", -1.0),
-    "uncertainty: gaps_m: half-width = True: must be a finite number": lambda: Interval("gaps_m", True),
+    "uncertainty: half-width of latency_s = -1.0: the half-width must be a finite number": lambda: Interval(
+        "latency_s", -1.0
+    ),
+    "uncertainty: half-width of gaps_m = True: the half-width must be a finite number": lambda: Interval(
+        "gaps_m", True
+    ),
     "uncertainty: gaps_m: place = 0.5: must be an index of a vehicle or pair": lambda: Interval(
         "gaps_m", 0.5, place=0.5
     ),
@@ -86,14 +94,14 @@ def test_uncertainty__is_refused(message: str) -> None:
 
 
 SHIELDS: dict[str, Callable[[], object]] = {
-    "mode robust needs an uncertainty, for instance braking_capacity_mps2=5%": lambda: make_agent(
+    "mode robust needs a value of uncertainty, for instance braking_capacity_mps2=5%": lambda: make_agent(
         "full_brake+robust", scenario=PAIR
     ),
     "agent 'coast+step:estimated+robust': may have at most one search (+search), then at most one shield": lambda: (
         make_agent("coast+step:estimated+robust", scenario=PERIODIC)
     ),
-    "agent 'e_v2x_bm:estimated+episode:estimated': e_v2x_bm:estimated already decides on received": lambda: make_agent(
-        "e_v2x_bm:estimated+episode:estimated", scenario=PERIODIC
+    "agent 'e_v2x_bm:estimated+episode:estimated': e_v2x_bm:estimated already decides only on received": lambda: (
+        make_agent("e_v2x_bm:estimated+episode:estimated", scenario=PERIODIC)
     ),
     "shield: robust interior: total harm: cannot be certified; use robust corners": lambda: make_agent(
         "coast+robust:interior:estimated", scenario=PERIODIC, harm_count="total"
@@ -104,7 +112,7 @@ SHIELDS: dict[str, Callable[[], object]] = {
     "shield: robust interior: 5 vehicles: cannot be certified; use robust corners, or first-impact harm of": lambda: (
         RobustShield(line(5), 2, uncertainty=parse_uncertainty("gaps_m=0.1"), robust="interior")
     ),
-    "shield: mode step does not use an uncertainty; use mode robust": lambda: ShieldOptions(
+    "shield: mode step does not use uncertainty; use mode robust": lambda: ShieldOptions(
         mode="step", uncertainty="gaps_m=1"
     ),
     "shield: robust = 'interior': not a setting of mode step; use mode robust": lambda: ShieldOptions(
@@ -128,10 +136,10 @@ SHIELDS: dict[str, Callable[[], object]] = {
         estimated=True, mode="robust", uncertainty="gaps_m=0.5"
     ),
     "shield: estimated = 'yes': must be True or False": lambda: ShieldOptions(estimated="yes"),
-    "ShieldedEnv: mode robust needs an uncertainty, for instance braking_capacity_mps2=5%": lambda: ShieldedEnv(
+    "ShieldedEnv: mode robust needs a value of uncertainty, for instance braking_capacity_mps2=5%": lambda: ShieldedEnv(
         EthBrakeEnv(), mode="robust"
     ),
-    "HybridShield: estimated = True: shields only one learner; pass one": lambda: HybridShield(
+    "HybridShield: estimated = True: the shield can control only one learner": lambda: HybridShield(
         parallel_env(PAIR), mode="step", estimated=True
     ),
 }
@@ -170,14 +178,14 @@ def test_name__is_unknown(message: str) -> None:
 
 def test_mixture__estimated_agents_need_one_of_its_scenarios() -> None:
     members = [{"scenario": load_scenario(name).declared()} for name in ("paper-random", "paper-random-brake-only")]
-    with refused("is a mixture: an unknown vehicle could belong to any of paper-random, paper-random-brake-only"):
+    with refused("is a mixture of scenarios, but estimated agents and shields need the ranges of one scenario"):
         ShieldedEnv(EthBrakeEnv(Scenario(name="mixed", mixture=members)), estimated=True)
 
 
 def test_estimated_worlds__that_leave_too_much_open_are_refused() -> None:
     wide = {"braking_capacity_mps2": {"uniform": [3, 9]}, "mass_t": {"uniform": [2, 9]}, "driving_capacity_mps2": 3.0}
     wide = PAPER.replace(vehicles=4, latency_s=0.1, v2x="nominal", roles={"vehicle_2": "learner"}, **wide)
-    with refused("has 14 uncertain numbers of other vehicles, which make 16384 corners; must be at most 1024 corners"):
+    with refused("make 16384 combinations (corners), but at most 1024 are allowed"):
         make_agent("coast+robust:estimated", scenario=wide)
 
 
@@ -193,14 +201,16 @@ def test_interior__takes_no_brakes_that_began_to_build_up_before() -> None:
     slow = PAPER.replace(brake_rate_mps3=9)
     braking = replace(slow.sample(1, 3).worlds, command_mps2=np.full((1, 3), -1.0))
     shield = RobustShield(slow, 1, uncertainty=parse_uncertainty("gaps_m=0.1"), robust="interior")
-    with refused("shield: robust interior: brakes that began to build up before the alert"):
+    with refused("shield: robust interior: a vehicle whose brakes began to build up before the alert"):
         shield.begin(braking, np.arange(1))
 
 
 def test_interior__takes_no_script_that_it_cannot_enclose() -> None:
     roles = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "e_v2x_bm:pairwise"}
     gentle = PAPER.replace(early_impacts="keep", roles=roles)
-    with refused("vehicle_3 follows 'e_v2x_bm:pairwise'; must be full_brake, coast or constant:A"):
+    with refused(
+        "vehicle_3 follows the script 'e_v2x_bm:pairwise'; the script must be full_brake, coast or constant:A"
+    ):
         RobustShield(gentle, 1, uncertainty=parse_uncertainty("gaps_m.pair_1=0.1"), robust="interior")
 
 
@@ -223,11 +233,11 @@ def test_uncertainty__is_for_an_agent_that_certifies_against_it() -> None:
 SLOW = PAPER.replace(brake_rate_mps3=9)
 PIECES = PAPER.replace(roles={"vehicle_1": "profile:0=3,1=5", "vehicle_2": "learner"})
 AGENTS: dict[str, Callable[[], object]] = {
-    "agent 'ppo+robust': mode robust needs an uncertainty": lambda: make_agent("ppo+robust", scenario=PAPER),
+    "agent 'ppo+robust': mode robust needs a value of uncertainty": lambda: make_agent("ppo+robust", scenario=PAPER),
     "agent 'e_v2x_bm:estimated': needs a scenario, for instance make_agent('e_v2x_bm:estimated'": lambda: make_agent(
         "e_v2x_bm:estimated"
     ),
-    "scenario 'mixture-delays' is a mixture: an unknown vehicle could belong to any": lambda: make_agent(
+    "scenario 'mixture-delays' is a mixture of scenarios": lambda: make_agent(
         "e_v2x_bm:estimated", scenario=eb.load_scenario("mixture-delays")
     ),
     ":estimated: in world 0 brakes build up at a finite rate, for which the result would not be exact; leave": lambda: (
@@ -236,8 +246,8 @@ AGENTS: dict[str, Callable[[], object]] = {
     ":estimated: a vehicle of world 0 follows a braking profile, for which the result would not be exact;": lambda: (
         evaluated(make_agent("full_brake+step:estimated", scenario=PIECES), PIECES)
     ),
-    "shield: robust interior: vehicle_1 follows 'profile:0=3,1=5'; must be full_brake": lambda: evaluated(
-        make_agent("full_brake+robust:interior", scenario=PIECES, uncertainty="latency_s=0.1"), PIECES
+    "shield: robust interior: vehicle_1 follows the script 'profile:0=3,1=5'; the script must be full_brake": lambda: (
+        evaluated(make_agent("full_brake+robust:interior", scenario=PIECES, uncertainty="latency_s=0.1"), PIECES)
     ),
 }
 
@@ -261,5 +271,5 @@ def test_team__goes_behind_no_robust_shield(monkeypatch) -> None:
 
 
 def test_evaluation__of_a_robust_shield_needs_an_uncertainty(refuse: Refuse) -> None:
-    told = "agent 'ppo+robust': mode robust needs an uncertainty"
+    told = "agent 'ppo+robust': mode robust needs a value of uncertainty"
     refuse("evaluate --agents ppo+robust", told)

@@ -214,12 +214,12 @@ def test_robust_shield__decisions_have_the_committed_bits() -> None:
 
 
 FRICTION: dict[str, Callable[[], object]] = {
-    "uncertainty: friction is one number for the whole line; give it without a vehicle": lambda: parse_uncertainty(
+    "uncertainty: friction is one number for the whole line; write friction=..., not": lambda: parse_uncertainty(
         "friction.vehicle_2=0.1"
     ),
-    "uncertainty: friction=0.1: friction is not known in every world; declare it in the scenario": lambda: (
-        parse_uncertainty("friction=0.1").members(FIXED.sample(1, 7).worlds)
-    ),
+    "uncertainty: friction=0.1: some worlds have no value of friction; declare friction in": lambda: parse_uncertainty(
+        "friction=0.1"
+    ).members(FIXED.sample(1, 7).worlds),
     "uncertainty: friction=1: the value 0.6 in world 0 may be as low as -0.4; must be above 0": lambda: (
         parse_uncertainty("friction=1").members(FIXED.replace(friction=0.6).sample(1, 7).worlds)
     ),

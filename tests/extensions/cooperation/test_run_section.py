@@ -151,11 +151,11 @@ def test_interrupted__further_training_ends_the_comparison_and_not_the_report(tm
             pressed.append(progress)
             os.kill(os.getpid(), signal.SIGINT)
 
-    assert run(tmp_path / "run", SCENARIO, on_progress=press).interrupted == "the training alone/vehicle_3"
+    assert run(tmp_path / "run", SCENARIO, on_progress=press).interrupted == "the training run in alone/vehicle_3"
     status = json.loads((tmp_path / "run" / "run.json").read_text())
-    assert (status["status"], status["reason"]) == ("finished", "interrupted: the training alone/vehicle_3")
+    assert (status["status"], status["reason"]) == ("finished", "interrupted: the training run in alone/vehicle_3")
     told = json.loads((tmp_path / "run" / "cooperation.json").read_text())["note"]
-    assert told == "The training alone/vehicle_3 was interrupted: nothing more was compared."
+    assert told == "The training run in alone/vehicle_3 was interrupted: nothing more was compared."
     assert told in (tmp_path / "run" / "report.html").read_text()
 
 

@@ -39,7 +39,7 @@ def test_parse__ranges_and_lists_in_ascending_order(text: str, settings: list[st
 
 
 MUST = "must be KEY=LOW..HIGH:STEP or KEY=A,B,... with numbers, for instance objective=social:0..90:15"
-RANGE = "must go up from LOW to HIGH in at most 99 whole steps, for instance 0..90:15"
+RANGE = "must go up from LOW to HIGH in 1 to 99 equal steps, for instance 0..90:15"
 REFUSED = {
     "friction": MUST,
     "=1,2": MUST,
@@ -47,7 +47,7 @@ REFUSED = {
     "gaps_m='{uniform: [5, 10]}'": MUST,
     "friction=0.5,nan": MUST,
     "friction=0.5,,0.6": MUST,
-    "objective=social:0..100:15": f"--sweep objective: range social:0..100:15: {RANGE}",
+    "objective=social:0..100:15": f"--sweep objective: range social:0..100:15: a range LOW..HIGH:STEP {RANGE}",
     "friction=1..0.5:0.1": RANGE,
     "friction=0.5..1:0": RANGE,
     "friction=0.5..1:-0.1": RANGE,
@@ -58,9 +58,9 @@ REFUSED = {
     "objective=social:0..120:30": "objective 'social:120': social needs an angle from 0 to 90 degrees",
     "mass_t.2=-1,2": "mass_t[2] (vehicle_3) = -1: must be finite and in (0, 1000] t",
     "frictoin=0.5,0.6": "unknown setting 'frictoin'; did you mean 'friction'?",
-    "averaging=0.9,0.99": "--sweep averaging: the key belongs to a recipe, but must be a key of a scenario",
-    "vehicles=2,3": "--sweep vehicles: levels with different vehicles cannot be compared; run one ablation",
-    "horizon_s=4,8": "run one ablation for each value of horizon_s (--set horizon_s=..., --output)",
+    "averaging=0.9,0.99": "--sweep averaging: this is a key of a recipe, but only a key of a scenario can be swept",
+    "vehicles=2,3": "--sweep vehicles: levels with different values of vehicles cannot be compared; for each value",
+    "horizon_s=4,8": "for each value of horizon_s, run the command once, with --set horizon_s=... and an --output",
     "friction=0.5,0.6 --sweep v2x.lost=0,0.1": "--sweep is given twice; give it once, because",
     "friction=0.5,0.6 --set friction=1": "--sweep friction: --set changes the same key",
     "friction=0.5,0.6 --levels cooperation-3-pair,cooperation-4-all": "levels: 2 levels given; a sweep needs",

@@ -126,9 +126,9 @@ def test_agent__that_is_made_for_another_time_step_is_refused() -> None:
 
 
 REFUSED: dict[str, Callable[[], object]] = {
-    "agent 'idm:a=0': a must be a number above 0, for instance a=1.4": lambda: make_agent("idm:a=0"),
+    "agent 'idm:a=0': a must be a finite number above 0, for instance a=1.4": lambda: make_agent("idm:a=0"),
     "agent 'idm:T=1:T=2': parameter T is given twice": lambda: make_agent("idm:T=1:T=2"),
-    "agent 'acc:T': T must be a number 0 or more, for instance T=1.1": lambda: make_agent("acc:T"),
+    "agent 'acc:T': T must be a finite number of 0 or more, for instance T=1.1": lambda: make_agent("acc:T"),
     "agent 'r157_fsm:b_min=7': b_min = 7: must be at most b_max, which is 6": lambda: make_agent("r157_fsm:b_min=7"),
     "unknown agent 'idm:t=1': parameter 't'": lambda: make_agent("idm:t=1"),
     "vehicle_3 is driven by 'idm', whose command is not fixed at the alert": lambda: make_agent("e_v2x_bm").begin(

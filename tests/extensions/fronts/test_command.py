@@ -38,7 +38,7 @@ def test_front__of_given_weights_two_learners_and_total_harm(ethbrake: Command, 
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ("--weights 1,1", ("weights[0] = 1,1", "give 3 numbers", "1,4,1")),
+        ("--weights 1,1", ("weights[0] = 1,1", "one number for each of the 3 vehicles", "1,4,1")),
         ("--weights 1,-1,1", ("weights[0] = 1,-1,1", "each 0 or from 1e-6")),
         ("--weights 0,0,0", ("not all 0",)),
         ("--weights 1,x,1", ("'1,x,1'", "numbers separated by commas")),

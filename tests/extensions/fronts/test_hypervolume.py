@@ -44,5 +44,5 @@ def test_volume__of_many_vehicles_is_refused() -> None:
     ("points", "reference"), [([[np.nan, 0.0]], [1.0, 1.0]), ([[0.0, 0.0]], [np.inf, 1.0]), ([[0.0]], [1.0, 1.0])]
 )
 def test_volume__of_what_is_not_finite_or_fits_not_is_refused(points: list, reference: list) -> None:
-    with pytest.raises(InvalidInput, match="these must be finite numbers of the shapes"):
+    with pytest.raises(InvalidInput, match="points must be finite numbers"):
         hypervolume(np.array(points), np.array(reference))

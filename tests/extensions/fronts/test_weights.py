@@ -35,7 +35,9 @@ def test_corners__put_one_vehicle_first() -> None:
     ],
 )
 def test_weights__that_are_none_are_refused_by_row(row: list[float]) -> None:
-    with pytest.raises(InvalidInput, match=r"weights\[1\] = .*: give 3 numbers, one for each vehicle, each 0 or from"):
+    with pytest.raises(
+        InvalidInput, match=r"weights\[1\] = .*: give one number for each of the 3 vehicles, each 0 or from"
+    ):
         checked_weights([[1.0, 0.0, 0.0], row], 3)
 
 

@@ -510,7 +510,7 @@ def test_host__that_does_not_fit_is_refused_before_anything_moves(host, message)
     ("scenario", "agent", "message"),
     [
         ("paper-random", "full_brake", "host: 'str' is not an agent, because it has no name and no act; to make"),
-        ("paper-random-obstacle", None, "host: scenario 'paper-random-obstacle': has an obstacle ahead (obstacle_gap"),
+        ("paper-random-obstacle", None, "host: scenario 'paper-random-obstacle' has an obstacle ahead (obstacle_gap"),
         (
             "paper-random-buildup",
             None,

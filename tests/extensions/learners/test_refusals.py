@@ -27,10 +27,12 @@ def experts(**changes: Any) -> Any:
 
 def test_observation_and_network__hold_those_of_the_policy_to_start_from() -> None:
     turned = load_recipe("vine").replace(observation=["own", "front_1", "contact"])
-    with refused("observation lacks rear_1.known, rear_1.gap, rear_1.closing_speed, rear_1.acceleration"):
+    with refused("observation lacks the features rear_1.known, rear_1.gap, rear_1.closing_speed, rear_1.acceleration"):
         widened(eb.load_shipped("ppo"), Training.of(turned, PAPER))
     smaller = load_recipe("vine").replace(network={"policy": [64, 64]})
-    with refused("network.policy_hidden is (64, 64), but (128, 128) in the policy of the key start; change the recipe"):
+    with refused(
+        "network.policy_hidden is (64, 64), but must be (128, 128), as in the policy that the key start names"
+    ):
         widened(eb.load_shipped("ppo"), Training.of(smaller, PAPER))
 
 
@@ -38,7 +40,7 @@ def test_policy_to_start_from__has_one_network(empty_folder: Path) -> None:
     several = {"networks": 3, "gate_hidden": (6,), "value_hidden": ()}
     several = make_policy(eb.ObservationSpec(), {"name": "paper-random"}, "vine", **several)
     several.save(Path("first"))
-    with refused("recipe 'vine': start: the policy is a mixture of 3 networks"):
+    with refused("recipe 'vine': start: this policy is a mixture of 3 networks"):
         train(TINY_EXPERTS.replace(start="vine@first"), PAPER, Path("run"))
 
 
@@ -62,7 +64,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     "recipe 'vine': reward.shaping = 0.1: must be 0: this algorithm plays tried actions to the end": lambda: (
         TINY_VINE.replace(reward={"harm": 1.0, "shaping": 0.1})
     ),
-    "recipe 'vine': offset.largest = 0.1: must be at least as large as smallest, which is 0.3": lambda: (
+    "recipe 'vine': offset.largest = 0.1: must be at least the value of the key smallest, 0.3": lambda: (
         TINY_VINE.replace(offset={"smallest": 0.3, "largest": 0.1})
     ),
     "recipe 'vine': gradient_limit = often: must be 'auto' or a finite number above 0": lambda: TINY_VINE.replace(
@@ -79,14 +81,14 @@ REFUSED: dict[str, Callable[[], object]] = {
     "memory = 15: must be at least tried, which is 16": lambda: TINY_ROLLOUTS.replace(memory=15),
     "must contain a range, because the recipe has no fixed": lambda: TINY_ROLLOUTS.replace(near=[], fixed=[], drawn=0),
     "recipe 'vine': experts.networks = 1: must be greater than or equal to 2": lambda: experts(networks=1),
-    "the sum of the four shares is 1.5; it must be 1": lambda: experts(
+    "shares of all updates: they must sum to 1, but sum to 1.5": lambda: experts(
         shares={"pretraining_first": 0.5, "pretraining_others": 0.5, "gating": 0.5, "joint": 0.0}
     ),
     "recipe 'vine': experts.gatin: unknown key; did you mean gating?": lambda: experts(gatin=[8]),
     "runs/mine: is not a folder; give the folder of a policy bundle (manifest.json, weights.safetensors)": lambda: (
         train(load_recipe("vine").replace(start="ppo@runs/mine"), "cooperation-2-five", "run", steps=1)
     ),
-    "drawn = 2: must be at most the number of policies, 1": lambda: train(
+    "drawn = 2: drawn must be at most 1, the number of policies": lambda: train(
         load_recipe("rollout-classification").replace(policies=["ppo"]), "paper-random", "new"
     ),
     "'policy@shipped/ppo' is now written ppo": lambda: train(

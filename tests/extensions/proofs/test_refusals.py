@@ -33,8 +33,8 @@ def problem() -> ProfileProblem:
 
 
 PROOFS: dict[str, Callable[[], object]] = {
-    "avoidability: vehicle_1 of 3 vehicles is controlled; the controlled vehicle must be vehicle_2": lambda: (
-        avoidability(wide_worlds(2, 3, seed=1), 0)
+    "avoidability: vehicle_1 of 3 vehicles is controlled, but the proofs cover only vehicle_2": lambda: avoidability(
+        wide_worlds(2, 3, seed=1), 0
     ),
     "avoidability: vehicle = -1: must be a whole number in 0..2": lambda: avoidability(wide_worlds(2, 3, seed=1), -1),
     "avoidability: vehicle_3 follows the script 'coast'; must be 'full_brake'": lambda: avoidability(
@@ -47,16 +47,20 @@ PROOFS: dict[str, Callable[[], object]] = {
         replace(line([5], [9, 9], 5), speeds_mps=np.array([[9, np.nan]])), 1
     ),
     "harm_count = 'worst': must be 'first' or 'total'": lambda: lower_bound(THREE, harm_count="worst"),
-    "lower_bound: horizon_s = 0.2: must be finite and at least 0.5 s": lambda: lower_bound(THREE, horizon_s=0.2),
-    "lower_bound: horizon_s = inf: must be finite and at least 0.5": lambda: lower_bound(THREE, horizon_s=float("inf")),
-    "lower_bound: horizon_s = '8': must be a number of seconds": lambda: lower_bound(THREE, horizon_s="8"),
-    "lower_bound: time_step_s = 0.0: must be at least 0.001 seconds, or None": lambda: lower_bound(
+    "lower_bound: horizon_s = 0.2: the horizon must be finite and at least 0.5 s": lambda: lower_bound(
+        THREE, horizon_s=0.2
+    ),
+    "lower_bound: horizon_s = inf: the horizon must be finite and at least 0.5": lambda: lower_bound(
+        THREE, horizon_s=float("inf")
+    ),
+    "lower_bound: horizon_s = '8': the horizon must be a number of seconds": lambda: lower_bound(THREE, horizon_s="8"),
+    "lower_bound: time_step_s = 0.0: the time step must be at least 0.001 s, or None": lambda: lower_bound(
         THREE, time_step_s=0.0
     ),
-    "lower_bound: time_step_s = True: must be at least 0.001 seconds, or None": lambda: lower_bound(
+    "lower_bound: time_step_s = True: the time step must be at least 0.001 s, or None": lambda: lower_bound(
         THREE, time_step_s=True
     ),
-    "lower_bound: time_step_s = nan: must be at least 0.001 seconds, or None": lambda: lower_bound(
+    "lower_bound: time_step_s = nan: the time step must be at least 0.001 s, or None": lambda: lower_bound(
         THREE, time_step_s=float("nan")
     ),
     "team_bound: vehicles = (): must have at least one vehicle and no vehicle twice": lambda: team_bound(TEAM, ()),
@@ -93,7 +97,7 @@ SEARCHES: dict[str, Callable[[], object]] = {
     "vehicles = (): must be one or more vehicle indices from 0 to 2": lambda: best_harm(PAPER, WORLDS, vehicles=()),
     "budget = 0: must be a whole number, at least 1": lambda: best_harm(PAPER, WORLDS, budget=0),
     "threads = 0: must be a whole number, at least 1": lambda: best_harm(PAPER, WORLDS, budget=10, threads=0),
-    "counts = (): the counts must be first, total, or both": lambda: best_harm(PAPER, WORLDS, budget=10, counts=()),
+    "counts = (): counts must contain 'first', 'total' or both": lambda: best_harm(PAPER, WORLDS, budget=10, counts=()),
     "profiles: command -7.1 m/s2 is beyond a vehicle's capacity": lambda: problem().follow(
         problem().constant(np.array([[[-7.1]]]))
     ),
@@ -125,7 +129,7 @@ def test_file__is_no_table(empty_folder: Path) -> None:
 
 def test_table__is_improved_by_a_harm_of_each_world() -> None:
     table = BestHarmTable.load(TABLES / "paper-random.npz")
-    with refused("harm has the shape (3,); give one harm for each of (2,) worlds"):
+    with refused("harm has the shape (3,); give one number for each world, shape (2,)"):
         table.improved(table.identity[:2], "first", np.zeros(3))
 
 

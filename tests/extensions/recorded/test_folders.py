@@ -55,7 +55,7 @@ def test_refused_files__are_all_listed_and_add_no_row(
     openacc(good(folder / "late"), COLUMNS, *late)
     made = scenario_from_data("mine", folder, "openacc")
     assert len(rows_of(made)) == 1 and made.found[-1] == "refused: 3 files"
-    wrong = "data/late/a.csv, line 11: vehicle 2 overlaps vehicle 1 ahead by 15.00 m; 9 of 54 vehicles have"
+    wrong = "data/late/a.csv, line 11: vehicle 2 overlaps vehicle 1 ahead by 15.00 m; 9 of 54 positions of vehicles"
     starts = [f"data/{name}.csv, line 3, column Speed1: 'fast' is not a number" for name in "bc"] + [wrong]
     assert [text.startswith(start) for text, start in zip(made.refused, starts, strict=True)] == [True] * 3
     command = ["scenario", "from-data", "data", "--format", "openacc", "--output", "mine.yaml"]
@@ -78,7 +78,7 @@ def test_folder_without_recordings__says_what_each_file_lacks(tmp_path: Path) ->
         match=r"contains no recording of OpenACC: .*Veh.csv: lacks columns .*: Time, Speed<number>, IVS<number>",
     ):
         scenario_from_data("mine", tmp_path, "openacc")
-    with pytest.raises(InvalidInput, match=r"must be a folder with files of exiD, whose names match \*_tracks.csv"):
+    with pytest.raises(InvalidInput, match=r"must be a folder with files of exiD; their names match \*_tracks.csv"):
         scenario_from_data("mine", tmp_path, "exid")
     with pytest.raises(InvalidInput, match="must be a folder with"):
         scenario_from_data("mine", tmp_path / "nowhere", "exid")
@@ -104,7 +104,7 @@ def test_hostile_folder__yields_the_good_files_and_one_line_for_each_other(tmp_p
     said = dict.fromkeys(made.refused)
     rights = (
         "binary.csv: cannot be read ('utf-8'",
-        "cut.csv, line 3: the line has 3 values, but the header has 6 columns; is the file complete?",
+        "cut.csv, line 3: the line has 3 values, but the header names 6 columns; is the file complete?",
         "huge.csv, line 2: the line must have fewer than 65,536",
         "nowhere.csv: the file does not exist",
         "pipe.csv: is a device, a pipe or a socket",

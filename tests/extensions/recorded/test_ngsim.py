@@ -67,7 +67,7 @@ def test_text_beside_its_csv__is_skipped_because_it_is_the_same(tmp_path: Path) 
 
 @pytest.mark.parametrize("street", ["lankershim", "peachtree"])
 def test_rows_of_streets__are_said_to_be_all(street: str, tmp_path: Path) -> None:
-    right = r"all 3 rows are from lankershim or peachtree, streets with crossings, which are left out"
+    right = r"all 3 rows are from lankershim or peachtree, but rows from streets with crossings are left out"
     with pytest.raises(InvalidInput, match=right):
         scenario_from_data("mine", write_files(tmp_path, {"a.csv": form_of_portal(street)}), "ngsim")
     some = form_of_portal("i-80") + form_of_portal(street)[1:]
@@ -83,14 +83,14 @@ def test_rows_of_streets__are_said_to_be_all(street: str, tmp_path: Path) -> Non
             "api.csv",
             '"40.00"',
             '"40.00',
-            "api.csv, line 2: the line has 24 values, but the header has 25 columns; is the file complete",
+            "api.csv, line 2: the line has 24 values, but the header names 25 columns; is the file complete",
         ),
         ("a.txt", "40.00", "fast", "a.txt, line 1, column v_Vel: 'fast' is not a number"),
         (
             "a.txt",
             "   60.00",
             "",
-            "a.txt, line 1: the line has 17 values; a text file of NGSIM without a header has 18",
+            "a.txt, line 1: the line has 17 values; in a text file of NGSIM without a header each line has 18",
         ),
     ],
 )

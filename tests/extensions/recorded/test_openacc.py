@@ -56,19 +56,20 @@ def test_pair__is_no_chain_of_three_and_the_message_names_a_scenario_for_pairs(
     if found:
         assert len(rows_of(scenario_from_data("mine", folder, "openacc", based_on="realistic-pair"))) == 1
     else:
-        right = r"no queue of 3 vehicles .*; the longest queue has 2 vehicles: .*, for instance realistic-pair with 2"
+        right = r"no 3 vehicles follow .*; the longest queue has 2 vehicles: .*, for instance realistic-pair with 2"
         with pytest.raises(InvalidInput, match=right):
             scenario_from_data("mine", folder, "openacc")
 
 
 def test_car_without_speed__has_no_link(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInput, match=r"contains no queue of 3 vehicles at the times that were read$"):
+    with pytest.raises(InvalidInput, match=r"no 3 vehicles follow each other in a lane at any moment that was read$"):
         scenario_from_data("mine", openacc(tmp_path, "Speed1,Speed2,Speed3,IVS1,IVS2", "20,,20,15,16"), "openacc")
 
 
 def test_no_link__is_said_with_the_columns(tmp_path: Path) -> None:
     with pytest.raises(
-        InvalidInput, match=r"no car follows another in the columns Speed1, Speed3, IVS1; .*Speed1, Speed2 and IVS1"
+        InvalidInput,
+        match=r"none of the columns Speed1, Speed3, IVS1 is the gap between two cars; .*Speed1, Speed2 and IVS1",
     ):
         scenario_from_data("mine", openacc(tmp_path, "Speed1,Speed3,IVS1", "20,20,15"), "openacc")
     with pytest.raises(InvalidInput, match="lacks columns that files of OpenACC have: IVS<number>"):
@@ -98,7 +99,8 @@ def test_gap_of_0_or_less__of_a_standing_car_is_left_out_of_moving_ones_one_in_a
     made = scenario_from_data("mine", openacc(tmp_path, columns, *[good] * 24, *few), "openacc")  # 1 of 100 vehicles
     assert "left out: 1 vehicles that overlap, are recorded twice, or follow one that is not recorded" in made.found
     with pytest.raises(
-        InvalidInput, match=r"line 25: vehicle 2 overlaps vehicle 1 ahead by 1\.00 m; 2 of 100 vehicles have"
+        InvalidInput,
+        match=r"line 25: vehicle 2 overlaps vehicle 1 ahead by 1\.00 m; 2 of 100 positions of vehicles are faulty",
     ):
         scenario_from_data("mine", openacc(tmp_path, columns, *[good] * 23, *many), "openacc")
 
@@ -126,7 +128,7 @@ def test_units__are_checked_between_moments_a_second_apart_however_far_rows_are_
             made = scenario_from_data("mine", folder, "openacc", based_on="realistic-pair", every_s=every_s)
             assert len(rows_of(made)) == 300 / every_s
         else:
-            with pytest.raises(InvalidInput, match=r"gaps change 3\.\d\d times as much as they should by the speeds"):
+            with pytest.raises(InvalidInput, match=r"gaps change by 3\.\d\d times the amount that the speeds imply"):
                 scenario_from_data("mine", folder, "openacc", based_on="realistic-pair", every_s=every_s)
 
 

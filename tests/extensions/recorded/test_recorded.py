@@ -73,7 +73,7 @@ def test_platoon__gaps_are_as_recorded_and_a_blank_ends_a_queue(tmp_path: Path) 
     (folder / "later.csv").write_text("Date,later\n" + (folder / "platoon.csv").read_text())
     assert scenario_from_data("mine", folder, "openacc").found[0].startswith("60 chains")
     with pytest.raises(
-        InvalidInput, match=r"gaps change 0\.31 times as much as they should by the speeds .*must be in m and m/s"
+        InvalidInput, match=r"gaps change by 0\.31 times the amount that the speeds imply .*must be in m and m/s"
     ):
         scenario_from_data("mine", write_openacc(tmp_path / "feet", 100, unit=0.3048), "openacc")
 
@@ -95,16 +95,16 @@ REFUSED = {
     "no length": (lambda t: t.replace("4.50", "0.00", 1), r"line 2, column width: 0 m: the length must be above 0"),
     "a huge id": (lambda t: t.replace("\n1,1,", "\n1,1e300,", 1), r"column id: 1e\+300 must have the drivingDirection"),
     "half an id": (lambda t: t.replace("\n1,1,", "\n1,1.5,", 1), r"column id: 1.5 must be a whole number, 0 or above"),
-    "half written": (lambda t: t[:-20], "values, but the header has 25 columns; is the file complete?"),
+    "half written": (lambda t: t[:-20], "values, but the header names 25 columns; is the file complete?"),
     "no rows": (lambda t: t.splitlines()[0] + "\n", "contains no rows of data"),
     "empty": (lambda t: "", "lacks columns that files of highD have: frame, id"),
     "no UTF-8": (lambda t: "\udcff" + t, "cannot be read .*utf-8"),
     "half a frame": (lambda t: t.replace("\n2,1,", "\n2.5,1,", 1), "column frame: 2.5 must be a multiple of 0.04 s"),
     "twice": (lambda t: t + t.splitlines()[1] + "\n", "line 3122: vehicle 1 is recorded twice .* .see line 2"),
     "nobody ahead": (lambda t: re.sub(r",1,0,0,0,0,0,0,0,3\n", ",77,0,0,0,0,0,0,0,3\n", t), "vehicle 77, which is not"),
-    "feet": (lambda t: scaled(t, 2.8, 1.5), "long, which is less than a third; lengths and speeds must be"),
+    "feet": (lambda t: scaled(t, 2.8, 1.5), "long, but at least a third should be; lengths and speeds must be"),
     "long lorries": (lambda t: scaled(t, 3.281, 3.281), r"m: the length must be .* at most 40 m; highD is in m"),
-    "half as fast": (lambda t: scaled(t, 1.0, 0.4), r"gaps change 2\.\d\d times as much as they should by the speeds"),
+    "half as fast": (lambda t: scaled(t, 1.0, 0.4), r"gaps change by 2\.\d\d times the amount that the speeds imply"),
     "too fast": (lambda t: t.replace("-27.879", "-127.879"), "127.879 m/s: the speed must be at most 75 m/s; highD is"),
 }  # fmt: skip
 
@@ -129,7 +129,9 @@ def test_overlaps__are_refused_but_few_of_noisy_data_are_left_out(tmp_path: Path
     made = scenario_from_data("mine", file.parent, "ngsim")
     assert len(rows_of(made)) == 39 and "left out: 2 vehicles that overlap" in made.found[2]
     file.write_text(re.sub(r"(?m)^((?:2|5|8|11|14|17),\d+,11,\d+,20),[^,]+", r"\1,99", text))
-    with pytest.raises(InvalidInput, match=r"line \d+: vehicle 2 overlaps .*; 12 of 120 vehicles have such faults"):
+    with pytest.raises(
+        InvalidInput, match=r"line \d+: vehicle 2 overlaps .*; 12 of 120 positions of vehicles are faulty"
+    ):
         scenario_from_data("mine", file.parent, "ngsim")
 
 

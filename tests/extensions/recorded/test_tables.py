@@ -80,7 +80,8 @@ def test_times_of_30_hertz__may_be_rounded(tmp_path: Path) -> None:
     ]
     assert rows_of(made_of(table(tmp_path, cars))) == [ROWS[0]] * 3
     with pytest.raises(
-        InvalidInput, match=r"every = 0.05 s: must be a multiple of 0.0333333 s, the time step of the table"
+        InvalidInput,
+        match=r"every = 0.05 s: the time between two moments must be a multiple of 0.0333333 s, the time step of the",
     ):
         made_of(table(tmp_path, cars), every_s=0.05)
 
@@ -100,8 +101,8 @@ def test_parquet__gives_the_same_rows_and_names_rows(tmp_path: Path, monkeypatch
     assert made_of(write(numbered)).csv.endswith("a.parquet: 3-4-1\n")
     for k, cell, right in (
         (4, -1.0, r"a.parquet, row 3, column l: -1 m: the length must be above 0 and at most 40 m"),
-        (5, None, "a.parquet, row 3, column v: is empty"),
-        (0, None, "a.parquet, row 3, column who: is empty"),
+        (5, None, "a.parquet, row 3, column v: the value is empty"),
+        (0, None, "a.parquet, row 3, column who: the value is empty"),
     ):
         with pytest.raises(InvalidInput, match=right):
             made_of(write([*CARS[:2], (*CARS[2][:k], cell, *CARS[2][k + 1 :]), *CARS[3:]]))
@@ -128,22 +129,25 @@ def one_more(*car: object) -> list[tuple[object, ...]]:
 WRONG = {
     "direction": (
         [(*car[:3], -car[3], *car[4:]) for car in CARS],
-        "lane E1_0, positions .front. change -1.00 times as much",
+        "lane E1_0, positions .column front. change by -1.00 times the distance",
     ),
     "backwards": (
         [(*car[:3], -car[3], car[4], -car[5]) for car in CARS],
-        "in lane E1_0, positions .front. change 1.00 times as much .*, which are below 0; front must increase",
+        "in lane E1_0, positions .column front. change by 1.00 times .*, and the speeds are negative; front must",
     ),
     "feet": (
         [(*car[:3], car[3] / 0.3048, *car[4:]) for car in CARS],
-        r"change 3.28 times as much as they should by the speeds; .* both must be in m and m/s",
+        r"change by 3.28 times the distance that the speeds imply; .* both columns must be in m and m/s",
     ),
-    "km/h": (scaled(1.0, 2.5), r"change 0.40 times as much as they should by the speeds"),
+    "km/h": (scaled(1.0, 2.5), r"change by 0.40 times the distance that the speeds imply"),
     "twice": (one_more(*CARS[2]), "line 17: vehicle c is recorded twice for this time .see line 4"),
     "overlap": (one_more("d", 1.0, "E1_0", 119.0, 5.0, 20.0), "line 17: vehicle d overlaps vehicle c ahead by 3.00 m"),
-    "no name": (one_more("", 1.0, "E1_0", 150.0, 5.0, 20.0), "line 17, column who: is empty"),
+    "no name": (one_more("", 1.0, "E1_0", 150.0, 5.0, 20.0), "line 17, column who: the value is empty"),
     "no number": (one_more("d", 1.0, "E1_0", 150.0, "5 m", 20.0), "line 17, column l: '5 m' is not a number"),
-    "time": (one_more("d", 0.625, "E1_0", 150.0, 5, 20.0), "every = 0.8 s: must be a multiple of 0.125 s"),
+    "time": (
+        one_more("d", 0.625, "E1_0", 150.0, 5, 20.0),
+        "every = 0.8 s: the time between two moments must be a multiple of 0.125 s",
+    ),
 }
 
 
@@ -232,5 +236,7 @@ def test_frames_of_video__keep_their_rate_and_names_of_columns_are_literal(tmp_p
     columns = "time=t/29.97,vehicle=veh#,lane=lane,front=x,length=l,speed=v,units=m"
     made = made_of(folder, columns, based_on="realistic-pair")
     assert rows_of(made) == ["15.0,20.0,20.0"] * 21
-    with pytest.raises(InvalidInput, match=r"every = 0\.05 s: must be a multiple of 0\.0333"):
+    with pytest.raises(
+        InvalidInput, match=r"every = 0\.05 s: the time between two moments must be a multiple of 0\.0333"
+    ):
         made_of(folder, columns, based_on="realistic-pair", every_s=0.05)

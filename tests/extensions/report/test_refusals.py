@@ -56,8 +56,8 @@ FIGURES: dict[str, Callable[[], object]] = {
     "deceleration_curve: points = 1: the number of points must be at least 2": lambda: deceleration_curve(
         PAPER.sample(1, 7).worlds, Task(PAPER, (1,)), points=1
     ),
-    "SeedCurve.of: no step is common to all trainings": lambda: SeedCurve.of([{0: 1.0}, {1: 1.0}]),
-    "seed_curves: a panel has no curves": lambda: seed_curves({"harm": {}}),
+    "SeedCurve.of: the training runs have no evaluated step in common": lambda: SeedCurve.of([{0: 1.0}, {1: 1.0}]),
+    "seed_curves: a quantity has no curves": lambda: seed_curves({"harm": {}}),
     "harm_by_agent: there are no rows; give the summary of at least one agent": lambda: harm_by_agent([]),
     "learning_curve: there are no points; give at least one evaluation": lambda: learning_curve([]),
     "harm_against_total_gap: bins = 0: the number of bins must be at least 1": lambda: harm_against_total_gap(

@@ -54,9 +54,13 @@ VERDICT = {"what": "all", "outcome": "agrees", "because": "of 25 comparisons 25 
 )
 def test_result__that_was_changed_is_made_again(where: str, changes: dict[str, Any], empty_folder: Path) -> None:
     reproduced({}, changes)
-    with refused(f"out/gaps/result.json: the entry {where} is missing or wrong; make the result again (--force)"):
+    with refused(
+        f"out/gaps/result.json: the key {where} is missing or its value is wrong; reproduce the item again (--force)"
+    ):
         read_results(Path("out"))
-    with refused(f"out/gaps/result.json: the entry {where} is missing or wrong; make the result again (--force)"):
+    with refused(
+        f"out/gaps/result.json: the key {where} is missing or its value is wrong; reproduce the item again (--force)"
+    ):
         make_items(
             Reproduction("quick", Path("out"), 24, machine="a machine"),
             [planted("harm-delays", lambda settings: made())],

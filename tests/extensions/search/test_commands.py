@@ -74,12 +74,12 @@ def test_compile__leaves_nothing_of_a_search_to_compile(ethbrake: Command) -> No
         (
             "vehicle_1: full_brake\n",
             "vehicle_1: planner:0\n",
-            "the text after the colon must be a number of candidates per decision",
+            "after the colon, give the number of profiles to try at each decision",
         ),
         (
             "vehicle_3: full_brake\n",
             "vehicle_3: best_harm:1000001\n",
-            "must be a number of candidates from 1 to 1,000,000, for instance best_harm:20000",
+            "the number of profiles to try in each world, from 1 to 1,000,000, for instance best_harm:20000",
         ),
     ],
 )

@@ -30,17 +30,17 @@ REFUSED: dict[str, Callable[[], object]] = {
     "agent 'planner+step+episode': may have at most one search (+search), then at most one shield (+episode,": lambda: (
         make_agent("planner+step+episode", scenario=PAPER)
     ),
-    "agent 'planner:0': the text after the colon must be a number of candidates per decision": lambda: make_agent(
+    "agent 'planner:0': after the colon, give the number of profiles to try at each decision": lambda: make_agent(
         "planner:0"
     ),
-    "agent 'planner:1.5': the text after the colon must be a number of candidates per decision": lambda: make_agent(
+    "agent 'planner:1.5': after the colon, give the number of profiles to try at each decision": lambda: make_agent(
         "planner:1.5"
     ),
     "best_harm: budget = 0: the number of candidates must be at least 1": lambda: make_agent(
         "best_harm", most_candidates=0
     ),
     "search: candidates = 0: must be a whole number in 1..1000000": lambda: Searched(BRAKE, PAPER, candidates=0),
-    "commands of shape (3, 75): give one controlled vehicle and commands of shape": lambda: refine(
+    "the commands have the shape (3, 75); give one controlled vehicle and commands of shape": lambda: refine(
         problem(1), np.zeros((3, 75)), budget=5
     ),
     "refine: a command exceeds the capacity of the vehicle": lambda: refine(
@@ -52,7 +52,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     "templates = 0: must be a whole number, at least 1": lambda: best_templates(
         problem(1), np.full(12, np.inf), number=0
     ),
-    "templates: 2 controlled vehicles; give a problem with one": lambda: best_templates(
+    "templates: the problem has 2 controlled vehicles; give a problem with one": lambda: best_templates(
         problem(1, 2), np.full(12, np.inf), number=40
     ),
 }

@@ -98,13 +98,13 @@ def test_table__of_an_objective_says_so_and_is_not_folded_with_harm_of_the_line(
     profiles, _ = plain.profiles(plain.identity, "first", problem_of(scenario, worlds).last_step)
     of_first = 3.0 * problem_of(scenario, worlds).borne(profiles)["first"][:, 0]
     assert (again.best["first"].harm <= of_first + 1e-6).all()
-    with pytest.raises(InvalidInput, match="the table holds amounts of the objective 'weighted:1,0,0'; give a table"):
+    with pytest.raises(InvalidInput, match="the table contains values of the objective 'weighted:1,0,0'; give a table"):
         fold_episodes(table, scenario, worlds, "coast", {"first": eb.make_agent("coast")})
 
 
 def test_vehicles__that_minimise_different_amounts_cannot_be_searched_together() -> None:
     pair = eb.load_scenario("cooperation-3-pair")
-    with pytest.raises(InvalidInput, match="the 2 controlled vehicles minimise different amounts"):
+    with pytest.raises(InvalidInput, match="the 2 controlled vehicles have different objectives"):
         best_harm(pair, pair.sample(2, 1).worlds, counts=("first",), budget=50, objective="own")
 
 

@@ -83,7 +83,7 @@ FALSIFIED = [
     ),
     (
         "study falsify --agent ladder --measure harm --budget 8",
-        "agent ladder: the name stands for several agents; name one agent",
+        "agent ladder: this name means several agents; give the name of one agent",
     ),
     ("study sweep nowhere.yaml --output new", "nowhere.yaml: the file does not exist"),
 ]
@@ -100,7 +100,7 @@ def test_study__is_refused(line: str, message: str, refuse: Refuse) -> None:
         (
             "scenario: paper-random",
             "scenario: paper-distance",
-            "the worlds were found in scenario 'paper-distance', whose content differs",
+            "scenario 'paper-distance' has changed since these worlds were found",
         ),
         ("harm_count: first", "harm_count: second", "worst.yaml, line 8: harm_count = second: must be first or total"),
         ("    score: 120", "    skore: 120", "worst.yaml, line 12: worlds[0].skore: unknown key; did you mean score?"),

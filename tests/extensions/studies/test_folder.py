@@ -54,7 +54,7 @@ def test_folder__of_another_question_is_refused_with_what_differs(tmp_path: Path
     assert not folder_of(tmp_path / "new", "you").check()  # the record of the first one stays
     assert '"owner": "me"' in (tmp_path / "new" / "question.json").read_text()
     with pytest.raises(
-        AlreadyExists, match=r"the folder is not for curves: it contains question.json of another command"
+        AlreadyExists, match=r"the folder cannot be used for curves, because another command has written question.json"
     ):
         StudyFolder(tmp_path / "new", "curves").check()
 
@@ -228,7 +228,7 @@ LAST = "trainings/cooperation-3-congested-tiny-shared-seed1"
             ('"total_steps": 256', '"total_steps": 512'),
             "this folder contains another training run, which differs in recipe total_steps; choose another folder",
         ),
-        (f"{LAST}/run.json", None, "the folder is not that of a training"),
+        (f"{LAST}/run.json", None, "the folder was not written by a training run"),
         (f"{LAST}/team.json", ('"scheme"', '"shceme"'), "team.json"),
         (f"{LAST}/policy/manifest.json", ("{", "{}"), "manifest.json"),
     ],

@@ -45,16 +45,14 @@ TUNINGS: dict[str, Callable[[], object]] = {
     "t.yaml: search: missing; this key is required; docs/extensions/studies.md shows an example": lambda: plan(
         "scenario: paper-random\nrecipe: ppo\n"
     ),
-    "t.yaml, line 4: search: the recipe rejects learning_rate.strat=0.0001: recipe 'ppo': learning_rate": lambda: plan(
+    "t.yaml, line 4: search: learning_rate.strat=0.0001 is not possible: recipe 'ppo': learning_rate": lambda: plan(
         search={"learning_rate.strat": RATE}
     ),
     "must be whole numbers, written without a decimal": lambda: plan(search={"n_epochs": {"low": 1.0, "high": 4.0}}),
-    "t.yaml, line 4: search.n_epochs = {high: 4, low: 4}: low 4 must be less than high 4": lambda: plan(
+    "t.yaml, line 4: search.n_epochs = {high: 4, low: 4}: low (4) must be less than high (4)": lambda: plan(
         search={"n_epochs": {"low": 4, "high": 4}}
     ),
-    "low 0 must be greater than 0, because log is true": lambda: plan(
-        search={"gamma": {"low": 0, "high": 1, "log": True}}
-    ),
+    "low (0) must be above 0, because log is true": lambda: plan(search={"gamma": {"low": 0, "high": 1, "log": True}}),
     "t.yaml, line 5: search.gamma.high = .nan: must be a finite number": lambda: plan(
         search={"gamma": {"low": 0.5, "high": float("nan")}}
     ),
@@ -71,7 +69,7 @@ TUNINGS: dict[str, Callable[[], object]] = {
     "t.yaml, line 4: search.gamma = {choices: [0.9, 0.9]}: the value 0.9 is listed twice": lambda: plan(
         search={"gamma": {"choices": [0.9, 0.9]}}
     ),
-    "t.yaml, line 4: search: the recipe rejects network.policy=[0]: recipe 'ppo': network.policy[0] = 0:": lambda: plan(
+    "t.yaml, line 4: search: network.policy=[0] is not possible: recipe 'ppo': network.policy[0] = 0:": lambda: plan(
         search={"network.policy": {"choices": [[8], [0]]}}
     ),
     "t.yaml, line 4: search.seed: this key cannot be searched: a good seed is luck; give one seed for all": lambda: (
@@ -89,7 +87,7 @@ TUNINGS: dict[str, Callable[[], object]] = {
     "t.yaml, line 4: search.algorithm: this key cannot be searched: a recipe has the keys of one": lambda: plan(
         search={"algorithm": {"choices": ["ppo", "sac"]}}
     ),
-    "t.yaml, line 4: search.mass_t: this is a key of the scenario; give a key of the recipe": lambda: plan(
+    "t.yaml, line 4: search.mass_t: this is a key of the scenario, but only keys of the recipe": lambda: plan(
         search={"mass_t": {"low": 1, "high": 2}}
     ),
     "t.yaml, line 4: search.gamma: the file also sets gamma; delete one of the two keys": lambda: plan(
@@ -98,7 +96,7 @@ TUNINGS: dict[str, Callable[[], object]] = {
     "t.yaml, line 8: search.learning_rate.start: the file also sets learning_rate; delete one of": lambda: plan(
         search={"learning_rate.start": RATE, "learning_rate": {"choices": [1, 2]}}
     ),
-    "search: the recipe rejects offset.largest=0.1080873589761303, offset.smallest=0.16819777065410824": lambda: plan(
+    "search: offset.largest=0.1080873589761303, offset.smallest=0.16819777065410824": lambda: plan(
         recipe="quick",
         search={"offset.smallest": {"low": 0.01, "high": 0.2}, "offset.largest": {"low": 0.1, "high": 0.5}},
     ),
@@ -115,7 +113,7 @@ TUNINGS: dict[str, Callable[[], object]] = {
     "t.yaml, line 6: recipe 'ppo': vf_coef = -0.5: must be greater than or equal to 0": lambda: plan(
         WRITTEN.replace("vf_coef: 0.5", "vf_coef: -0.5", 1)
     ),
-    "t.yaml, line 6: set.seed: this key is not allowed under set; use the top-level keys": lambda: plan(
+    "t.yaml, line 6: set.seed: this key is not allowed under set; at the top of the file": lambda: plan(
         WRITTEN.replace("vf_coef: 0.5", "seed: 3", 1)
     ),
 }
@@ -193,7 +191,7 @@ SWEEPS: dict[str, Callable[[], object]] = {
     "recipe 'ppo': reward.terminl: unknown key; did you mean terminal?": lambda: sweep(
         {"set": {"reward.terminl": 1}, "jobs": [GRID]}
     ),
-    "the seed must not be given under set; give it as the key seed, next to the key recipe": lambda: sweep(
+    "the seed must not stand under set; write the key seed next to the key recipe": lambda: sweep(
         {"set": {"seed": 3}, "jobs": [GRID]}
     ),
     's.yaml, line 4: set = {"gamma=0.9, x": 3}: "gamma=0.9, x": a key must not contain': lambda: sweep(
@@ -202,13 +200,13 @@ SWEEPS: dict[str, Callable[[], object]] = {
     "s.yaml, line 5: jobs[0] (paper-random, ppo, seed 0, =3): --set '=3': must be KEY=VALUE": lambda: sweep(
         {"set": {"": 3}, "jobs": [GRID]}
     ),
-    "jobs[1] (paper-random, ppo, seed 0): is the same training as jobs[0] (paper-random, ppo, seed 0)": lambda: sweep(
+    "jobs[1] (paper-random, ppo, seed 0): this job trains the same policy as jobs[0] (paper-random": lambda: sweep(
         {"jobs": [GRID, {**GRID, "seed": 0}]}
     ),
-    "grid (paper-random, ppo, seed 0): is the same training as grid (paper-random, ppo, seed 0)": lambda: sweep(
-        {"grid": {**GRID, "seed": [0, 0]}}
+    "grid (paper-random, ppo, seed 0): this job trains the same policy as grid (paper-random, ppo, seed 0)": lambda: (
+        sweep({"grid": {**GRID, "seed": [0, 0]}})
     ),
-    "jobs[1] (paper-random, ppo, seed 0, gamma=0.995): is the same training as jobs[0] (paper-random": lambda: sweep(
+    "jobs[1] (paper-random, ppo, seed 0, gamma=0.995): this job trains the same policy as jobs[0]": lambda: sweep(
         {"jobs": [GRID, {**GRID, "set": {"gamma": 0.995}}]}
     ),
     "scenario 'cooperation-0-sensors' has no learner; give at least one vehicle the role learner": lambda: sweep(
@@ -224,7 +222,7 @@ SWEEPS: dict[str, Callable[[], object]] = {
         "grid: {scenario: paper-random, recipe: ppo, recipe: sac}\n"
     ),
     "s.yaml: must be a mapping with a grid or a list of jobs": lambda: sweep("- one\n"),
-    "s.yaml, line 10: grid.set.vf_coef: the key vf_coef is also in the top-level set": lambda: sweep(
+    "s.yaml, line 10: grid.set.vf_coef: the file sets vf_coef twice: here, and for all jobs": lambda: sweep(
         SWEPT.replace("gamma", "vf_coef", 1)
     ),
 }
