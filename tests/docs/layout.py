@@ -100,20 +100,24 @@ def page() -> str:
     uses = arrows()
     core = [[room for room in layer if not room.startswith("__")] for layer in layers(0)]
     core = [[room for room in layer if room != "extensions"] for layer in core]
-    drawing = [f"    {' · '.join(layer)}" for layer in core if layer]
+    drawing = [" · ".join(layer) for layer in core if layer]
     extensions = layers(1)
-    beside = [f"    {' · '.join(layer)}" for layer in extensions]
+    beside = [" · ".join(layer) for layer in extensions]
     return "\n".join(
         [
             BEGINNING,
             "## The core\n",
             "The core from the top down; a folder or file uses only those in the lines below it:\n",
+            "```text",
             *drawing,
+            "```",
             "",
             *table([layer for layer in core if layer], "", uses),
             "\n## Extensions\n",
             "Every extension may use the core and the extensions in the lines below it:\n",
+            "```text",
             *beside,
+            "```",
             "",
             *table(extensions, "extensions.", uses),
             END,
