@@ -10,15 +10,16 @@ PACKAGE = ROOT / "ethbrake_marl"
 PAGE = ROOT / "docs" / "internals" / "layout.md"
 BEGINNING = """# How the code is laid out
 
-Which file does what? The package has a core and extensions. The core is what the paper, training,
-scenarios and levels of cooperation need. An extension is a folder that you can delete: it registers
-itself by entry points (`pyproject.toml`), and no module of the core names it. To delete one, delete
-its folder, its folder in `tests/extensions/`, its lines in `pyproject.toml` and every extension
-that uses it; then run `make venv`. `make core` deletes all of them in a copy and runs the core's
-tests there.
+Which file does what? The package has a core and extensions. The core contains everything that the
+paper's environment, training, scenarios and levels of cooperation need. An extension is a folder
+that you can delete: it registers itself by entry points (`pyproject.toml`), and no module of the
+core names it. To delete an extension, delete its folder, its folder in `tests/extensions/`, its
+lines in `pyproject.toml` and every extension that uses it; then run `make venv`. `make core`
+deletes all extensions in a copy of the repository, and runs the core's tests there.
 
-A module imports only from its own folder or from folders listed below it; `make lint` checks this.
-This page is made from the code: `python -m tests.docs.layout`.
+A module imports only from its own folder or from folders that this page lists below that folder;
+`make lint` checks this. The following command makes this page from the code:
+`python -m tests.docs.layout`.
 
 ## Where to look
 
@@ -35,9 +36,10 @@ This page is made from the code: `python -m tests.docs.layout`.
 | How do I add a column to every evaluation? | [a set of measures](../extend.md#a-set-of-measures) |
 """
 END = """
-`scenarios/` has one YAML file per scenario, and `train/` one per training recipe. The files of an
-extension are in a folder with the extension's name. The wheel contains both folders. Another page
-explains [how the code is tested](tests.md).
+`scenarios/` has one YAML file per scenario, and `train/` one per training recipe. The files that
+belong to an extension are in a subfolder with the extension's name. The wheel (the installable
+package) contains `scenarios/` and `train/`. Another page explains [how the code is
+tested](tests.md).
 """
 
 
@@ -98,20 +100,24 @@ def page() -> str:
     uses = arrows()
     core = [[room for room in layer if not room.startswith("__")] for layer in layers(0)]
     core = [[room for room in layer if room != "extensions"] for layer in core]
-    drawing = [f"    {' · '.join(layer)}" for layer in core if layer]
+    drawing = [" · ".join(layer) for layer in core if layer]
     extensions = layers(1)
-    beside = [f"    {' · '.join(layer)}" for layer in extensions]
+    beside = [" · ".join(layer) for layer in extensions]
     return "\n".join(
         [
             BEGINNING,
             "## The core\n",
-            "From the top down; each line uses only lines below it:\n",
+            "The core from the top down; a folder or file uses only those in the lines below it:\n",
+            "```text",
             *drawing,
+            "```",
             "",
             *table([layer for layer in core if layer], "", uses),
             "\n## Extensions\n",
-            "Every extension may use the core. Among themselves, each line uses only lines below it:\n",
+            "Every extension may use the core and the extensions in the lines below it:\n",
+            "```text",
             *beside,
+            "```",
             "",
             *table(extensions, "extensions.", uses),
             END,
