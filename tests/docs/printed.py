@@ -167,7 +167,7 @@ _TESTS = tuple(
 
 TABLES: dict[str, How] = {
     "| who drives Vehicle 2 | knows | collisions": _by(NIGHTLY, *_TESTS),
-    "| what | first-impact harm | of the best known": TRAINED,
+    "| agent and test | first-impact harm | harm / best known harm": TRAINED,
     "| who drives Vehicle 2 | collisions | first-impact harm": _by(
         NIGHTLY,
         "ethbrake evaluate --scenario recorded-openacc --agents full_brake,e_v2x_bm,idm,universal,best_harm --json",
