@@ -190,7 +190,7 @@ def decide_front(gap: Floats, speed: Floats, onset: Floats, braking: Floats, i: 
     Args:
         gap: [P] gaps, m.
         speed: [N] speeds, m/s.
-        onset: [N] times from which on the vehicles may act, s.
+        onset: [N] time from which on each vehicle may act, s.
         braking: [N] braking capacities, m/s2.
         i: index of the controlled vehicle, at least 1.
         out: [RESULT_WIDTH] verdict; receives the columns REASON (a code), MARGIN and SPARE (both m).
@@ -222,7 +222,7 @@ def plan_behind(
     Args:
         gap: [P] gaps, m.
         speed: [N] speeds, m/s.
-        onset: [N] times from which on the vehicles may act, s.
+        onset: [N] time from which on each vehicle may act, s.
         braking: [N] braking capacities, m/s2.
         driving: [N] driving capacities, m/s2.
         limit: [N] speed limits, m/s.
@@ -251,7 +251,7 @@ def meets_rear_early(gap: Floats, speed: Floats, onset: Floats, braking: Floats,
     Args:
         gap: [P] gaps, m.
         speed: [N] speeds, m/s.
-        onset: [N] times from which on the vehicles may act, s.
+        onset: [N] time from which on each vehicle may act, s.
         braking: [N] braking capacities, m/s2.
         i: index of the controlled vehicle.
         out: [RESULT_WIDTH] verdict; receives the columns REASON and MARGIN if there is contact.
@@ -281,7 +281,7 @@ def decide_world(
     Args:
         gap: [P] gaps, m.
         speed: [N] speeds, m/s.
-        onset: [N] times from which on the vehicles may act, s.
+        onset: [N] time from which on each vehicle may act, s.
         braking: [N] braking capacities, m/s2.
         driving: [N] driving capacities, m/s2.
         limit: [N] speed limits, m/s.
@@ -326,7 +326,7 @@ def decide_worlds(
     Args:
         gaps: [n, P] gaps, m.
         speeds: [n, N] speeds, m/s.
-        onset: [n, N] times from which on the vehicles may act, s.
+        onset: [n, N] time from which on each vehicle may act, s.
         braking: [n, N] braking capacities, m/s2.
         driving: [n, N] driving capacities, m/s2.
         limit: [n, N] speed limits, m/s.
@@ -384,10 +384,11 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
     An overlap of at most 1e-12 m between the deciding trajectories counts as a rounding error, not as contact.
 
     Args:
-        worlds: the worlds now, [n].
+        worlds: the ``n`` worlds in their present state.
         vehicle: index of the controlled vehicle, from 0.
-        scripts: script name of each other vehicle, by index, as in ``Scenario.roles``. Every script must be full_brake.
-            None: all other vehicles brake fully.
+        scripts: maps the index of each vehicle that is not controlled to the name of its script, as in
+            ``Scenario.roles``. The only script allowed is full_brake. If ``scripts`` is None, these vehicles brake
+            fully.
 
     Raises ``InvalidInput`` for any other line, a script other than full_brake, a front vehicle that may brake only
     after the controlled vehicle acts, a vehicle that moves backward, or an obstacle (``obstacle_gap_m``) that vehicle_1
@@ -419,7 +420,8 @@ def check_covered(worlds: Worlds, vehicle: int, scripts: Mapping[int, str] | Non
     Args:
         worlds: the worlds, [n].
         vehicle: index of the controlled vehicle, from 0.
-        scripts: script name of each other vehicle, by index; None: all other vehicles brake fully.
+        scripts: maps the index of each vehicle that is not controlled to the name of its script; None if these vehicles
+            brake fully.
 
     """
     # An obstacle that Vehicle 1 does not reach under full braking has no effect: only a push could bring Vehicle 1

@@ -39,11 +39,12 @@ def gentlest_between(kind: int, at: Floats, early: float, late: float) -> float:
     capacities in each second.
 
     Args:
-        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
-            ``RAMPED_REAR``).
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
+        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
+            build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
 
     """
     if kind >= RAMPED_FRONT:
@@ -61,7 +62,7 @@ def decision_around(at: Floats, early: float, late: float) -> tuple[float, float
     Both results are ``late`` if there are no decision steps, or if the two times lie in different steps.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earlier time, s.
         late: later time, s.
 
@@ -86,13 +87,14 @@ def lacking(kind: int, at: Floats, early: float, late: float, softest: float, ha
     before and after the contact.
 
     Args:
-        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
-            ``RAMPED_REAR``).
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
+        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
+            build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
         softest: smallest closing speed that any command reaches between ``early`` and ``late``, m/s.
-        hard: largest closing speed of the first contact, m/s.
+        hard: largest closing speed that the first contact may have, m/s.
         begin: start of the decision step, s.
 
     """
@@ -121,16 +123,18 @@ def harm_of(
     """Return a lower bound (m2/s2) on the harm of the first contacts in a range of times and closing speeds.
 
     Args:
-        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
-            ``RAMPED_REAR``).
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        soft: smallest closing speed of the first contact, m/s.
-        hard: largest closing speed of the first contact, m/s.
-        floor: known lower bound on the harm of the other pair, m2/s2.
-        plan: working memory for the motion of one vehicle, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: second working memory of the same kind.
+        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
+            build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        soft: smallest closing speed that the first contact may have, m/s.
+        hard: largest closing speed that the first contact may have, m/s.
+        floor: known lower bound on the harm of the other pair (the pair that does not have the first contact), m2/s2.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan`` (with brake build-up from
+            ``empty_legs``); overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     begin, end = decision_around(at, early, late)
@@ -150,7 +154,7 @@ def room_for(heap: Floats, count: int, harm: float) -> int:
     only the column ``HARM`` of this row. Row 0 of the heap is always the cell with the smallest bound.
 
     Args:
-        heap: [CELLS, NEAR] cells ordered as a binary heap; changed in place.
+        heap: [CELLS, NEAR] binary heap with one row for each cell (range of first contacts); changed in place.
         count: number of cells so far.
         harm: bound of the new cell, m2/s2.
 
@@ -169,7 +173,7 @@ def put(heap: Floats, count: int, harm: float, early: float, late: float, soft: 
     """Add a cell (a range of times and closing speeds) to the heap, and return the new number of cells.
 
     Args:
-        heap: [CELLS, NEAR] cells ordered as a binary heap; changed in place.
+        heap: [CELLS, NEAR] binary heap with one row for each cell (range of first contacts); changed in place.
         count: number of cells so far.
         harm: lower bound on the harm of first contacts in the cell, m2/s2.
         early: earliest time, s.
@@ -188,7 +192,7 @@ def drop_first(heap: Floats, count: int) -> int:
     """Remove row 0, the cell with the smallest bound, from the heap, and return the new number of cells.
 
     Args:
-        heap: cells ordered as a binary heap; changed in place.
+        heap: binary heap with one row for each cell (range of first contacts); changed in place.
         count: number of cells before the removal.
 
     """
@@ -217,14 +221,15 @@ def divide(
     contacts is at most this second result.
 
     Args:
-        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
-            ``RAMPED_REAR``).
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        floor: known lower bound on the harm of the other pair, m2/s2.
+        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
+            build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        floor: known lower bound on the harm of the other pair (the pair that does not have the first contact), m2/s2.
         count: number of cells on the heap.
-        plan: working memory for the motion of one vehicle, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: second working memory of the same kind.
-        heap: working memory for the cells of the search, [CELLS, NEAR].
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan`` (with brake build-up from
+            ``empty_legs``); overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
+        heap: working memory for the search, [CELLS, NEAR]: one row for each cell (range of first contacts).
 
     """
     harm, early, late, soft, hard = (heap[0, HARM], heap[0, EARLY], heap[0, LATE], heap[0, SOFT], heap[0, HARD])
@@ -258,18 +263,19 @@ def least_harm(
     """Return a lower bound (m2/s2) on the harm of every first contact between two times, or ``best`` if it is smaller.
 
     Args:
-        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
-            ``RAMPED_REAR``).
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
+            build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         first: earliest time of the contact, s after the controlled vehicle may act.
         last: latest time of the contact, s.
-        floor: known lower bound on the harm of the other pair, m2/s2.
-        best: smallest harm of a first contact found so far, m2/s2.
-        enough: lower bound (m2/s2) that is proven in another way; the function returns 0 if the bound of some contact
-            is not above it.
-        plan: working memory for the motion of one vehicle, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: second working memory of the same kind.
-        heap: working memory for the cells of the search, [CELLS, NEAR].
+        floor: known lower bound on the harm of the other pair (the pair that does not have the first contact), m2/s2.
+        best: smallest harm that the search has reached so far, m2/s2.
+        enough: lower bound that is already proven in another way, m2/s2; the function returns 0 if the bound of some
+            first contact is not above ``enough``.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan`` (with brake build-up from
+            ``empty_legs``); overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
+        heap: working memory for the search, [CELLS, NEAR]: one row for each cell (range of first contacts).
 
     """
     for k in range(_TRIED):
@@ -304,9 +310,9 @@ def next_split(kind: int, at: Floats, time: float, last: float) -> float:
     With brake build-up the result is at most ``_PART_S`` later than ``time``.
 
     Args:
-        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
-            ``RAMPED_REAR``).
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
+            build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         time: start of the search, s.
         last: largest possible result, s.
 

@@ -45,7 +45,7 @@ def least_before(at: Floats, met: float, squared: float) -> float:
     close this gap by time t.
 
     Args:
-        at: [PAIR_WIDTH] one pair, columns ``PAIR_GAP`` to ``FOLLOWER_A``.
+        at: [PAIR_WIDTH] values of one pair, in the order ``PAIR_GAP`` to ``FOLLOWER_A``.
         met: time at which the extreme motions lead to contact, s.
         squared: squared closing speed of the extreme motions at the time ``met``, m2/s2.
 
@@ -80,10 +80,10 @@ def least_closing_of_pair(at: Floats, until: float, plan: Floats, other: Floats)
     The results are 0 and infinity if no contact is certain.
 
     Args:
-        at: [PAIR_WIDTH] one pair, columns ``PAIR_GAP`` to ``FOLLOWER_A``.
+        at: [PAIR_WIDTH] values of one pair, in the order ``PAIR_GAP`` to ``FOLLOWER_A``.
         until: horizon, s.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     onset = at[LEADER_ONSET]

@@ -1,9 +1,9 @@
 """Bound how much faster than the centre of mass of a pair one of its vehicles can be after the pair's first contact.
 
-A *flight* is a time in which the two vehicles are apart. ``share`` is the partner's share of the mass of both vehicles.
-``press`` is the acceleration (m/s2) at which the two vehicles close under the best command. ``reach`` is the part of
-``press`` (m/s2) that another command can take away. ``opening`` is the speed (m/s) at which the vehicles separate.
-docs/internals/proofs/lower-bound.md has the proofs.
+A *flight* is a period in which the two vehicles are not in contact. ``share`` is the partner's share of the mass of
+both vehicles. ``press`` is the acceleration (m/s2) at which the two vehicles close under the best command. ``reach`` is
+the part of ``press`` (m/s2) that another command can take away. ``opening`` is the speed (m/s) at which the vehicles
+separate. docs/internals/proofs/lower-bound.md has the proofs.
 """
 
 from __future__ import annotations
@@ -18,16 +18,19 @@ def flight_lead(share: float, press: float, reach: float, opening: float, flight
     """Return the *lead* of a flight: the speed (m/s) that the controlled vehicle gains by it, minus the speed that it
     costs.
 
-    A *flight* is a time in which the two vehicles are apart. The gain is the speed of the controlled vehicle minus the
-    speed of the centre of mass of both vehicles. For a flight of length L and opening speed o, the lead is ``share
-    (press L - o) - G``. G is the speed that the vehicle must give up so that the vehicles stay apart for the time L,
-    namely the smallest G with ``G L - G^2 / (2 reach) >= (press L^2 / 2) - o L``. In each second the vehicle can give
-    up at most ``reach``. The result is -inf if no command keeps the vehicles apart for so long.
+    A *flight* is a period in which the two vehicles are not in contact. The gain is the speed of the controlled vehicle
+    minus the speed of the centre of mass of both vehicles. For a flight of length L and opening speed o, the lead is
+    ``share (press L - o) - G``. G is the speed that the vehicle must give up so that the vehicles stay apart for the
+    time L, namely the smallest G with ``G L - G^2 / (2 reach) >= (press L^2 / 2) - o L``. In each second the vehicle
+    can give up at most ``reach``. The result is -inf if no command keeps the vehicles apart for so long.
 
     Args:
-        share: partner's share of the mass of both vehicles, 0 to 1.
-        press: acceleration at which the two vehicles close under the best command, m/s2.
-        reach: part of ``press`` that another command can take away, m/s2; infinite: no limit is known.
+        share: mass of the partner (the neighbour of the first contact), as a share of the mass of both vehicles, 0 to
+            1.
+        press: acceleration of the two vehicles towards each other under the extreme command (full drive or full
+            braking), m/s2.
+        reach: largest amount by which another command can lower the acceleration ``press``, m/s2; infinite if no limit
+            is known.
         opening: speed at which the two vehicles separate, m/s.
         flight: length of the flight, s.
 
@@ -48,12 +51,15 @@ def best_flight(share: float, press: float, reach: float, opening: float) -> flo
     """Return the length (s) of the flight with the largest ``flight_lead``; infinite if longer flights are always
     better.
 
-    A *flight* is a time in which the two vehicles are apart.
+    A *flight* is a period in which the two vehicles are not in contact.
 
     Args:
-        share: partner's share of the mass of both vehicles, 0 to 1.
-        press: acceleration at which the two vehicles close under the best command, m/s2.
-        reach: part of ``press`` that another command can take away, m/s2; infinite: no limit is known.
+        share: mass of the partner (the neighbour of the first contact), as a share of the mass of both vehicles, 0 to
+            1.
+        press: acceleration of the two vehicles towards each other under the extreme command (full drive or full
+            braking), m/s2.
+        reach: largest amount by which another command can lower the acceleration ``press``, m/s2; infinite if no limit
+            is known.
         opening: speed at which the two vehicles separate, m/s.
 
     """
@@ -77,13 +83,17 @@ def lead(
 ) -> float:
     """Return the largest ``flight_lead`` (m/s) of all flights that last from ``shortest`` to ``longest`` seconds.
 
-    A *flight* is a time in which the two vehicles are apart. The result is the maximum over all opening speeds up to
-    ``opening``, because with a limit on the length of the flight a smaller opening speed may have a larger lead.
+    A *flight* is a period in which the two vehicles are not in contact. The result is the maximum over all opening
+    speeds up to ``opening``, because with a limit on the length of the flight a smaller opening speed may have a larger
+    lead.
 
     Args:
-        share: partner's share of the mass of both vehicles, 0 to 1.
-        press: acceleration at which the two vehicles close under the best command, m/s2.
-        reach: part of ``press`` that another command can take away, m/s2; infinite: no limit is known.
+        share: mass of the partner (the neighbour of the first contact), as a share of the mass of both vehicles, 0 to
+            1.
+        press: acceleration of the two vehicles towards each other under the extreme command (full drive or full
+            braking), m/s2.
+        reach: largest amount by which another command can lower the acceleration ``press``, m/s2; infinite if no limit
+            is known.
         opening: largest speed at which the two vehicles separate, m/s.
         shortest: smallest length of the flight, s.
         longest: largest length of the flight, s.
@@ -109,9 +119,12 @@ def decays(share: float, press: float, reach: float, bounce: float) -> bool:
     result is True, ``reach`` limits the speed that the vehicle can gain in any flight.
 
     Args:
-        share: partner's share of the mass of both vehicles, 0 to 1.
-        press: acceleration at which the two vehicles close under the best command, m/s2.
-        reach: part of ``press`` that another command can take away, m/s2; infinite: no limit is known.
+        share: mass of the partner (the neighbour of the first contact), as a share of the mass of both vehicles, 0 to
+            1.
+        press: acceleration of the two vehicles towards each other under the extreme command (full drive or full
+            braking), m/s2.
+        reach: largest amount by which another command can lower the acceleration ``press``, m/s2; infinite if no limit
+            is known.
         bounce: coefficient of restitution.
 
     """
@@ -135,18 +148,22 @@ def largest_lead(
     computed for the best command from the first contact on. In fact the earlier command still applies in the *window*
     (the rest of the decision step), which costs the speed ``lost``.
 
-    A *flight* is a time in which the pair is apart. The bound is the maximum over three cases: the last flight before
-    the contact with the other neighbour began with the first impact, within the window, or after the window.
+    A *flight* is a period in which the two vehicles of the pair are not in contact. The bound is the maximum over three
+    cases: the last flight before the contact with the other neighbour began with the first impact, within the window,
+    or after the window.
 
     Args:
-        share: partner's share of the mass of both vehicles, 0 to 1.
-        press: acceleration at which the two vehicles close under the best command, m/s2.
-        reach: part of ``press`` that another command can take away, m/s2; infinite: no limit is known.
+        share: mass of the partner (the neighbour of the first contact), as a share of the mass of both vehicles, 0 to
+            1.
+        press: acceleration of the two vehicles towards each other under the extreme command (full drive or full
+            braking), m/s2.
+        reach: largest amount by which another command can lower the acceleration ``press``, m/s2; infinite if no limit
+            is known.
         bounce: coefficient of restitution.
         opening: speed at which the pair separates after the first contact, m/s.
-        lost: speed that is lost in the window, m/s.
-        late: start of the window, s.
-        end: end of the window, s.
+        lost: speed that the controlled vehicle loses in the window (the rest of the decision step), m/s.
+        late: start of the window (the rest of the decision step of the first contact), s.
+        end: end of the window (the rest of the decision step of the first contact), s.
         since: earliest time of the contact with the other neighbour, s.
         until: latest time of the contact with the other neighbour, s.
 
@@ -178,9 +195,11 @@ def widest_flight(
     if no bound is known.
 
     Args:
-        share: partner's share of the mass of both vehicles, 0 to 1.
+        share: mass of the partner (the neighbour of the first contact), as a share of the mass of both vehicles, 0 to
+            1.
         slack: braking capacity of the partner minus braking capacity of the vehicle, m/s2.
-        press: acceleration at which the two vehicles close under the best command, m/s2.
+        press: acceleration of the two vehicles towards each other under the extreme command (full drive or full
+            braking), m/s2.
         drive: largest acceleration that the vehicle can command, m/s2.
         bounce: coefficient of restitution.
         closing: closing speed of the first impact, m/s.

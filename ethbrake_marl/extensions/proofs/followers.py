@@ -66,13 +66,15 @@ def least_closing(
         other_turn: second time at which the rate changes, s.
         other_bend: change of the rate at ``other_turn``, m/s2.
         share: first neighbour's share of the mass of both vehicles of the first contact, 0 to 1.
-        press: acceleration at which the two vehicles close under the best command, m/s2.
-        reach: part of ``press`` that another command can take away, m/s2; infinite: no limit is known.
+        press: acceleration of the two vehicles towards each other under the extreme command (full drive or full
+            braking), m/s2.
+        reach: largest amount by which another command can lower the acceleration ``press``, m/s2; infinite if no limit
+            is known.
         bounce: coefficient of restitution.
         opening: speed at which the two vehicles separate after the first contact, m/s.
-        lost: speed that is lost in the window, m/s.
-        late: start of the window, s.
-        end: end of the window, s.
+        lost: speed that the controlled vehicle loses in the window (the rest of the decision step), m/s.
+        late: start of the window (the rest of the decision step of the first contact), s.
+        end: end of the window (the rest of the decision step of the first contact), s.
         until: latest time of the second contact, s.
 
     """
@@ -101,14 +103,16 @@ def pushed_by_leader(
     ``late``, ``end`` and ``lack``.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        closing: largest closing speed of the first contact, m/s.
-        end: end of the decision step of the first contact, s; the command of this step stays in force until then.
-        lack: smallest possible difference between that command and the best command after the contact, m/s2.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        closing: largest closing speed that the first contact may have, m/s.
+        end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
+        lack: smallest possible difference between the command up to ``end`` and the best command after the contact,
+            m/s2.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     share, rest, press = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE], at[LINE.U_F] + at[LINE.A_L]
@@ -148,12 +152,13 @@ def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: 
     result is 0 if nothing is proven.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        closing: largest closing speed of the first contact, m/s.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        closing: largest closing speed that the first contact may have, m/s.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     share, rest, bounce = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE], at[LINE.RESTITUTION]
@@ -200,14 +205,16 @@ def after_front(
     centre of mass of both vehicles do not hold and are left out.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        closing: largest closing speed of the first contact, m/s.
-        end: end of the decision step of the first contact, s; the command of this step stays in force until then.
-        lack: smallest possible difference between that command and the best command after the contact, m/s2.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        closing: largest closing speed that the first contact may have, m/s.
+        end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
+        lack: smallest possible difference between the command up to ``end`` and the best command after the contact,
+            m/s2.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     share, rest = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE]
@@ -238,7 +245,7 @@ def obstacle_harm(at: Floats, late: float, closing: float) -> float:
     stands at the obstacle, because the push is then one impact of both vehicles and the obstacle.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         late: latest time of the push, s.
         closing: smallest closing speed of the push, m/s.
 
@@ -270,8 +277,8 @@ def braking_after(
         a_l: braking capacity of the vehicle in front, m/s2.
         v_f: speed of the braking vehicle, m/s.
         a_f: braking capacity of the braking vehicle, m/s2.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     fill_braking(plan, 0.0, a_l)
@@ -294,15 +301,17 @@ def pushed_by_rear(
     controlled vehicle must be at least the braking capacity of the rear vehicle.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        closing: largest closing speed of the first contact, m/s.
-        end: end of the decision step of the first contact, s; the command of this step stays in force until then.
-        lack: smallest possible difference between that command and the best command after the contact, m/s2.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        closing: largest closing speed that the first contact may have, m/s.
+        end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
+        lack: smallest possible difference between the command up to ``end`` and the best command after the contact,
+            m/s2.
         gap: gap to the front vehicle at ``early``, m.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     share, rest = at[LINE.REAR_SHARE], 1.0 - at[LINE.REAR_SHARE]
@@ -334,12 +343,13 @@ def slowed_by_rear(at: Floats, early: float, closing: float, gap: float, plan: F
     speed may rise.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        closing: largest closing speed of the first contact, m/s.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        closing: largest closing speed that the first contact may have, m/s.
         gap: gap to the front vehicle at ``early``, m.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     share, v_l = at[LINE.REAR_SHARE], leader(at, early)[0]

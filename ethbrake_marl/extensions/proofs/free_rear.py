@@ -46,8 +46,8 @@ def gained(near: float, time: float, since: float, power: float) -> float:
         near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m.
         time: time of the comparison, s.
         since: time from which on the rear vehicle may brake less than fully, s.
-        power: largest difference between the rear vehicle's acceleration and full braking, m/s2; infinite if other
-            vehicles may push it.
+        power: largest difference between the rear vehicle's acceleration and its full braking, m/s2; infinite if other
+            vehicles may push the rear vehicle.
 
     """
     if near <= 0.0 or time <= since:
@@ -65,7 +65,7 @@ def behind_full_braking(at: Floats, early: float, late: float) -> float:
     A negative gap is an overlap: the rear vehicle would be that far ahead of the controlled one.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: end of the controlled vehicle's motion, s.
         late: end of the rear vehicle's motion, s.
 
@@ -83,14 +83,15 @@ def soft_behind(at: Floats, early: float, late: float, near: float, far: float, 
     The *lead* is the distance by which the rear vehicle is farther ahead than under its own full braking.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        near: smallest lead of the rear vehicle, m.
-        far: largest lead of the rear vehicle, m.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m.
+        far: largest distance by which the rear vehicle is farther ahead than if it braked fully, m.
         since: time from which on the rear vehicle may brake less than fully, s.
-        power: largest difference between the rear vehicle's acceleration and full braking, m/s2; infinite if other
-            vehicles may push it.
+        power: largest difference between the rear vehicle's acceleration and its full braking, m/s2; infinite if other
+            vehicles may push the rear vehicle.
 
     """
     faster = gained(near, late, since, power)
@@ -111,16 +112,17 @@ def after_behind(
     controlled vehicle is at every time at least as far ahead and as fast as in this motion.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        near: smallest lead of the rear vehicle, m.
-        far: largest lead of the rear vehicle, m.
-        hard: largest closing speed of the first contact, m/s.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m.
+        far: largest distance by which the rear vehicle is farther ahead than if it braked fully, m.
+        hard: largest closing speed that the first contact may have, m/s.
         faster: smallest difference between the rear vehicle's speed and its speed under full braking, m/s.
-        moved: working memory for a second world, [LINE.WIDTH].
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     further = near - faster * (late - early)
@@ -155,20 +157,23 @@ def put_behind(
     Returns the new number of cells on the heap.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        near: smallest lead of the rear vehicle, m.
-        far: largest lead of the rear vehicle, m.
-        soft: smallest closing speed of the first contact, m/s.
-        hard: largest closing speed of the first contact, m/s.
-        search: [SEARCH] settings of the search: ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound
-            of the front pair alone, m2/s2) and ``BEST`` (smallest harm found so far, m2/s2).
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m.
+        far: largest distance by which the rear vehicle is farther ahead than if it braked fully, m.
+        soft: smallest closing speed that the first contact may have, m/s.
+        hard: largest closing speed that the first contact may have, m/s.
+        search: [SEARCH] numbers of the search: ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of ``gained``;
+            ``FLOOR`` is the bound of the front pair alone (m2/s2); ``BEST`` is the smallest harm that the search has
+            reached so far (m2/s2).
         count: number of cells on the heap.
-        moved: working memory for a second world, [LINE.WIDTH].
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
-        heap: [SEARCHED + 4, HEAP_WIDTH] cells ordered as a binary heap; changed in place.
+        moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
+        heap: [SEARCHED + 4, HEAP_WIDTH] binary heap with one row for each cell (range of first contacts); changed in
+            place.
 
     """
     since, power, floor = search[SINCE], search[POWER], search[FLOOR]
@@ -197,17 +202,17 @@ def try_behind(
     smaller.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         time: time of the contact, s.
         near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m; raised if no
             contact has it.
         far: largest distance by which the rear vehicle is farther ahead than if it braked fully, m.
-        search: [SEARCH] settings of the search: ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound
-            of the front pair alone, m2/s2) and ``BEST`` (smallest harm found so far, m2/s2). The function lowers
-            ``BEST``.
-        moved: working memory for a second world, [LINE.WIDTH].
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        search: [SEARCH] numbers of the search: ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of ``gained``;
+            ``FLOOR`` is the bound of the front pair alone (m2/s2); ``BEST`` is the smallest harm that the search has
+            reached so far (m2/s2). The function lowers ``BEST`` if it reaches a smaller harm.
+        moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     near = max(near, behind_full_braking(at, time, time))
@@ -229,15 +234,16 @@ def divide_behind(
     distance by which the rear vehicle is farther ahead than under its own full braking.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        search: [SEARCH] settings of the search: ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound
-            of the front pair alone, m2/s2) and ``BEST`` (smallest harm found so far, m2/s2). The function lowers
-            ``BEST``.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        search: [SEARCH] numbers of the search: ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of ``gained``;
+            ``FLOOR`` is the bound of the front pair alone (m2/s2); ``BEST`` is the smallest harm that the search has
+            reached so far (m2/s2). The function lowers ``BEST`` if it reaches a smaller harm.
         count: number of cells on the heap.
-        moved: working memory for a second world, [LINE.WIDTH].
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
-        heap: [SEARCHED + 4, HEAP_WIDTH] cells ordered as a binary heap; changed in place.
+        moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
+        heap: [SEARCHED + 4, HEAP_WIDTH] binary heap with one row for each cell (range of first contacts); changed in
+            place.
 
     """
     early, late, near, far = heap[0, EARLY], heap[0, LATE], heap[0, NEAR], heap[0, FAR]
@@ -272,15 +278,16 @@ def meetings_behind(
     The result is at most ``search[BEST]``.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         last: latest time of the contact, s after the controlled vehicle may act.
-        search: [SEARCH] settings of the search: ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound
-            of the front pair alone, m2/s2) and ``BEST`` (smallest harm found so far, m2/s2). The function lowers
-            ``BEST``.
-        moved: working memory for a second world, [LINE.WIDTH].
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
-        heap: working memory for the cells of the search, [SEARCHED + 4, HEAP_WIDTH].
+        search: [SEARCH] numbers of the search: ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of ``gained``;
+            ``FLOOR`` is the bound of the front pair alone (m2/s2); ``BEST`` is the smallest harm that the search has
+            reached so far (m2/s2). The function lowers ``BEST`` if it reaches a smaller harm.
+        moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
+        heap: working memory for the search, [SEARCHED + 4, HEAP_WIDTH]: one row for each cell (range of first
+            contacts).
 
     """
     since, hard, count = min(search[SINCE], last), math.sqrt(search[BEST]), 0

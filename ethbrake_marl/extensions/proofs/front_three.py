@@ -43,12 +43,12 @@ def all_at_once(at: Floats, first: float, last: float, pair: Floats, plan: Float
     pairs add up to at least W. The closing speed of the front pair is at least its smallest value at any first contact.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         first: earliest first contact with the front vehicle, s.
         last: latest first contact with the front vehicle, s.
-        pair: working memory for a pair, [PAIR_WIDTH].
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        pair: working memory for the values of one pair, [PAIR_WIDTH]; overwritten.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     pair[PAIR_GAP], pair[LEADER_ONSET], pair[LEADER_FREE] = at[LINE.GAP_L] + at[LINE.GAP_R], 0.0, 0.0
@@ -72,11 +72,11 @@ def late_meetings(at: Floats, first: float, stand: float, plan: Floats, other: F
     Code 2: yes, and nothing is proven about the harm.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         first: earliest first contact with the front vehicle, s; infinite: there is none.
         stand: time at which the rear vehicle comes to rest under full braking, s.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     if first == math.inf or not stays_ahead(at, first, first, plan, other):
@@ -103,16 +103,16 @@ def combined_bound_of_team(
     The bound covers first contacts with either neighbour. The result is 0 if some of the harm may come after ``until``.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         until: horizon, s; later harm does not count.
-        front: bound on the harm of the front pair alone, m2/s2.
-        rear: bound on the harm of the rear pair alone, m2/s2.
+        front: lower bound on the harm of the front pair (front and controlled vehicle) alone, m2/s2.
+        rear: lower bound on the harm of the rear pair (controlled and rear vehicle) alone, m2/s2.
         since: time from which on the rear vehicle may brake less than fully, s.
-        power: largest difference between the rear vehicle's acceleration and full braking, m/s2.
-        pair: working memory for a pair, [PAIR_WIDTH].
-        moved: working memory for a second world, [LINE.WIDTH].
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        power: largest difference between the rear vehicle's acceleration and its full braking, m/s2.
+        pair: working memory for the values of one pair, [PAIR_WIDTH]; overwritten.
+        moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
         heap: working memory for the cells of contacts with the front vehicle, [CELLS, NEAR].
         heap_behind: working memory for the cells of contacts with the rear vehicle, [SEARCHED + 4, HEAP_WIDTH].
 

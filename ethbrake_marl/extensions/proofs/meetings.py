@@ -33,8 +33,8 @@ def gentlest_front(at: Floats, time: float) -> tuple[float, float]:
     second result, in s), and then brakes.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        time: time of the contact, s after the controlled vehicle may act.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        time: time of the contact, in s from the moment at which the controlled vehicle may act.
 
     """
     v_l, way = leader(at, time)
@@ -61,8 +61,8 @@ def braked_then_driven(at: Floats, brake: float, time: float) -> tuple[float, fl
     A vehicle that brakes to rest waits there until it drives.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        brake: duration of the braking, s.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        brake: how long the vehicle brakes before it drives, s.
         time: time of the result, s.
 
     """
@@ -83,8 +83,8 @@ def braking_to_rear(at: Floats, time: float, further: float) -> float:
     ``time``.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        time: time of the contact, s after the controlled vehicle may act.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        time: time of the contact, in s from the moment at which the controlled vehicle may act.
         further: distance by which the rear vehicle is farther ahead than under full braking, m.
 
     """
@@ -109,8 +109,8 @@ def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
     by ``time``.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        time: time of the contact, s after the controlled vehicle may act.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        time: time of the contact, in s from the moment at which the controlled vehicle may act.
 
     """
     brake = braking_to_rear(at, time, 0.0)
@@ -125,10 +125,10 @@ def gentlest(kind: int, at: Floats, time: float) -> tuple[float, float]:
     With brake build-up the second result is 0.
 
     Args:
-        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
-            ``RAMPED_REAR``).
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        time: time of the contact, s after the controlled vehicle may act.
+        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
+            build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        time: time of the contact, in s from the moment at which the controlled vehicle may act.
 
     """
     if kind >= RAMPED_FRONT:
@@ -143,10 +143,10 @@ def meet_front(at: Floats, drive: float, plan: Floats, other: Floats) -> float:
     The result is infinite if there is no contact.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         drive: duration of the drive, s; infinite: the vehicle never brakes.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], drive, at[LINE.A_F])
@@ -161,10 +161,10 @@ def meet_rear(at: Floats, brake: float, plan: Floats, other: Floats) -> float:
     The result is infinite if there is no contact.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        brake: duration of the braking, s.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        brake: how long the vehicle brakes before it drives, s.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     fill_brake_then_drive(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], brake, at[LINE.A_F])
@@ -179,11 +179,11 @@ def stays_ahead(at: Floats, drive: float, until: float, plan: Floats, other: Flo
     """Return whether the controlled vehicle avoids the rear vehicle until ``until`` if it drives first and then brakes.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        drive: duration of the drive, s.
-        until: end of the comparison, s.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        drive: how long the vehicle drives before it brakes, s.
+        until: time until which there must be no contact, s.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], drive, at[LINE.A_F])
@@ -197,11 +197,11 @@ def stays_behind(at: Floats, brake: float, until: float, plan: Floats, other: Fl
     drives.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        brake: duration of the braking, s.
-        until: end of the comparison, s.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        brake: how long the vehicle brakes before it drives, s.
+        until: time until which there must be no contact, s.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     fill_brake_then_drive(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], brake, at[LINE.A_F])

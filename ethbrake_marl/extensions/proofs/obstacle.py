@@ -44,7 +44,7 @@ def all_three(at: Floats) -> tuple[float, float, float, float]:
     mass before the rear vehicle's onset. The fourth is the additional deceleration by the rear vehicle's brakes.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
 
     """
     front, rear = at[LINE.FRONT_SHARE] / (1.0 - at[LINE.FRONT_SHARE]), at[LINE.REAR_SHARE] / (1.0 - at[LINE.REAR_SHARE])
@@ -59,7 +59,7 @@ def leader_pushed(at: Floats, early: float, beyond: float) -> tuple[float, float
     The push is just strong enough that the front vehicle hits the obstacle with the speed ``sqrt(beyond)``.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: time of the push, s.
         beyond: squared speed at the obstacle, m2/s2.
 
@@ -77,14 +77,14 @@ def least_beyond(
     The bound uses the centre of mass of all three vehicles: it cannot reach the obstacle before the front vehicle does.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: time of the push, s.
         late: time at which the vehicles have ``place`` and ``speed``, s.
-        place: smallest position of the centre of mass of all three vehicles at ``late``, m.
-        speed: speed of this centre of mass at ``late``, m/s.
-        least: lower bound that is known already, m2/s2; the result is at least ``least``.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        place: smallest possible position, at ``late``, of the centre of mass of all three vehicles, m.
+        speed: speed of the centre of mass of all three vehicles at ``late``, m/s.
+        least: lower bound on the result that is known already, m2/s2; the result is at least ``least``.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     if not speed > 0.0:
@@ -109,9 +109,10 @@ def slowest(at: Floats, early: float, late: float, faster: float) -> tuple[float
     that no command and no push brings the vehicle further behind.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
         faster: speed by which the vehicle is faster than the front vehicle after the contact, m/s.
 
     """
@@ -157,10 +158,11 @@ def stopped_there(
     (m/s) is the vehicle's largest backward speed. The time (s) is the longest time that it spends near the obstacle.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        hard: largest closing speed of the first contact, m/s.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        hard: largest closing speed that the first contact may have, m/s.
         beyond: squared speed at which the front vehicle hits the obstacle, m2/s2.
         struck: time at which the front vehicle hits the obstacle, s.
         until: time by which the rear vehicle arrives, s.
@@ -202,16 +204,17 @@ def behind_leader(
     vehicle or the obstacle. The result is LARGE (a huge number) if these assumptions contradict each other.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        soft: smallest closing speed of the first contact, m/s.
-        hard: largest closing speed of the first contact, m/s.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        soft: smallest closing speed that the first contact may have, m/s.
+        hard: largest closing speed that the first contact may have, m/s.
         beyond: largest squared speed at which the front vehicle hits the obstacle, m2/s2.
-        place: smallest position of the centre of mass of all three vehicles at ``late``, m.
-        speed: speed of this centre of mass at ``late``, m/s.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        place: smallest possible position, at ``late``, of the centre of mass of all three vehicles, m.
+        speed: speed of the centre of mass of all three vehicles at ``late``, m/s.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     wall, drive, onset = at[LINE.GAP_L] + at[LINE.WALL], at[LINE.U_F], at[LINE.ONSET_R]
@@ -284,14 +287,15 @@ def after_at_obstacle(
     """Return the smallest harm (m2/s2) of rear pair and obstacle together after a first contact with the front vehicle.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        soft: smallest closing speed of the first contact, m/s.
-        hard: largest closing speed of the first contact, m/s.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        soft: smallest closing speed that the first contact may have, m/s.
+        hard: largest closing speed that the first contact may have, m/s.
         follows: known lower bound on the harm of the rear pair, m2/s2.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     share = at[LINE.FRONT_SHARE]
@@ -327,13 +331,14 @@ def beyond_rear(
     rear vehicle.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        closing: largest closing speed of the first contact, m/s.
-        least: lower bound that is known already, m2/s2; the result is at least ``least``.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        closing: largest closing speed that the first contact may have, m/s.
+        least: lower bound on the result that is known already, m2/s2; the result is at least ``least``.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     v_l, way_l = leader(at, late)
@@ -353,14 +358,16 @@ def after_rear(
     """Return the smallest harm (m2/s2) of front pair and obstacle together after a first contact with the rear vehicle.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        closing: largest closing speed of the first contact, m/s.
-        end: end of the decision step of the first contact, s; the command of this step stays in force until then.
-        lack: smallest possible difference between that command and the best command after the contact, m/s2.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        closing: largest closing speed that the first contact may have, m/s.
+        end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
+        lack: smallest possible difference between the command up to ``end`` and the best command after the contact,
+            m/s2.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     share, rest = at[LINE.REAR_SHARE], 1.0 - at[LINE.REAR_SHARE]
@@ -394,16 +401,19 @@ def after(
     """Return the smallest harm (m2/s2) of the other pair (and the obstacle) after a first contact with one neighbour.
 
     Args:
-        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
-            ``RAMPED_REAR``).
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        closing: largest closing speed of the first contact, m/s.
-        end: end of the decision step of the first contact, s; the command of this step stays in force until then.
-        lack: smallest possible difference between that command and the best command after the contact, m/s2.
-        plan: working memory for the motion of one vehicle, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: second working memory of the same kind.
+        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
+            build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        closing: largest closing speed that the first contact may have, m/s.
+        end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
+        lack: smallest possible difference between the command up to ``end`` and the best command after the contact,
+            m/s2.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan`` (with brake build-up from
+            ``empty_legs``); overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     if kind >= RAMPED_FRONT:

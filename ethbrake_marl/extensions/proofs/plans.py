@@ -78,11 +78,11 @@ def fill_drive_then_brake(plan: Floats, v: float, u: float, limit: float, drive:
     """Write a plan: drive for ``drive`` seconds, at most up to the speed limit, then brake to rest.
 
     Args:
-        plan: [2, PIECES] receives the plan.
+        plan: [2, PIECES] array into which the function writes the motion.
         v: speed now, m/s.
         u: driving acceleration, m/s2.
         limit: speed limit, m/s.
-        drive: duration of the drive, s.
+        drive: how long the vehicle drives before it brakes, s.
         braking: deceleration, m/s2, positive.
 
     """
@@ -95,11 +95,11 @@ def fill_brake_then_drive(plan: Floats, v: float, u: float, limit: float, brake:
     """Write a plan: brake for ``brake`` seconds, at most to rest, then drive up to the speed limit and keep that speed.
 
     Args:
-        plan: [2, PIECES] receives the plan.
+        plan: [2, PIECES] array into which the function writes the motion.
         v: speed now, m/s.
         u: driving acceleration, m/s2.
         limit: speed limit, m/s.
-        brake: duration of the braking, s.
+        brake: how long the vehicle brakes before it drives, s.
         braking: deceleration, m/s2, positive.
 
     """

@@ -1,9 +1,9 @@
 """First contacts with brake build-up, the harm that must follow them, and functions that all lower bounds share.
 
 ``sign`` is 1 for first contacts with the leader and -1 for first contacts with the rear vehicle. The functions treat
-contacts with the rear vehicle as the mirror image of contacts with the leader. A *force* is an acceleration (m/s2). The
-controlled vehicle's force times ``sign`` first rises and later falls: it drives and then brakes towards the leader, and
-does the reverse towards the rear vehicle. ``place`` is a position times ``sign`` (m).
+contacts with the rear vehicle as the mirror image of contacts with the leader. Here *force* means force per mass, which
+is an acceleration (m/s2). The controlled vehicle's force times ``sign`` first rises and later falls: it drives and then
+brakes towards the leader, and does the reverse towards the rear vehicle. ``place`` is a position times ``sign`` (m).
 docs/internals/proofs/lower-bound-cases.md has the proofs.
 """
 
@@ -37,7 +37,8 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 def fill_leader(at: Floats, plan: Floats) -> None:
     """Write the motion of the front vehicle, if no other vehicle pushes it, to ``plan`` [3, LEGS].
 
-    A plan is a piecewise linear acceleration over time. ``at`` is the state of one world, [LINE.WIDTH].
+    A plan describes a vehicle's acceleration as a piecewise linear function of time. ``at`` is the state of one world,
+    [LINE.WIDTH] numbers in the order of ``line.LINE``.
     """
     fill_build_up(plan, 0.0, at[LINE.FORCE_L], -at[LINE.A_L], at[LINE.FALL_L])
 
@@ -46,7 +47,8 @@ def fill_leader(at: Floats, plan: Floats) -> None:
 def fill_follower(at: Floats, plan: Floats) -> None:
     """Write the motion of the rear vehicle, if no other vehicle pushes it, to ``plan`` [3, LEGS].
 
-    A plan is a piecewise linear acceleration over time. ``at`` is the state of one world, [LINE.WIDTH].
+    A plan describes a vehicle's acceleration as a piecewise linear function of time. ``at`` is the state of one world,
+    [LINE.WIDTH] numbers in the order of ``line.LINE``.
     """
     fill_build_up(plan, at[LINE.ONSET_R], at[LINE.FORCE_R], -at[LINE.A_R], at[LINE.FALL_R])
 
@@ -56,12 +58,13 @@ def range_of(sign: float, at: Floats) -> tuple[float, float, float, float]:
     """Return the limits of ``sign`` times the controlled vehicle's force: largest force, rate up, least force, rate
     down.
 
-    A *force* is an acceleration (m/s2); rates are in m/s3. The least force is negative and is returned without its
-    minus sign. If ``sign`` is 1, the largest force is full drive; if ``sign`` is -1, it is full braking.
+    Here *force* means force per mass, which is an acceleration (m/s2); rates are in m/s3. The least force is negative
+    and is returned without its minus sign. If ``sign`` is 1, the largest force is full drive; if ``sign`` is -1, it is
+    full braking.
 
     Args:
         sign: 1 or -1.
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
 
     """
     if sign > 0.0:
@@ -74,15 +77,15 @@ def fill_controlled(at: Floats, sign: float, switch: float, time: float, final: 
     """Write a plan of the controlled vehicle: ``sign`` times its force rises as fast as possible until ``switch``, then
     falls.
 
-    A *force* is an acceleration (m/s2). After ``switch`` it falls as fast as possible.
+    Here *force* means force per mass, which is an acceleration (m/s2). After ``switch`` it falls as fast as possible.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        sign: 1 for a contact with the front vehicle, -1 with the rear vehicle.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        sign: 1 for a contact with the front vehicle, -1 for a contact with the rear vehicle.
         switch: time at which the force begins to fall, s.
         time: time of the contact, s.
-        final: force times ``sign`` at ``time``, m/s2; -inf: no condition.
-        plan: [3, LEGS] receives the plan.
+        final: required value of ``sign`` times the force at ``time``, m/s2; -inf if no value is required.
+        plan: [3, LEGS] array into which the function writes the motion.
 
     """
     high, rise, low, fall = range_of(sign, at)
@@ -101,13 +104,13 @@ def switch_for(
     earlier one.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        sign: 1 for a contact with the front vehicle, -1 with the rear vehicle.
-        time: time of the contact, s after the controlled vehicle may act.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        sign: 1 for a contact with the front vehicle, -1 for a contact with the rear vehicle.
+        time: time of the contact, in s from the moment at which the controlled vehicle may act.
         place: position times ``sign`` at ``time``, m.
-        final: force times ``sign`` at ``time``, m/s2; -inf: no condition.
+        final: required value of ``sign`` times the force at ``time``, m/s2; -inf if no value is required.
         halvings: number of bisections.
-        plan: working memory for the motion of one vehicle, [3, LEGS].
+        plan: working memory for the motion of one vehicle, an array from ``empty_legs``; overwritten.
 
     """
     low, high = (-1.0 if range_of(sign, at)[1] == math.inf else 0.0), time
@@ -130,10 +133,10 @@ def met_at(kind: int, at: Floats, time: float, plan: Floats) -> tuple[float, flo
     The *sign* is 1 for the front vehicle and -1 for the rear one. The *place* is the position times the sign.
 
     Args:
-        kind: neighbour of the first contact, ``RAMPED_FRONT`` or ``RAMPED_REAR``.
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        time: time of the contact, s after the controlled vehicle may act.
-        plan: working memory for the motion of one vehicle, [3, LEGS].
+        kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        time: time of the contact, in s from the moment at which the controlled vehicle may act.
+        plan: working memory for the motion of one vehicle, an array from ``empty_legs``; overwritten.
 
     """
     if kind == RAMPED_FRONT:
@@ -150,9 +153,9 @@ def gentlest_ramped(kind: int, at: Floats, time: float) -> float:
     """Return the smallest closing speed (m/s) of a first contact at ``time``, with brake build-up.
 
     Args:
-        kind: neighbour of the first contact, ``RAMPED_FRONT`` or ``RAMPED_REAR``.
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        time: time of the contact, s after the controlled vehicle may act.
+        kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        time: time of the contact, in s from the moment at which the controlled vehicle may act.
 
     """
     plan = empty_legs()
@@ -171,13 +174,14 @@ def slack_of(
     ``late``.
 
     Args:
-        kind: neighbour of the first contact, ``RAMPED_FRONT`` or ``RAMPED_REAR``.
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
+        kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
         v: speed of the neighbour at ``early``, m/s.
-        hard: largest closing speed of the first contact, m/s.
-        plan: working memory for the motion of one vehicle, [3, LEGS].
+        hard: largest closing speed that the first contact may have, m/s.
+        plan: working memory for the motion of one vehicle, an array from ``empty_legs``; overwritten.
 
     """
     span = late - early
@@ -192,10 +196,11 @@ def gentlest_ramped_between(kind: int, at: Floats, early: float, late: float) ->
     """Return the smallest closing speed (m/s) of first contacts between ``early`` and ``late``, with brake build-up.
 
     Args:
-        kind: neighbour of the first contact, ``RAMPED_FRONT`` or ``RAMPED_REAR``.
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
+        kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
 
     """
     plan = empty_legs()
@@ -219,11 +224,12 @@ def force_of_meeting(kind: int, at: Floats, early: float, late: float, hard: flo
     opposite sign, so the bound is on the braking.
 
     Args:
-        kind: neighbour of the first contact, ``RAMPED_FRONT`` or ``RAMPED_REAR``.
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        hard: largest closing speed of the first contact, m/s.
+        kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        hard: largest closing speed that the first contact may have, m/s.
 
     """
     plan = empty_legs()
@@ -253,13 +259,14 @@ def after_ramped(
     The bound uses the motion of the controlled vehicle alone.
 
     Args:
-        kind: neighbour of the first contact, ``RAMPED_FRONT`` or ``RAMPED_REAR``.
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        hard: largest closing speed of the first contact, m/s.
-        plan: working memory for the motion of one vehicle, [3, LEGS].
-        other: second working memory of the same kind, [3, LEGS].
+        kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        hard: largest closing speed that the first contact may have, m/s.
+        plan: working memory for the motion of one vehicle, an array from ``empty_legs``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     sign = 1.0 if kind == RAMPED_FRONT else -1.0
@@ -305,11 +312,11 @@ def is_first_ramped(kind: int, at: Floats, time: float, plan: Floats, other: Flo
     """Return whether a first contact at ``time`` or later is possible before the other neighbour arrives.
 
     Args:
-        kind: neighbour of the first contact, ``RAMPED_FRONT`` or ``RAMPED_REAR``.
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        time: time of the contact, s after the controlled vehicle may act.
-        plan: working memory for the motion of one vehicle, [3, LEGS].
-        other: second working memory of the same kind, [3, LEGS].
+        kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        time: time of the contact, in s from the moment at which the controlled vehicle may act.
+        plan: working memory for the motion of one vehicle, an array from ``empty_legs``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     sign, _, place = met_at(kind, at, time, plan)
@@ -336,11 +343,11 @@ def meet_ramped(kind: int, at: Floats, sign: float, plan: Floats, other: Floats)
     the smallest closing speed (m/s) over all motions of the pair whose gap is never larger than in this motion.
 
     Args:
-        kind: neighbour of the first contact, ``RAMPED_FRONT`` or ``RAMPED_REAR``.
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         sign: 1: the controlled vehicle drives fully; -1: it brakes fully.
-        plan: working memory for the motion of one vehicle, [3, LEGS].
-        other: second working memory of the same kind, [3, LEGS].
+        plan: working memory for the motion of one vehicle, an array from ``empty_legs``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     fill_controlled(at, sign, math.inf, math.inf, -math.inf, plan)
@@ -397,9 +404,9 @@ def at_onset_of(
 
     Args:
         where: name of the caller, for error messages.
-        worlds: the worlds now, [n].
+        worlds: the ``n`` worlds in their present state.
         vehicles: indices of the controlled vehicles.
-        harm_count: ``first`` or ``total`` impacts.
+        harm_count: which impacts count: ``first`` or ``total``.
         horizon_s: horizon, s.
 
     Raises ``InvalidInput`` if the horizon is not finite, or lies before a vehicle may act.

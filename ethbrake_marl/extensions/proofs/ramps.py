@@ -1,10 +1,10 @@
 """Simulate two vehicles whose accelerations change at finite rates: their first contact and its closing speed.
 
-A *force* is an acceleration (m/s2). A *plan* is the motion of one vehicle, an array [3, LEGS]. Row ENDS has the end of
-each leg (s from now; the last leg never ends), row FORCES the force at its start (m/s2), row JERKS the rate of change
-(m/s3). A vehicle at rest stays there until its force is above 0. A vehicle at its speed limit keeps that speed until
-its force is below 0. No time steps are needed, because the gap is piecewise a cubic polynomial of time.
-docs/internals/proofs/lower-bound-cases.md has the proof, under "Brakes that build up".
+Here *force* means force per mass, which is an acceleration (m/s2). A *plan* is the motion of one vehicle, an array [3,
+LEGS]. Row ENDS has the end of each leg (s from now; the last leg never ends), row FORCES the force at its start (m/s2),
+row JERKS the rate of change (m/s3). A vehicle at rest stays there until its force is above 0. A vehicle at its speed
+limit keeps that speed until its force is below 0. No time steps are needed, because the gap is piecewise a cubic
+polynomial of time. docs/internals/proofs/lower-bound-cases.md has the proof, under "Brakes that build up".
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def fill_switch(
     forces below are multiplied by ``sign``.
 
     Args:
-        plan: [3, LEGS] receives the plan.
+        plan: [3, LEGS] array into which the function writes the motion.
         sign: 1 or -1.
         force: force now.
         high: largest force.

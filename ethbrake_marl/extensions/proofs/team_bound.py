@@ -47,13 +47,13 @@ def _combined_bound_of_line(
     The combined bound is 0 unless the first vehicle brakes already. The second vehicle is treated as if it may act now.
 
     Args:
-        now: the worlds now, [n].
+        now: the ``n`` worlds in their present state.
         onset: [n, N] time from now at which each vehicle may act, s.
         counts: [n, P] True for pairs whose next impact counts and whose vehicles move forward.
         chosen: indices of the controlled vehicles; they include the second vehicle.
         until: [n] horizon, s from now.
         pairs: [n, 2] bounds of both pairs alone, m2/s2.
-        time_step_s: time between two decisions, s; None: commands may change at any time.
+        time_step_s: time between two decisions, s; If ``time_step_s`` is None, commands may change at any time.
 
     """
     v = now.vehicles
@@ -130,26 +130,26 @@ def team_bound(
 ) -> TeamBound:
     """Return a proven lower bound on the harm of every world, whatever several controlled vehicles do together.
 
-    ``harm = early + obstacle + max((pairs[:, 0] + pairs[:, 1]), combined) + pairs[:, 2:].sum(axis=1)``. Each part is
-    lowered by the largest possible rounding error. If Vehicle 1 is controlled, ``combined`` covers the obstacle,
-    Vehicle 1 and Vehicle 2: ``harm = early + max((obstacle + pairs[:, 0]), combined) + pairs[:, 1:].sum(axis=1)``. Harm
-    that may come only after the horizon counts as 0.
+    ``harm = early + obstacle + max((pairs[:, 0] + pairs[:, 1]), combined) + pairs[:, 2:].sum(axis=1)``. Each term of
+    this formula is lowered by the largest possible rounding error. If Vehicle 1 is controlled, ``combined`` covers the
+    obstacle, Vehicle 1 and Vehicle 2: ``harm = early + max((obstacle + pairs[:, 0]), combined) + pairs[:,
+    1:].sum(axis=1)``. Harm that may come only after ``horizon_s`` counts as 0.
 
     All other vehicles brake fully from their latencies on. With a single controlled vehicle, ``lower_bound`` gives
     larger bounds for the lines that it covers.
 
     Args:
-        worlds: the worlds now, [n].
+        worlds: the ``n`` worlds in their present state.
         vehicles: indices of the controlled vehicles, from 0.
-        harm_count: ``first`` or ``total``. With ``first``, only the first impact of each pair counts, even if it came
-            before now.
+        harm_count: which impacts count: ``first`` or ``total``. With ``first``, only the first impact of each pair
+            counts: if a pair has had an impact before now, no later impact of this pair counts.
         horizon_s: time until which harm counts, s after the alert.
-        scripts: script name of each other vehicle, by index. Every script must be full_brake. None: all other vehicles
-            brake fully.
+        scripts: maps the index of each vehicle that is not controlled to the name of its script. The only script
+            allowed is full_brake. If ``scripts`` is None, these vehicles brake fully.
         time_step_s: time between two decisions, s. With a time step the bound holds only for commands that change at
             decisions. The first decision comes when the first controlled vehicle may act, and the next ones every
             ``time_step_s`` after it. The bound is then larger if Vehicle 2 is the first controlled vehicle that may
-            act. None: commands may change at any time.
+            act. If ``time_step_s`` is None, commands may change at any time.
 
     Raises ``InvalidInput`` for vehicles that are empty, unknown or repeated, another script, an unknown harm count, a
     time step below ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before the first of the vehicles may
