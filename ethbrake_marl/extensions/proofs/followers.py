@@ -5,7 +5,7 @@ the extreme command (full drive or full braking) is best for the centre of mass 
 controlled vehicle moves faster or slower than this centre of mass only until it meets the first neighbour again;
 ``flights.largest_lead`` bounds the difference. docs/internals/proofs/lower-bound.md has the proofs.
 
-The functions bound all first contacts between the times ``early`` and ``late`` at once, starting from the state at
+Each function computes one bound for all first contacts between the times ``early`` and ``late``, from the state at
 ``early``. From ``late`` to ``end`` the command of the earlier decision still applies. This command differs from the
 extreme command by at least ``lack`` (m/s2).
 """
@@ -52,20 +52,21 @@ def least_closing(
 ) -> float:  # fmt: skip
     """Return the smallest closing speed (m/s) of the controlled vehicle's contact with its second neighbour.
 
-    The controlled vehicle had contact with its first neighbour before. The result has two parts: the closing speed of
-    the second neighbour relative to the centre of mass of the controlled vehicle and its first neighbour, minus the
-    largest difference between the speeds of the controlled vehicle and this centre of mass (``largest_lead``). In the
-    *window* the command of the earlier decision still applies, which costs the speed ``lost``. Times count from the
-    first contact, in s.
+    The controlled vehicle had contact with its first neighbour before. The bound is v - d. Here v is the closing speed
+    of the second neighbour relative to the centre of mass of the controlled vehicle and its first neighbour. The
+    largest difference between the speeds of the controlled vehicle and this centre of mass is d (``largest_lead``). In
+    the *window* (the rest of the decision step of the first contact) the command of the earlier decision still applies.
+    This costs the vehicle the speed ``lost``. Times count from the first contact, in s.
 
     Args:
-        start: closing speed of the second neighbour relative to the centre of mass at the first contact, m/s.
-        slope: rate of change of the closing speed ``start``, m/s2.
-        turn: first time at which the rate changes, s.
-        bend: change of the rate at ``turn``, m/s2.
-        other_turn: second time at which the rate changes, s.
-        other_bend: change of the rate at ``other_turn``, m/s2.
-        share: first neighbour's share of the mass of both vehicles of the first contact, 0 to 1.
+        start: closing speed, at the time of the first contact, of the second neighbour relative to the centre of mass
+            of the controlled vehicle and its first neighbour, m/s.
+        slope: rate at which this closing speed (``start``) changes from the first contact on, m/s2.
+        turn: time at which the rate of change (``slope``) increases by ``bend``, s.
+        bend: increase of the rate of change at ``turn``, m/s2; may be negative.
+        other_turn: time at which the rate of change increases by ``other_bend``, s.
+        other_bend: increase of the rate of change at ``other_turn``, m/s2; may be negative.
+        share: mass of the first neighbour, as a share of the mass of this neighbour and the controlled vehicle, 0 to 1.
         press: acceleration of the two vehicles towards each other under the extreme command (full drive or full
             braking), m/s2.
         reach: largest amount by which another command can lower the acceleration ``press``, m/s2; infinite if no limit
@@ -75,7 +76,7 @@ def least_closing(
         lost: speed that the controlled vehicle loses in the window (the rest of the decision step), m/s.
         late: start of the window (the rest of the decision step of the first contact), s.
         end: end of the window (the rest of the decision step of the first contact), s.
-        until: latest time of the second contact, s.
+        until: latest time of the contact with the second neighbour, s.
 
     """
     best = least_of_line(start, slope, turn, bend, other_turn, other_bend, 0.0, until)
@@ -99,8 +100,8 @@ def pushed_by_leader(
     """Return the smallest closing speed (m/s) at the rear pair after a first contact with the front vehicle (leader).
 
     The bound uses the centre of mass of the leader and the controlled vehicle. The result is 0 if nothing is proven. If
-    the leader stands at ``early``, later first contacts lead to the same motion, only later. The function then ignores
-    ``late``, ``end`` and ``lack``.
+    the leader is at rest at ``early``, a later first contact leads to the same motion at a later time, so the function
+    ignores ``late``, ``end`` and ``lack``.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -241,8 +242,8 @@ def after_front(
 @compiled
 def obstacle_harm(at: Floats, late: float, closing: float) -> float:
     """Return the smallest squared speed (m2/s2) at which the front vehicle hits the obstacle after a push from behind.
-    After the push nothing but its own brakes slows the front vehicle. The result is 0 if the front vehicle already
-    stands at the obstacle, because the push is then one impact of both vehicles and the obstacle.
+    After the push only its own brakes slow the front vehicle. The result is 0 if the front vehicle already stands at
+    the obstacle, because the push is then one impact of both vehicles and the obstacle.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -271,8 +272,8 @@ def braking_after(
     certain.
 
     Args:
-        gap: largest possible gap, m.
-        least_gap: smallest possible gap, m; used only if the vehicle in front brakes harder.
+        gap: largest possible gap between the two vehicles, m.
+        least_gap: smallest possible gap between the two vehicles, m; used only if the vehicle in front brakes harder.
         v_l: speed of the vehicle in front, m/s.
         a_l: braking capacity of the vehicle in front, m/s2.
         v_f: speed of the braking vehicle, m/s.
@@ -340,7 +341,7 @@ def slowed_by_rear(at: Floats, early: float, closing: float, gap: float, plan: F
 
     The bound follows from the fact that the controlled vehicle stays ahead of the rear vehicle. The braking capacity of
     the controlled vehicle must be at least the braking capacity of the rear vehicle. The result is 0 if the closing
-    speed may rise.
+    speed of the front pair may rise with time.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.

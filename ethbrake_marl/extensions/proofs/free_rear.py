@@ -1,9 +1,10 @@
 """Find the smallest harm over all first contacts of the controlled vehicle with a rear vehicle that may do anything.
 
 Whatever it does, the rear vehicle is at least as far ahead and at least as fast as if it braked fully. The *lead* of
-the rear vehicle is the distance (m) by which it is farther ahead than under full braking. A first contact has a time, a
-lead and a closing speed; a *cell* is a range of each. The search halves cells until the smallest bound of any cell is
-close to the smallest harm found so far. docs/internals/proofs/team-bound.md has the proof.
+the rear vehicle is the distance (m) by which it is farther ahead than under full braking. The search describes a first
+contact by its time, its lead and its closing speed. A *cell* is a set of first contacts: a range of times, a range of
+leads and a range of closing speeds. The search halves cells until the smallest bound of any cell is close to the
+smallest harm that the search has reached. docs/internals/proofs/team-bound.md has the proof.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def gained(near: float, time: float, since: float, power: float) -> float:
 
     Args:
         near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m.
-        time: time of the comparison, s.
+        time: time for which the two speeds are compared, s.
         since: time from which on the rear vehicle may brake less than fully, s.
         power: largest difference between the rear vehicle's acceleration and its full braking, m/s2; infinite if other
             vehicles may push the rear vehicle.
@@ -60,14 +61,15 @@ def gained(near: float, time: float, since: float, power: float) -> float:
 
 @compiled
 def behind_full_braking(at: Floats, early: float, late: float) -> float:
-    """Return the gap (m) if the controlled vehicle brakes until ``early`` and the rear vehicle until ``late`` (s).
+    """Return the gap (m) between the controlled vehicle's position at ``early`` (s) and the rear vehicle's position at
+    ``late`` (s) if both brake fully.
 
-    A negative gap is an overlap: the rear vehicle would be that far ahead of the controlled one.
+    A negative gap is an overlap: the rear vehicle would be that far ahead of the controlled vehicle.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: end of the controlled vehicle's motion, s.
-        late: end of the rear vehicle's motion, s.
+        early: time for which the controlled vehicle's position is computed, s.
+        late: time for which the rear vehicle's position is computed, s.
 
     """
     return float(
@@ -108,7 +110,7 @@ def after_behind(
 ) -> float:  # fmt: skip
     """Return the smallest squared closing speed (m2/s2) at the front pair after a first contact with the rear vehicle.
 
-    The bound is computed for one motion, which starts from a state at ``early``. After each of the contacts, the
+    The bound is computed for one motion, which starts from a state at ``early``. After any of these first contacts, the
     controlled vehicle is at every time at least as far ahead and as fast as in this motion.
 
     Args:
@@ -198,14 +200,14 @@ def put_behind(
 def try_behind(
     at: Floats, time: float, near: float, far: float, search: Floats, moved: Floats, plan: Floats, other: Floats
 ) -> None:
-    """Lower ``search[BEST]`` to the harm of the gentlest first contact with the rear vehicle at ``time``, if that is
-    smaller.
+    """Lower ``search[BEST]`` to the harm of the gentlest first contact with the rear vehicle at ``time``, if this harm
+    is smaller.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         time: time of the contact, s.
-        near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m; raised if no
-            contact has it.
+        near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m; the function
+            raises this distance if no contact at ``time`` has it.
         far: largest distance by which the rear vehicle is farther ahead than if it braked fully, m.
         search: [SEARCH] numbers of the search: ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of ``gained``;
             ``FLOOR`` is the bound of the front pair alone (m2/s2); ``BEST`` is the smallest harm that the search has

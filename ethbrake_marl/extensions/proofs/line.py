@@ -13,7 +13,8 @@ from ethbrake_marl.physics.state import Floats
 
 
 class _Line(NamedTuple):
-    """Index of each column of a world array. The values hold at the moment when the controlled vehicle may act.
+    """Index of each column in the arrays that describe worlds. The values describe a world at the moment at which the
+    controlled vehicle may act.
 
     L marks the front vehicle (leader), F the controlled vehicle (follower), R the rear vehicle. V is a speed (m/s), A a
     braking capacity and U a driving capacity (m/s2).

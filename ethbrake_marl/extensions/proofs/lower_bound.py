@@ -61,7 +61,8 @@ _PARTS = 8  # number of parts into which the times of soft contacts are divided
 
 @compiled
 def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
-    """Return the smallest squared closing speed (m2/s2) at the rear pair's first contact, and its latest time (s).
+    """Return the smallest squared closing speed (m2/s2) at the rear pair's first contact, and the latest time of this
+    contact (s).
 
     Full drive of the controlled vehicle leads to exactly this closing speed and this time. The time is infinite if full
     drive avoids contact.
@@ -103,14 +104,15 @@ def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, o
     """Return the latest time (s) of a first contact with one neighbour that comes before any contact with the other
     one.
 
-    The function bisects the time, because a later first contact brings the other neighbour nearer. For a later contact
-    with the front vehicle the controlled vehicle drives for a shorter time, so the rear vehicle comes nearer. For a
-    later contact with the rear vehicle it brakes for a shorter time, so it comes nearer to the front vehicle.
+    The function finds this time by bisection, because the other neighbour is nearer if the first contact is later. For
+    a later contact with the front vehicle the controlled vehicle drives for a shorter time, so the rear vehicle comes
+    nearer. For a later contact with the rear vehicle the controlled vehicle brakes for a shorter time, so it comes
+    nearer to the front vehicle.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST``.
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        first: time of a first contact before which the other neighbour has not arrived, s.
+        first: time at which a first contact with this neighbour is possible before the other neighbour arrives, s.
         last: latest time of a contact with this neighbour, s; the result is at most ``last``.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
@@ -129,15 +131,15 @@ def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, o
 
 @compiled(apart=True)
 def last_meeting(at: Floats, first: float, plan: Floats, other: Floats) -> tuple[float, float, bool]:
-    """Return the time (s) of the latest contact with the front vehicle, and of the latest one before the rear vehicle
-    arrives.
+    """Return the latest time (s) of a contact with the front vehicle, and the latest time (s) of such a contact before
+    the rear vehicle arrives.
 
     The third result is True if the first contact with the front vehicle may come arbitrarily late and at any closing
     speed.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        first: earliest contact with the front vehicle, s.
+        first: earliest time of a contact with the front vehicle, s.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
@@ -160,8 +162,9 @@ def front_first(
     at once.
 
     The result is at most ``best``. In a contact of all three vehicles at once, the closing speeds of the two pairs add
-    up to the closing speed W of front and rear vehicle. The front pair's part of W is at least its smallest closing
-    speed at that time. This case is included only if a first contact with the front vehicle can come at that time.
+    up to W, the closing speed of the rear vehicle relative to the front vehicle. The closing speed of the front pair is
+    at least its smallest possible value at that time. The result covers such a contact of all three vehicles only if a
+    first contact with the front vehicle can come at that time.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -281,9 +284,9 @@ def rear_first(
 def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
     """Return a time (s) after which no first contact with the rear vehicle is possible.
 
-    Until its first contact, the rear vehicle passes neither the front vehicle nor the controlled one. Let the rear
-    vehicle brake harder than the controlled one, by b (m/s2). Then t seconds before the contact it was faster than the
-    controlled one by at least ``b t``, if it already braked at that time.
+    Until its first contact, the rear vehicle passes neither the front vehicle nor the controlled vehicle. Suppose that
+    the rear vehicle brakes harder than the controlled vehicle, by b (m/s2). Then t seconds before the contact the rear
+    vehicle was faster than the controlled vehicle by at least ``b t`` (m/s), if it already braked at that time.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -308,10 +311,8 @@ def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
 
 @compiled(apart=True)
 def last_rest(at: Floats) -> tuple[float, float]:
-    """Return the time (s) by which all harm in the combined bound has happened, and the time (s) when the rear vehicle
-    rests.
-
-    The rear vehicle comes to rest at the second time if it brakes fully and no other vehicle pushes it.
+    """Return the time (s) by which all harm in the combined bound has happened, and the time (s) at which the rear
+    vehicle comes to rest if it brakes fully and no other vehicle pushes it.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -328,9 +329,10 @@ def last_rest(at: Floats) -> tuple[float, float]:
 def combined_bound(
     at: Floats, until: float, front: float, rear: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
-    """Return a lower bound (m2/s2) on the harm of a world with unavoidable contact, over first contacts of both kinds.
+    """Return a lower bound (m2/s2) on the harm of a world with unavoidable contact.
 
-    The first contact may be with the front or the rear vehicle. The result is 0 if the harm may come after ``until``.
+    The first contact may be with the front or the rear vehicle. The result is 0 if some of this harm may come after
+    ``until``.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -407,11 +409,11 @@ def lower_bound(
     """Return a proven lower bound on the harm of every world, over all commands of one vehicle.
 
     ``harm = early + max((front_pair + rear_pair), combined)``. Each term of this formula is lowered by the largest
-    possible rounding error (``rounding``). The combined bound is 0 where contact can be avoided. Harm that may come
-    only after ``horizon_s`` counts as 0. The function covers the same lines as ``avoidability``.
+    possible rounding error (``rounding``). ``combined`` is 0 in worlds in which contact can be avoided. Harm that may
+    come only after ``horizon_s`` counts as 0. The function covers the same lines as ``avoidability``.
 
-    With brake build-up, the bound holds for commands that change at any time, and it is smaller. ``contact``, the
-    verdict on avoidable contact, is then None, even if brakes build up in only one of the worlds.
+    If brakes build up, the bound holds for commands that change at any time, and it is weaker (smaller). ``contact``,
+    the verdict on avoidable contact, is None if brakes build up in any of the worlds.
 
     Args:
         worlds: the ``n`` worlds in their present state.
@@ -421,10 +423,10 @@ def lower_bound(
         horizon_s: time until which harm counts, s after the alert.
         scripts: maps the index of each vehicle that is not controlled to the name of its script. The only script
             allowed is full_brake. If ``scripts`` is None, these vehicles brake fully.
-        time_step_s: time between two decisions, s. With a time step the bound is larger, but it holds only for commands
+        time_step_s: time between two decisions, s. With a number the bound is larger, but it holds only for commands
             that change at decisions. The first decision comes when the vehicle may act, and the next ones every
-            ``time_step_s`` after it, as for every agent. The computation takes ten times as long. If ``time_step_s`` is
-            None, commands may change at any time.
+            ``time_step_s`` after it, as for every agent. With a number the computation takes ten times as long as with
+            None. If ``time_step_s`` is None, commands may change at any time.
 
     Raises ``InvalidInput`` for other lines, for an unknown ``harm_count``, for a time step below ``LEAST_TIME_STEP_S``,
     and for a horizon that is not finite or lies before the vehicle may act.

@@ -88,7 +88,7 @@ def bound_ramped(states: Floats, has_front: Bools, has_rear: Bools, both: Bools,
         states: [n, LINE.WIDTH] worlds; ``line.LINE`` names the columns.
         has_front: [n] True if the controlled vehicle has a front vehicle and the next impact of this pair counts.
         has_rear: [n] True if the controlled vehicle has a rear vehicle and the next impact of this pair counts.
-        both: [n] True for worlds whose combined bound is computed; it is 0 in all other worlds.
+        both: [n] True for worlds whose combined bound is computed; the combined bound is 0 in all other worlds.
         out: [n, BOUNDS] array into which the function writes the columns FRONT_BOUND, REAR_BOUND and COMBINED_BOUND,
             m2/s2.
 
@@ -118,7 +118,7 @@ def ramped_states(worlds: Worlds, i: int, until: Floats) -> Floats:
     Args:
         worlds: the worlds, [n], at the moment when vehicle ``i`` may act.
         i: index of the controlled vehicle.
-        until: [n] horizon, s after that moment; later harm does not count.
+        until: [n] horizon, in s from the moment when vehicle ``i`` may act; later harm does not count.
 
     """
     v, at = worlds.vehicles, onset_states(worlds, i, None)
