@@ -279,7 +279,7 @@ def decide_world(
 
     Columns of the verdict: REASON (AVOIDABLE, EARLY, FRONT or REAR), MARGIN (m; as in ``Avoidability``), SPARE (m; part
     of the gap that remains under full braking), DRIVE (s; end of the drive), TOUCH (s; end of the full braking after
-    the drive), FOLLOW (m/s2; the command after the full braking). DRIVE and TOUCH count from the moment at which
+    the drive), FOLLOW (m/s2; the command after the full braking). DRIVE and TOUCH are times after the moment at which
     vehicle ``i`` may act.
 
     Args:
@@ -354,11 +354,11 @@ class Avoidability:
     stays behind the front vehicle. ``margin_m`` is the smallest gap between the largest trajectory and the rear
     vehicle. If the controlled vehicle has no rear vehicle, ``margin_m`` is the part of the gap to the front vehicle
     that remains under full braking. ``margin_m`` is negative if contact is unavoidable. If the reason is *front*,
-    ``margin_m`` is minus the missing gap; if it is *early*, minus the overlap before the vehicle may act.
+    ``margin_m`` is minus the missing gap; if the reason is *early*, minus the overlap before the vehicle may act.
 
     ``switch_s`` and ``command_mps2`` are times and commands that show how to avoid contact: in a simulation they cause
-    no impact. Each command applies from its absolute time on, until the time of the next command. An infinite time
-    means that the command never applies. Both arrays are NaN in worlds where contact is unavoidable.
+    no impact. Each command applies from its time (s after the alert) until the time of the next command. An infinite
+    time means that the command never applies. Both arrays are NaN in worlds where contact is unavoidable.
     """
 
     # [n] 0: contact is avoidable. 1, early: a pair has contact before the controlled vehicle may act. 2, front: even
@@ -391,12 +391,12 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
         worlds: the ``n`` worlds in their present state.
         vehicle: index of the controlled vehicle, from 0.
         scripts: maps the index of each vehicle that is not controlled to the name of its script, as in
-            ``Scenario.roles``. The only script allowed is full_brake. If ``scripts`` is None, these vehicles brake
-            fully.
+            ``Scenario.roles``. The only script allowed is full_brake. If ``scripts`` is None, all vehicles that are not
+            controlled brake fully.
 
-    Raises ``InvalidInput`` for any other line and any other script. Also raised if the front vehicle may brake only
-    after the controlled vehicle may act, if a vehicle moves backward, or if vehicle_1 could reach an obstacle
-    (``obstacle_gap_m``) before any contact.
+    Raises ``InvalidInput`` for any other line and any other script. The function also raises ``InvalidInput`` if the
+    front vehicle may brake only after the controlled vehicle may act, if a vehicle moves backward, or if vehicle_1
+    could reach an obstacle (``obstacle_gap_m``) before any contact.
 
     """
     worlds.refuse_build_up("avoidability")
@@ -425,7 +425,7 @@ def check_covered(worlds: Worlds, vehicle: int, scripts: Mapping[int, str] | Non
     Args:
         worlds: the worlds, [n].
         vehicle: index of the controlled vehicle, from 0.
-        scripts: maps the index of each vehicle that is not controlled to the name of its script; None if these vehicles
+        scripts: maps the index of each vehicle that is not controlled to the name of its script; None if all of them
             brake fully.
 
     """

@@ -79,7 +79,7 @@ def decision_around(at: Floats, early: float, late: float) -> tuple[float, float
 @compiled(apart=True)
 def lacking(kind: int, at: Floats, early: float, late: float, softest: float, hard: float, begin: float) -> float:
     """Return a lower bound (m/s2) on the difference between the command during a first contact and the best command
-    after it.
+    after this contact.
 
     If the first contact is with the front vehicle, braking before this contact makes it gentle, and driving after this
     contact softens a later impact from behind. If the first contact is with the rear vehicle, driving is best before
@@ -317,7 +317,7 @@ def next_split(kind: int, at: Floats, time: float, last: float) -> float:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
             build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        time: time after which the function looks for such a time, s.
+        time: start of the interval in which the function searches, s.
         last: largest possible result, s.
 
     """

@@ -149,11 +149,12 @@ def largest_lead(
 
     The pair is the controlled vehicle and the neighbour of its first contact. The motion of the centre of mass is
     computed as if the vehicle executed the best command from the first contact on. In fact the earlier command still
-    applies in the *window* (the rest of the decision step). This costs the vehicle the speed ``lost``.
+    applies in the *window* (the rest of the decision step). In the window the controlled vehicle loses the speed
+    ``lost`` (m/s).
 
     A *flight* is a period in which the two vehicles of the pair are not in contact. The bound is the maximum over three
-    cases: the last flight before the contact with the other neighbour began with the first impact, within the window,
-    or after the window.
+    cases: the last flight before the contact with the other neighbour begins with the first impact, begins within the
+    window, or begins after the window.
 
     Args:
         share: mass of the partner (the neighbour of the first contact), as a share of the mass of both vehicles, 0 to

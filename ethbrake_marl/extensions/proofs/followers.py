@@ -52,11 +52,12 @@ def least_closing(
 ) -> float:  # fmt: skip
     """Return the smallest closing speed (m/s) of the controlled vehicle's contact with its second neighbour.
 
-    The controlled vehicle had contact with its first neighbour before. The bound is v - d. Here v is the closing speed
-    of the second neighbour relative to the centre of mass of the controlled vehicle and its first neighbour. The
-    largest difference between the speeds of the controlled vehicle and this centre of mass is d (``largest_lead``). In
-    the *window* (the rest of the decision step of the first contact) the command of the earlier decision still applies.
-    This costs the vehicle the speed ``lost``. Times count from the first contact, in s.
+    The controlled vehicle had contact with its first neighbour before. The bound is a difference of two speeds, v - d.
+    Here v is the closing speed of the second neighbour relative to the centre of mass of the controlled vehicle and its
+    first neighbour, and d is the largest difference between the speeds of the controlled vehicle and this centre of
+    mass (``largest_lead``). In the *window* (the rest of the decision step of the first contact) the command of the
+    earlier decision still applies. In the window the controlled vehicle loses the speed ``lost`` (m/s). All times are
+    in s after the first contact.
 
     Args:
         start: closing speed, at the time of the first contact, of the second neighbour relative to the centre of mass

@@ -167,7 +167,7 @@ def put_behind(
         far: largest distance by which the rear vehicle is farther ahead than if it braked fully, m.
         soft: smallest closing speed that the first contact may have, m/s.
         hard: largest closing speed that the first contact may have, m/s.
-        search: [SEARCH] numbers of the search: ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of ``gained``;
+        search: [SEARCH] numbers that the search needs: ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of ``gained``;
             ``FLOOR`` is the bound of the front pair alone (m2/s2); ``BEST`` is the smallest harm that the search has
             reached so far (m2/s2).
         count: number of cells on the heap.
@@ -207,9 +207,9 @@ def try_behind(
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         time: time of the contact, s.
         near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m; the function
-            raises this distance if no contact at ``time`` has it.
+            raises this distance if no contact at ``time`` is possible with it.
         far: largest distance by which the rear vehicle is farther ahead than if it braked fully, m.
-        search: [SEARCH] numbers of the search: ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of ``gained``;
+        search: [SEARCH] numbers that the search needs: ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of ``gained``;
             ``FLOOR`` is the bound of the front pair alone (m2/s2); ``BEST`` is the smallest harm that the search has
             reached so far (m2/s2). The function lowers ``BEST`` if it reaches a smaller harm.
         moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
@@ -237,7 +237,7 @@ def divide_behind(
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        search: [SEARCH] numbers of the search: ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of ``gained``;
+        search: [SEARCH] numbers that the search needs: ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of ``gained``;
             ``FLOOR`` is the bound of the front pair alone (m2/s2); ``BEST`` is the smallest harm that the search has
             reached so far (m2/s2). The function lowers ``BEST`` if it reaches a smaller harm.
         count: number of cells on the heap.
@@ -282,7 +282,7 @@ def meetings_behind(
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         last: latest time of the contact, s after the controlled vehicle may act.
-        search: [SEARCH] numbers of the search: ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of ``gained``;
+        search: [SEARCH] numbers that the search needs: ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of ``gained``;
             ``FLOOR`` is the bound of the front pair alone (m2/s2); ``BEST`` is the smallest harm that the search has
             reached so far (m2/s2). The function lowers ``BEST`` if it reaches a smaller harm.
         moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.

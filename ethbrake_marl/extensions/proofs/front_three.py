@@ -70,9 +70,9 @@ def late_meetings(at: Floats, first: float, stand: float, plan: Floats, other: F
     """Return a code that says whether the first contact of the rear vehicle and the controlled vehicle can come after
     ``stand``.
 
-    Code 0: this contact cannot come after ``stand``. Code 1: it can, but its harm is then at least as large as the harm
-    of some first contact with the front vehicle. Code 2: this contact can come after ``stand``, and nothing is proven
-    about its harm.
+    Code 0: this contact cannot come after ``stand``. Code 1: this contact can come after ``stand``, but its harm is
+    then at least as large as the harm of some first contact with the front vehicle. Code 2: this contact can come after
+    ``stand``, and nothing is proven about its harm.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -152,7 +152,8 @@ def combined_bound_of_team(
 
 @compiled
 def bound_threes(states: Floats, until: Floats, pairs: Floats, since: Floats, power: Floats, out: Floats) -> None:
-    """Compute the combined bound of the first three vehicles in each of ``n`` worlds with unavoidable contact.
+    """Compute a lower bound on the harm of the first three vehicles together in each of ``n`` worlds with unavoidable
+    contact.
 
     Args:
         states: [n, LINE.WIDTH] worlds; ``line.LINE`` names the columns.

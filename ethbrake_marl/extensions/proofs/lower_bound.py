@@ -422,11 +422,11 @@ def lower_bound(
             counts: if a pair has had an impact before now, no later impact of this pair counts.
         horizon_s: time until which harm counts, s after the alert.
         scripts: maps the index of each vehicle that is not controlled to the name of its script. The only script
-            allowed is full_brake. If ``scripts`` is None, these vehicles brake fully.
-        time_step_s: time between two decisions, s. With a number the bound is larger, but it holds only for commands
-            that change at decisions. The first decision comes when the vehicle may act, and the next ones every
-            ``time_step_s`` after it, as for every agent. With a number the computation takes ten times as long as with
-            None. If ``time_step_s`` is None, commands may change at any time.
+            allowed is full_brake. If ``scripts`` is None, all vehicles that are not controlled brake fully.
+        time_step_s: time between two decisions, s. If ``time_step_s`` is a number, the bound is larger, but it holds
+            only for commands that change at decisions. The first decision comes when the vehicle may act, and the next
+            ones every ``time_step_s`` after it, as for every agent. With a time step the computation takes ten times as
+            long as with None. If ``time_step_s`` is None, commands may change at any time.
 
     Raises ``InvalidInput`` for other lines, for an unknown ``harm_count``, for a time step below ``LEAST_TIME_STEP_S``,
     and for a horizon that is not finite or lies before the vehicle may act.

@@ -1,8 +1,8 @@
 """Compute the gentlest first contact (smallest closing speed) of the controlled vehicle with a neighbour at a given
 time.
 
-Times count from the moment at which the controlled vehicle (f) may act. The front vehicle (leader, l) already brakes at
-time 0. The rear vehicle (r) coasts until its onset and then brakes. All speeds and gaps are at least 0.
+Times are measured from the moment at which the controlled vehicle (f) may act. The front vehicle (leader, l) already
+brakes at time 0. The rear vehicle (r) coasts until its onset and then brakes. All speeds and gaps are at least 0.
 docs/internals/proofs/lower-bound.md has the proofs.
 """
 

@@ -1,8 +1,8 @@
 """Bound the harm that must follow a first contact if an obstacle is ahead of the leader (the front vehicle).
 
 ``beyond`` is the squared speed (m2/s2) at which the leader hits the obstacle. This speed limits how far ahead the
-leader can be at any time. Positions are measured from the place at which the controlled vehicle is when it may first
-act. Masses are in units of the controlled vehicle's mass. docs/internals/proofs/lower-bound-obstacle.md has the proofs.
+leader can be at any time. Position 0 is the place of the controlled vehicle at the moment at which it may act. Masses
+are in units of the controlled vehicle's mass. docs/internals/proofs/lower-bound-obstacle.md has the proofs.
 """
 
 from __future__ import annotations

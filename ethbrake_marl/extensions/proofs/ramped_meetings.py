@@ -96,8 +96,8 @@ def fill_controlled(at: Floats, sign: float, switch: float, time: float, final: 
 def switch_for(
     at: Floats, sign: float, time: float, place: float, final: float, halvings: int, plan: Floats
 ) -> tuple[float, float, float]:
-    """Return two times (s) just before and after the switch that brings the controlled vehicle to ``place`` at
-    ``time``.
+    """Return a time (s) just before, and a time (s) just after, the switch that brings the controlled vehicle to
+    ``place`` at ``time``.
 
     The *switch* is the time at which ``sign`` times the vehicle's force stops rising and begins to fall; a *force* is
     an acceleration. The third result is the speed (m/s) at ``time`` if the switch is at the earlier of the two times.
@@ -429,7 +429,7 @@ def check_asked(where: str, harm_count: str, horizon_s: object, time_step_s: obj
     Args:
         where: name of the calling function, with which the error message begins.
         harm_count: must be ``first`` or ``total``.
-        horizon_s: end of the episode; must be a number.
+        horizon_s: time until which harm counts; must be a number of seconds.
         time_step_s: must be None or a number of at least ``LEAST_TIME_STEP_S``.
 
     """

@@ -173,7 +173,9 @@ def travel(plan: Floats, v: float, limit: float, until: float) -> tuple[float, f
 
 @compiled
 def force_of(plan: Floats, now: float) -> float:
-    """Return the acceleration (m/s2) that a plan [3, LEGS] requires at ``now`` (s), even if the vehicle stands still."""
+    """Return the force (m/s2) of a plan [3, LEGS] at ``now`` (s), even if the vehicle stands still. Here *force* means
+    force per mass, which is an acceleration.
+    """
     return leg_at(plan, now, 1.0, math.inf)[0]
 
 
@@ -214,8 +216,8 @@ def meeting(
     The results are inf, 0, 0 if there is no contact. The forced closing speed is the smallest value of ``w + (gap -
     slack) / t`` until the contact. Here w is the closing speed (m/s) and gap the gap (m) at the time t (s) after
     ``since``. The forced closing speed is also a lower bound on the closing speed of another motion of the pair if two
-    conditions hold. At ``since`` the gap of the other motion is smaller by at most ``slack``. The other motion's
-    closing speed minus the closing speed of this motion never decreases.
+    conditions hold. First, at ``since`` the gap of the other motion is smaller than the gap of this motion by at most
+    ``slack``. Second, the other motion's closing speed minus the closing speed of this motion never decreases.
 
     Args:
         gap: gap at ``since``, m.

@@ -42,7 +42,8 @@ _UNMOVED_T = 1e30  # mass of an obstacle, t; the other mass is negligible
 def _combined_bound_of_line(
     now: Worlds, onset: Floats, counts: Bools, chosen: Ints, until: Floats, pairs: Floats, time_step_s: float | None
 ) -> Floats:
-    """Return the combined bound of the first two pairs, [n] m2/s2, or 0 if nothing is proven.
+    """Return the combined bound: a lower bound on the harm of the first two pairs together, [n] m2/s2, or 0 if nothing
+    is proven.
 
     The combined bound is 0 in worlds in which the first vehicle does not brake yet. The second vehicle is treated as if
     it may act now.
@@ -146,15 +147,15 @@ def team_bound(
             counts: if a pair has had an impact before now, no later impact of this pair counts.
         horizon_s: time until which harm counts, s after the alert.
         scripts: maps the index of each vehicle that is not controlled to the name of its script. The only script
-            allowed is full_brake. If ``scripts`` is None, these vehicles brake fully.
-        time_step_s: time between two decisions, s. With a number the bound holds only for commands that change at
-            decisions. The first decision comes when the first controlled vehicle may act, and the next ones every
-            ``time_step_s`` after it. If Vehicle 2 is the first controlled vehicle that may act, the bound is larger
-            with a number than with None. If ``time_step_s`` is None, commands may change at any time.
+            allowed is full_brake. If ``scripts`` is None, all vehicles that are not controlled brake fully.
+        time_step_s: time between two decisions, s. If ``time_step_s`` is a number, the bound holds only for commands
+            that change at decisions. The first decision comes when the first controlled vehicle may act, and the next
+            ones every ``time_step_s`` after it. If Vehicle 2 is the first controlled vehicle that may act, the bound is
+            larger with a number than with None. If ``time_step_s`` is None, commands may change at any time.
 
-    Raises ``InvalidInput`` if ``vehicles`` is empty, or has an unknown or repeated index. Also raised for another
-    script, an unknown harm count, a time step below ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies
-    before the first of the vehicles may act.
+    Raises ``InvalidInput`` if ``vehicles`` is empty, or has an unknown or repeated index. The function also raises
+    ``InvalidInput`` for another script, an unknown harm count, a time step below ``LEAST_TIME_STEP_S``, and a horizon
+    that is not finite or lies before the first of the vehicles may act.
 
     """
     check_asked("team_bound", harm_count, horizon_s, time_step_s)
