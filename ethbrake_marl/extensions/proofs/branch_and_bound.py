@@ -83,8 +83,8 @@ def lacking(kind: int, at: Floats, early: float, late: float, softest: float, ha
 
     If the first contact is with the front vehicle, braking before this contact makes it gentle, and driving after this
     contact softens a later impact from behind. If the first contact is with the rear vehicle, driving is best before
-    the contact and braking after it. The command is the same in the whole decision step, so it cannot be the best one
-    both before and after the contact.
+    the contact and braking after it. The command is the same in the whole decision step, so this command cannot be the
+    best command both before and after the contact.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake

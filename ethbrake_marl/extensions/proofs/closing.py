@@ -82,7 +82,7 @@ def least_closing_of_pair(at: Floats, until: float, plan: Floats, other: Floats)
 
     Args:
         at: [PAIR_WIDTH] values of one pair, in the order ``PAIR_GAP`` to ``FOLLOWER_A``.
-        until: horizon, s.
+        until: horizon, s; later contacts do not count.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
@@ -106,7 +106,7 @@ def bound_pairs(pairs: Floats, until: Floats, out: Floats) -> None:
 
     Args:
         pairs: [n, PAIR_WIDTH] pairs, with the columns ``PAIR_GAP`` to ``FOLLOWER_A``.
-        until: [n] horizon of each pair, s.
+        until: [n] horizon of each pair, s; later harm does not count.
         out: [n] array into which the function writes the bounds, m2/s2; a contact without impact counts as 0.
 
     """

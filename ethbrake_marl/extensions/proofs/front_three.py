@@ -157,7 +157,7 @@ def bound_threes(states: Floats, until: Floats, pairs: Floats, since: Floats, po
 
     Args:
         states: [n, LINE.WIDTH] worlds; ``line.LINE`` names the columns.
-        until: [n] horizon, s.
+        until: [n] horizon, s; later harm does not count.
         pairs: [n, 2] lower bounds on the harm of the first two pairs, each pair alone, m2/s2.
         since: [n] time from which on the rear vehicle may brake less than fully, s.
         power: [n] largest difference between the rear vehicle's acceleration and its full braking, m/s2.

@@ -84,7 +84,7 @@ def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
 @compiled(apart=True)
 def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
     """Return whether the gentlest first contact with one neighbour at ``time`` comes before any contact with the other
-    one.
+    neighbour.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST``.
@@ -102,7 +102,7 @@ def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) ->
 @compiled(apart=True)
 def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, other: Floats) -> float:
     """Return the latest time (s) of a first contact with one neighbour that comes before any contact with the other
-    one.
+    neighbour.
 
     The function finds this time by bisection, because the other neighbour is nearer if the first contact is later. For
     a later contact with the front vehicle the controlled vehicle drives for a shorter time, so the rear vehicle comes
@@ -365,7 +365,7 @@ def bound_worlds(
 
     Args:
         states: [n, LINE.WIDTH] worlds; ``line.LINE`` names the columns.
-        until: [n] horizon, s.
+        until: [n] horizon, s; later harm does not count.
         has_front: [n] True if the controlled vehicle has a front vehicle and the next impact of this pair counts.
         has_rear: [n] True if the controlled vehicle has a rear vehicle and the next impact of this pair counts.
         unavoidable: [n] True if contact is unavoidable; the combined bound is 0 in all other worlds.

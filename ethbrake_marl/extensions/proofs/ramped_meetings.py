@@ -126,8 +126,8 @@ def switch_for(
 
 @compiled
 def met_at(kind: int, at: Floats, time: float, plan: Floats) -> tuple[float, float, float]:
-    """Return sign, speed (m/s) and place (m) at ``time`` of the neighbour of the first contact, if no other vehicle
-    pushes it.
+    """Return the sign of the first contact, and the speed (m/s) and the place (m) of the neighbour at ``time`` if no
+    other vehicle pushes this neighbour.
 
     The *sign* is 1 for the front vehicle and -1 for the rear vehicle. The *place* is the position times the sign.
 
@@ -398,8 +398,8 @@ def at_onset_of(
 ) -> tuple[Worlds, Floats, Floats, Bools]:
     """Simulate worlds until the first of ``vehicles`` may act.
 
-    Returns the worlds at that moment, the time of that moment ([n] s), the harm so far ([n] m2/s2), and a mask of
-    pairs, [n, P]. The mask is True for pairs whose next impact counts and whose vehicles move forward.
+    Returns the worlds at that moment, the time of that moment ([n], s), the harm up to that moment ([n], m2/s2), and a
+    boolean mask of pairs, [n, P]. The mask is True for pairs whose next impact counts and whose vehicles move forward.
 
     Args:
         where: name of the calling function, with which error messages begin.

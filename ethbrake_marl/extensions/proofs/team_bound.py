@@ -233,7 +233,7 @@ def _pair_bound(columns: Mapping[int, Floats | float], until: Floats, counts: Bo
     Args:
         columns: maps columns of the array of pairs (``PAIR_GAP`` to ``FOLLOWER_A``) to their values; columns that are
             left out are 0.
-        until: [n] horizon, s.
+        until: [n] horizon, s; later harm does not count.
         counts: [n] True for worlds in which the next impact of the pair counts.
 
     """
