@@ -68,8 +68,9 @@ def drive_before_braking(
     from now on. Requires ``spare_gap >= 0``.
 
     The results are the duration of the drive (s), the time at which the gap becomes 0 (s), and whether both vehicles
-    still move at that time. If both move then, ``a_f > a_l`` and their speeds are equal; otherwise the follower stops
-    at the standing leader. The duration and the time are infinite if the follower never moves.
+    still move at that time. If both vehicles still move when the gap becomes 0, then ``a_f > a_l`` and both have the
+    same speed. If not, the follower comes to rest behind the leader, which is already at rest. The duration and the
+    time are infinite if the follower never moves.
 
     Args:
         gap: gap to the leader, m.
@@ -106,8 +107,8 @@ def largest_behind(
 ) -> tuple[float, float, bool]:
     """Return how long a vehicle with a speed limit can drive before it must brake fully to stay behind the leader.
 
-    The leader is the vehicle in front; it brakes from now on. The further results are the time at which the gap becomes
-    0 (s), and whether both vehicles still move at that time.
+    The leader is the vehicle in front; it brakes from now on. The second and third result are the time at which the gap
+    becomes 0 (s), and whether both vehicles still move at that time.
 
     Args:
         gap: gap to the leader, m.
@@ -133,7 +134,7 @@ def largest_behind(
 
 @compiled
 def lowest_while_coasting(gap: float, v_f: float, v_r: float, a_r: float, onset_r: float, until: float) -> float:
-    """Return the smallest gap (m) between a coasting vehicle and the vehicle behind it until the time ``until``.
+    """Return the smallest gap (m), until the time ``until``, between a coasting vehicle and the vehicle behind it.
 
     The gap is a convex function of time, so it is smallest when both speeds are equal, or at one end of the interval.
 
@@ -167,8 +168,8 @@ def leader_at_onset(
     """Return the gap to the leader (m) and the speed of the leader (m/s) at ``start``, if the follower coasts until
     then.
 
-    The leader brakes from ``onset_l`` on, which is not after ``start``. Until ``start`` the gap is a concave function
-    of time: if it is not negative at ``start``, it was not negative before.
+    The leader brakes from the time ``onset_l`` on; ``onset_l`` must not be after ``start``. Until ``start`` the gap is
+    a concave function of time: if it is not negative at ``start``, it was not negative before.
 
     Args:
         gap: gap now, m.
@@ -190,10 +191,11 @@ def decide_front(gap: Floats, speed: Floats, onset: Floats, braking: Floats, i: 
     Args:
         gap: [P] gaps, m.
         speed: [N] speeds, m/s.
-        onset: [N] times from which on the vehicles may act, s.
+        onset: [N] time from which on each vehicle may act, s.
         braking: [N] braking capacities, m/s2.
         i: index of the controlled vehicle, at least 1.
-        out: [RESULT_WIDTH] verdict; receives the columns REASON (a code), MARGIN and SPARE (both m).
+        out: [RESULT_WIDTH] verdict, into which the function writes the columns REASON (a code), MARGIN (m) and SPARE
+            (m).
 
     """
     a_l, v_f, a_f = braking[i - 1], speed[i], braking[i]
@@ -222,15 +224,16 @@ def plan_behind(
     Args:
         gap: [P] gaps, m.
         speed: [N] speeds, m/s.
-        onset: [N] times from which on the vehicles may act, s.
+        onset: [N] time from which on each vehicle may act, s.
         braking: [N] braking capacities, m/s2.
         driving: [N] driving capacities, m/s2.
         limit: [N] speed limits, m/s.
         i: index of the controlled vehicle.
         keep: distance to keep to the vehicle in front, m.
-        plan: [2, PIECES] receives the trajectory: the ends (s) and the accelerations (m/s2) of its pieces.
-        out: [RESULT_WIDTH] verdict; receives the columns DRIVE (s; end of the drive), TOUCH (s; end of the full braking
-            after the drive) and FOLLOW (m/s2; the command after the braking).
+        plan: [2, PIECES] array into which the function writes the ends (s) and the accelerations (m/s2) of the
+            trajectory's intervals of constant acceleration.
+        out: [RESULT_WIDTH] verdict, into which the function writes the columns DRIVE (s; end of the drive), TOUCH (s;
+            end of the full braking after the drive) and FOLLOW (m/s2; the command after the full braking).
 
     """
     a_f, u = braking[i], driving[i]
@@ -251,10 +254,11 @@ def meets_rear_early(gap: Floats, speed: Floats, onset: Floats, braking: Floats,
     Args:
         gap: [P] gaps, m.
         speed: [N] speeds, m/s.
-        onset: [N] times from which on the vehicles may act, s.
+        onset: [N] time from which on each vehicle may act, s.
         braking: [N] braking capacities, m/s2.
         i: index of the controlled vehicle.
-        out: [RESULT_WIDTH] verdict; receives the columns REASON and MARGIN if there is contact.
+        out: [RESULT_WIDTH] verdict; if there is contact, the function writes the columns REASON (a code) and MARGIN
+            (m).
 
     """
     v_f, v_r, a_r, start = speed[i], speed[i + 1], braking[i + 1], onset[i]
@@ -275,20 +279,20 @@ def decide_world(
 
     Columns of the verdict: REASON (AVOIDABLE, EARLY, FRONT or REAR), MARGIN (m; as in ``Avoidability``), SPARE (m; part
     of the gap that remains under full braking), DRIVE (s; end of the drive), TOUCH (s; end of the full braking after
-    the drive), FOLLOW (m/s2; the command after the braking). DRIVE and TOUCH count from the moment at which vehicle
-    ``i`` may act.
+    the drive), FOLLOW (m/s2; the command after the full braking). DRIVE and TOUCH are times after the moment at which
+    vehicle ``i`` may act.
 
     Args:
         gap: [P] gaps, m.
         speed: [N] speeds, m/s.
-        onset: [N] times from which on the vehicles may act, s.
+        onset: [N] time from which on each vehicle may act, s.
         braking: [N] braking capacities, m/s2.
         driving: [N] driving capacities, m/s2.
         limit: [N] speed limits, m/s.
         i: index of the controlled vehicle.
-        plan: working memory, [2, PIECES].
-        rear: working memory, [2, PIECES].
-        out: [RESULT_WIDTH] receives the verdict.
+        plan: working memory for the motion of vehicle ``i``, [2, PIECES]; overwritten.
+        rear: working memory for the motion of the rear vehicle, [2, PIECES]; overwritten.
+        out: [RESULT_WIDTH] array into which the function writes the verdict.
 
     """
     out[REASON], out[MARGIN], out[SPARE] = AVOIDABLE, math.inf, math.inf
@@ -326,12 +330,12 @@ def decide_worlds(
     Args:
         gaps: [n, P] gaps, m.
         speeds: [n, N] speeds, m/s.
-        onset: [n, N] times from which on the vehicles may act, s.
+        onset: [n, N] time from which on each vehicle may act, s.
         braking: [n, N] braking capacities, m/s2.
         driving: [n, N] driving capacities, m/s2.
         limit: [n, N] speed limits, m/s.
         i: index of the controlled vehicle.
-        out: [n, RESULT_WIDTH] receives the verdicts; ``decide_world`` explains the columns.
+        out: [n, RESULT_WIDTH] array into which the function writes the verdicts; ``decide_world`` explains the columns.
 
     """
     plan, rear = empty_plan(), empty_plan()
@@ -348,13 +352,13 @@ class Avoidability:
 
     The *largest trajectory* of the controlled vehicle is farther ahead at every time than any other trajectory that
     stays behind the front vehicle. ``margin_m`` is the smallest gap between the largest trajectory and the rear
-    vehicle. (For two vehicles of which the rear one is controlled, ``margin_m`` is the part of the gap that remains
-    under full braking.) ``margin_m`` is negative if contact is unavoidable: it is then minus the missing gap if the
-    reason is *front*, and minus the overlap before the vehicle may act if the reason is *early*.
+    vehicle. If the controlled vehicle has no rear vehicle, ``margin_m`` is the part of the gap to the front vehicle
+    that remains under full braking. ``margin_m`` is negative if contact is unavoidable. If the reason is *front*,
+    ``margin_m`` is minus the missing gap; if the reason is *early*, minus the overlap before the vehicle may act.
 
     ``switch_s`` and ``command_mps2`` are times and commands that show how to avoid contact: in a simulation they cause
-    no impact. Each command applies from its absolute time on, until the time of the next command. An infinite time
-    means that the command never applies. Both arrays are NaN in worlds where contact is unavoidable.
+    no impact. Each command applies from its time (s after the alert) until the time of the next command. An infinite
+    time means that the command never applies. Both arrays are NaN in worlds where contact is unavoidable.
     """
 
     # [n] 0: contact is avoidable. 1, early: a pair has contact before the controlled vehicle may act. 2, front: even
@@ -381,17 +385,18 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
     If the vehicle cannot avoid contact, all its commands lead to contact, but not always to an impact
     (``LowerBound.impact_proven`` shows where an impact is certain). The line must have three vehicles with the middle
     one controlled, or two vehicles with either one controlled. The other vehicles brake fully from their latencies on.
-    An overlap of at most 1e-12 m between the deciding trajectories counts as a rounding error, not as contact.
+    An overlap of at most 1e-12 m in the computed motion counts as a rounding error, not as contact.
 
     Args:
-        worlds: the worlds now, [n].
+        worlds: the ``n`` worlds in their present state.
         vehicle: index of the controlled vehicle, from 0.
-        scripts: script name of each other vehicle, by index, as in ``Scenario.roles``. Every script must be full_brake.
-            None: all other vehicles brake fully.
+        scripts: maps the index of each vehicle that is not controlled to the name of its script, as in
+            ``Scenario.roles``. The only script allowed is full_brake. If ``scripts`` is None, all vehicles that are not
+            controlled brake fully.
 
-    Raises ``InvalidInput`` for any other line, a script other than full_brake, a front vehicle that may brake only
-    after the controlled vehicle acts, a vehicle that moves backward, or an obstacle (``obstacle_gap_m``) that vehicle_1
-    could reach before any contact.
+    Raises ``InvalidInput`` for any other line and any other script. The function also raises ``InvalidInput`` if the
+    front vehicle may brake only after the controlled vehicle may act, if a vehicle moves backward, or if vehicle_1
+    could reach an obstacle (``obstacle_gap_m``) before any contact.
 
     """
     worlds.refuse_build_up("avoidability")
@@ -414,12 +419,14 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
 
 
 def check_covered(worlds: Worlds, vehicle: int, scripts: Mapping[int, str] | None) -> None:
-    """Raise ``InvalidInput`` for worlds that ``avoidability`` does not cover. Brake build-up is not checked here.
+    """Raise ``InvalidInput`` for worlds that ``avoidability`` does not cover. The function does not check whether
+    brakes build up.
 
     Args:
         worlds: the worlds, [n].
         vehicle: index of the controlled vehicle, from 0.
-        scripts: script name of each other vehicle, by index; None: all other vehicles brake fully.
+        scripts: maps the index of each vehicle that is not controlled to the name of its script; None if all of them
+            brake fully.
 
     """
     # An obstacle that Vehicle 1 does not reach under full braking has no effect: only a push could bring Vehicle 1

@@ -2,7 +2,7 @@
 
 A first contact has a time and a closing speed. The harm of a first contact is its squared closing speed plus the harm
 that must follow (``obstacle.after``). A *cell* is a range of times and a range of closing speeds. The search halves
-cells until the smallest bound of any cell is close to the smallest harm found so far.
+cells until the smallest bound of any cell is close to the smallest harm that the search has reached.
 docs/internals/proofs/lower-bound.md has the proof.
 """
 
@@ -34,16 +34,17 @@ _TRIED = 8  # number of first contacts evaluated before the search
 def gentlest_between(kind: int, at: Floats, early: float, late: float) -> float:
     """Return the smallest closing speed (m/s) of first contacts between the times ``early`` and ``late``.
 
-    The smallest closing speed never rises with the time of the contact, with one exception: if the leader (front
-    vehicle) brakes harder than the controlled vehicle, it may rise by at most the difference of the two braking
-    capacities in each second.
+    The smallest closing speed never rises with the time of the contact, with one exception. If the leader (front
+    vehicle) brakes harder than the controlled vehicle, the smallest closing speed may rise by at most the difference of
+    the two braking capacities in each second.
 
     Args:
-        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
-            ``RAMPED_REAR``).
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
+        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
+            build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
 
     """
     if kind >= RAMPED_FRONT:
@@ -61,9 +62,9 @@ def decision_around(at: Floats, early: float, late: float) -> tuple[float, float
     Both results are ``late`` if there are no decision steps, or if the two times lie in different steps.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earlier time, s.
-        late: later time, s.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: start of a range of times, s.
+        late: end of this range of times, s.
 
     """
     step = at[LINE.TIME_STEP]
@@ -78,22 +79,24 @@ def decision_around(at: Floats, early: float, late: float) -> tuple[float, float
 @compiled(apart=True)
 def lacking(kind: int, at: Floats, early: float, late: float, softest: float, hard: float, begin: float) -> float:
     """Return a lower bound (m/s2) on the difference between the command during a first contact and the best command
-    after it.
+    after this contact.
 
-    If the first contact is with the front vehicle, braking before the contact makes it gentle, and driving after the
-    contact softens the impact from behind. If the first contact is with the rear vehicle, driving is best before the
-    contact and braking after it. The command is the same in the whole decision step, so it cannot be the best one both
-    before and after the contact.
+    If the first contact is with the front vehicle, braking before this contact makes it gentle, and driving after this
+    contact softens a later impact from behind. If the first contact is with the rear vehicle, driving is best before
+    the contact and braking after it. The command is the same in the whole decision step, so this command cannot be the
+    best command both before and after the contact.
 
     Args:
-        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
-            ``RAMPED_REAR``).
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        softest: smallest closing speed that any command reaches between ``early`` and ``late``, m/s.
-        hard: largest closing speed of the first contact, m/s.
-        begin: start of the decision step, s.
+        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
+            build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        softest: smallest closing speed that a first contact between ``early`` and ``late`` can have under any command,
+            m/s.
+        hard: largest closing speed that the first contact may have, m/s.
+        begin: start of the decision step in which the first contact happens, s.
 
     """
     whole = at[LINE.U_F] + at[LINE.A_F]
@@ -121,16 +124,18 @@ def harm_of(
     """Return a lower bound (m2/s2) on the harm of the first contacts in a range of times and closing speeds.
 
     Args:
-        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
-            ``RAMPED_REAR``).
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        soft: smallest closing speed of the first contact, m/s.
-        hard: largest closing speed of the first contact, m/s.
-        floor: known lower bound on the harm of the other pair, m2/s2.
-        plan: working memory for the motion of one vehicle, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: second working memory of the same kind.
+        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
+            build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        soft: smallest closing speed that the first contact may have, m/s.
+        hard: largest closing speed that the first contact may have, m/s.
+        floor: known lower bound on the harm of the other pair (the pair that does not have the first contact), m2/s2.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan`` (with brake build-up from
+            ``empty_legs``); overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     begin, end = decision_around(at, early, late)
@@ -146,13 +151,14 @@ def harm_of(
 
 @compiled
 def room_for(heap: Floats, count: int, harm: float) -> int:
-    """Insert a row for a cell with bound ``harm`` into the heap, and return the index of the row. The function fills in
-    only the column ``HARM`` of this row. Row 0 of the heap is always the cell with the smallest bound.
+    """Insert a row for a cell (range of first contacts) with bound ``harm`` into the heap, and return the index of the
+    row. The function fills in only the column ``HARM`` of this row. Row 0 of the heap is always the cell with the
+    smallest bound.
 
     Args:
-        heap: [CELLS, NEAR] cells ordered as a binary heap; changed in place.
+        heap: [CELLS, NEAR] binary heap with one row for each cell (range of first contacts); changed in place.
         count: number of cells so far.
-        harm: bound of the new cell, m2/s2.
+        harm: lower bound on the harm of the first contacts in the new cell, m2/s2.
 
     """
     at = count
@@ -169,13 +175,13 @@ def put(heap: Floats, count: int, harm: float, early: float, late: float, soft: 
     """Add a cell (a range of times and closing speeds) to the heap, and return the new number of cells.
 
     Args:
-        heap: [CELLS, NEAR] cells ordered as a binary heap; changed in place.
+        heap: [CELLS, NEAR] binary heap with one row for each cell (range of first contacts); changed in place.
         count: number of cells so far.
         harm: lower bound on the harm of first contacts in the cell, m2/s2.
-        early: earliest time, s.
-        late: latest time, s.
-        soft: smallest closing speed, m/s.
-        hard: largest closing speed, m/s.
+        early: earliest time of a first contact in the cell, s.
+        late: latest time of a first contact in the cell, s.
+        soft: smallest closing speed of a first contact in the cell, m/s.
+        hard: largest closing speed of a first contact in the cell, m/s.
 
     """
     at = room_for(heap, count, harm)
@@ -185,10 +191,11 @@ def put(heap: Floats, count: int, harm: float, early: float, late: float, soft: 
 
 @compiled(apart=True)
 def drop_first(heap: Floats, count: int) -> int:
-    """Remove row 0, the cell with the smallest bound, from the heap, and return the new number of cells.
+    """Remove row 0 (the cell of first contacts with the smallest bound) from the heap, and return the new number of
+    cells.
 
     Args:
-        heap: cells ordered as a binary heap; changed in place.
+        heap: binary heap with one row for each cell (range of first contacts); changed in place.
         count: number of cells before the removal.
 
     """
@@ -211,20 +218,21 @@ def drop_first(heap: Floats, count: int) -> int:
 def divide(
     kind: int, at: Floats, floor: float, count: int, plan: Floats, other: Floats, heap: Floats
 ) -> tuple[int, float]:
-    """Replace the cell with the smallest bound by its two halves.
+    """Replace the cell (range of first contacts) with the smallest bound by its two halves.
 
     Returns the new number of cells, and the bound (m2/s2) for one single contact in the cell. The smallest bound of all
-    contacts is at most this second result.
+    first contacts is at most this second result.
 
     Args:
-        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
-            ``RAMPED_REAR``).
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        floor: known lower bound on the harm of the other pair, m2/s2.
+        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
+            build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        floor: known lower bound on the harm of the other pair (the pair that does not have the first contact), m2/s2.
         count: number of cells on the heap.
-        plan: working memory for the motion of one vehicle, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: second working memory of the same kind.
-        heap: working memory for the cells of the search, [CELLS, NEAR].
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan`` (with brake build-up from
+            ``empty_legs``); overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
+        heap: working memory for the search, [CELLS, NEAR]: one row for each cell (range of first contacts).
 
     """
     harm, early, late, soft, hard = (heap[0, HARM], heap[0, EARLY], heap[0, LATE], heap[0, SOFT], heap[0, HARD])
@@ -255,21 +263,23 @@ def least_harm(
     kind: int, at: Floats, first: float, last: float, floor: float, best: float, enough: float, plan: Floats,
     other: Floats, heap: Floats,
 ) -> float:  # fmt: skip
-    """Return a lower bound (m2/s2) on the harm of every first contact between two times, or ``best`` if it is smaller.
+    """Return a lower bound (m2/s2) on the harm of every first contact between two times, or ``best`` if ``best`` is
+    smaller.
 
     Args:
-        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
-            ``RAMPED_REAR``).
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        first: earliest time of the contact, s after the controlled vehicle may act.
-        last: latest time of the contact, s.
-        floor: known lower bound on the harm of the other pair, m2/s2.
-        best: smallest harm of a first contact found so far, m2/s2.
-        enough: lower bound (m2/s2) that is proven in another way; the function returns 0 if the bound of some contact
-            is not above it.
-        plan: working memory for the motion of one vehicle, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: second working memory of the same kind.
-        heap: working memory for the cells of the search, [CELLS, NEAR].
+        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
+            build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        first: earliest time of the first contact, in s from the moment at which the controlled vehicle may act.
+        last: latest time of the first contact, counted like ``first``, s.
+        floor: known lower bound on the harm of the other pair (the pair that does not have the first contact), m2/s2.
+        best: smallest harm that the search has reached so far, m2/s2.
+        enough: lower bound that is already proven in another way, m2/s2; the function returns 0 if the bound of some
+            first contact is not above ``enough``.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan`` (with brake build-up from
+            ``empty_legs``); overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
+        heap: working memory for the search, [CELLS, NEAR]: one row for each cell (range of first contacts).
 
     """
     for k in range(_TRIED):
@@ -304,10 +314,10 @@ def next_split(kind: int, at: Floats, time: float, last: float) -> float:
     With brake build-up the result is at most ``_PART_S`` later than ``time``.
 
     Args:
-        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
-            ``RAMPED_REAR``).
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        time: start of the search, s.
+        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
+            build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        time: start of the interval in which the function searches, s.
         last: largest possible result, s.
 
     """

@@ -1,4 +1,4 @@
-"""Compute the smallest possible closing speed of a pair's first contact, whatever all vehicles do.
+"""Compute the smallest possible closing speed of a pair's first contact, whatever the vehicles do.
 
 The bound compares every motion of the pair with two extreme motions. The leader (front vehicle) goes as far ahead as it
 can: it drives fully if it is controlled, and brakes fully otherwise. The follower brakes fully, so it stays as far
@@ -40,14 +40,15 @@ def least_on_piece(constant: float, pressing: float, since: float, until: float)
 @compiled(apart=True)
 def least_before(at: Floats, met: float, squared: float) -> float:
     """Return the smallest closing speed (m/s) of a pair's first contact until ``met``, for a leader that follows a
-    script. At the time t of the contact the closing speed is at least ``c(t) + (g(t) / t)``. Here c(t) and g(t) are
-    closing speed and gap if both vehicles brake fully. ``g(t) / t`` is the additional speed that the follower needs to
-    close this gap by time t.
+    script. If the contact happens at the time t (s), its closing speed is at least ``c(t) + (g(t) / t)``. Here c(t) and
+    g(t) are the closing speed (m/s) and the gap (m) at the time t if both vehicles brake fully. ``g(t) / t`` is the
+    additional speed that the follower needs to close this gap by time t.
 
     Args:
-        at: [PAIR_WIDTH] one pair, columns ``PAIR_GAP`` to ``FOLLOWER_A``.
-        met: time at which the extreme motions lead to contact, s.
-        squared: squared closing speed of the extreme motions at the time ``met``, m2/s2.
+        at: [PAIR_WIDTH] values of one pair, in the order ``PAIR_GAP`` to ``FOLLOWER_A``.
+        met: time of contact in the extreme motions (the leader goes as far ahead as it can, the follower brakes fully),
+            s.
+        squared: squared closing speed at the contact of the extreme motions, m2/s2.
 
     """
     if met <= 0.0:
@@ -80,10 +81,10 @@ def least_closing_of_pair(at: Floats, until: float, plan: Floats, other: Floats)
     The results are 0 and infinity if no contact is certain.
 
     Args:
-        at: [PAIR_WIDTH] one pair, columns ``PAIR_GAP`` to ``FOLLOWER_A``.
-        until: horizon, s.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        at: [PAIR_WIDTH] values of one pair, in the order ``PAIR_GAP`` to ``FOLLOWER_A``.
+        until: horizon, s; later contacts do not count.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     onset = at[LEADER_ONSET]
@@ -101,12 +102,12 @@ def least_closing_of_pair(at: Floats, until: float, plan: Floats, other: Floats)
 
 @compiled
 def bound_pairs(pairs: Floats, until: Floats, out: Floats) -> None:
-    """Compute a lower bound on the harm of each of ``n`` pairs, whatever all vehicles do.
+    """Compute a lower bound on the harm of each of ``n`` pairs, whatever the vehicles do.
 
     Args:
-        pairs: [n, PAIR_WIDTH] pairs, columns ``PAIR_GAP`` to ``FOLLOWER_A``.
-        until: [n] horizon of each pair, s.
-        out: [n] receives the bounds, m2/s2; a contact without impact counts as 0.
+        pairs: [n, PAIR_WIDTH] pairs, with the columns ``PAIR_GAP`` to ``FOLLOWER_A``.
+        until: [n] horizon of each pair, s; later harm does not count.
+        out: [n] array into which the function writes the bounds, m2/s2; a contact without impact counts as 0.
 
     """
     plan, other = empty_plan(), empty_plan()

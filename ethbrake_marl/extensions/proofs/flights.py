@@ -1,8 +1,9 @@
 """Bound how much faster than the centre of mass of a pair one of its vehicles can be after the pair's first contact.
 
-A *flight* is a time in which the two vehicles are apart. ``share`` is the partner's share of the mass of both vehicles.
-``press`` is the acceleration (m/s2) at which the two vehicles close under the best command. ``reach`` is the part of
-``press`` (m/s2) that another command can take away. ``opening`` is the speed (m/s) at which the vehicles separate.
+A *flight* is a period in which the two vehicles are not in contact. ``share`` is the mass of the *partner* (the
+neighbour of the first contact), as a share of the mass of both vehicles. ``press`` is the acceleration (m/s2) of the
+two vehicles towards each other under the extreme command (full drive or full braking). ``reach`` is the largest amount
+(m/s2) by which another command can lower ``press``. ``opening`` is the speed (m/s) at which the vehicles separate.
 docs/internals/proofs/lower-bound.md has the proofs.
 """
 
@@ -15,21 +16,25 @@ from ethbrake_marl.physics.jit import compiled
 
 @compiled
 def flight_lead(share: float, press: float, reach: float, opening: float, flight: float) -> float:
-    """Return the *lead* of a flight: the speed (m/s) that the controlled vehicle gains by it, minus the speed that it
-    costs.
+    """Return the *lead* of a flight: the speed (m/s) that the controlled vehicle gains by the flight, minus the speed
+    that the flight costs.
 
-    A *flight* is a time in which the two vehicles are apart. The gain is the speed of the controlled vehicle minus the
-    speed of the centre of mass of both vehicles. For a flight of length L and opening speed o, the lead is ``share
-    (press L - o) - G``. G is the speed that the vehicle must give up so that the vehicles stay apart for the time L,
-    namely the smallest G with ``G L - G^2 / (2 reach) >= (press L^2 / 2) - o L``. In each second the vehicle can give
-    up at most ``reach``. The result is -inf if no command keeps the vehicles apart for so long.
+    A *flight* is a period in which the two vehicles are not in contact. The gain is the speed of the controlled vehicle
+    minus the speed of the centre of mass of both vehicles. For a flight that lasts L seconds and begins with the
+    opening speed o (m/s), the lead is ``share (press L - o) - G``. G is the speed (m/s) that the controlled vehicle
+    must give up so that the two vehicles stay apart for the time L: the smallest G with ``G L - G^2 / (2 reach) >=
+    (press L^2 / 2) - o L``. In each second the controlled vehicle can give up at most ``reach`` m/s. The result is -inf
+    if no command keeps the vehicles apart for the time L.
 
     Args:
-        share: partner's share of the mass of both vehicles, 0 to 1.
-        press: acceleration at which the two vehicles close under the best command, m/s2.
-        reach: part of ``press`` that another command can take away, m/s2; infinite: no limit is known.
+        share: mass of the partner (the neighbour of the first contact), as a share of the mass of both vehicles, 0 to
+            1.
+        press: acceleration of the two vehicles towards each other under the extreme command (full drive or full
+            braking), m/s2.
+        reach: largest amount by which another command can lower the acceleration ``press``, m/s2; infinite if no limit
+            is known.
         opening: speed at which the two vehicles separate, m/s.
-        flight: length of the flight, s.
+        flight: duration of the flight, s.
 
     """
     relative = share * (press * flight - opening)
@@ -45,15 +50,18 @@ def flight_lead(share: float, press: float, reach: float, opening: float, flight
 
 @compiled
 def best_flight(share: float, press: float, reach: float, opening: float) -> float:
-    """Return the length (s) of the flight with the largest ``flight_lead``; infinite if longer flights are always
-    better.
+    """Return the duration (s) of the flight with the largest ``flight_lead``; infinite if a longer flight always has a
+    larger lead.
 
-    A *flight* is a time in which the two vehicles are apart.
+    A *flight* is a period in which the two vehicles are not in contact.
 
     Args:
-        share: partner's share of the mass of both vehicles, 0 to 1.
-        press: acceleration at which the two vehicles close under the best command, m/s2.
-        reach: part of ``press`` that another command can take away, m/s2; infinite: no limit is known.
+        share: mass of the partner (the neighbour of the first contact), as a share of the mass of both vehicles, 0 to
+            1.
+        press: acceleration of the two vehicles towards each other under the extreme command (full drive or full
+            braking), m/s2.
+        reach: largest amount by which another command can lower the acceleration ``press``, m/s2; infinite if no limit
+            is known.
         opening: speed at which the two vehicles separate, m/s.
 
     """
@@ -77,17 +85,21 @@ def lead(
 ) -> float:
     """Return the largest ``flight_lead`` (m/s) of all flights that last from ``shortest`` to ``longest`` seconds.
 
-    A *flight* is a time in which the two vehicles are apart. The result is the maximum over all opening speeds up to
-    ``opening``, because with a limit on the length of the flight a smaller opening speed may have a larger lead.
+    A *flight* is a period in which the two vehicles are not in contact. The result is the maximum over all opening
+    speeds up to ``opening``, because a smaller opening speed may lead to a larger result if the duration of the flight
+    is limited.
 
     Args:
-        share: partner's share of the mass of both vehicles, 0 to 1.
-        press: acceleration at which the two vehicles close under the best command, m/s2.
-        reach: part of ``press`` that another command can take away, m/s2; infinite: no limit is known.
+        share: mass of the partner (the neighbour of the first contact), as a share of the mass of both vehicles, 0 to
+            1.
+        press: acceleration of the two vehicles towards each other under the extreme command (full drive or full
+            braking), m/s2.
+        reach: largest amount by which another command can lower the acceleration ``press``, m/s2; infinite if no limit
+            is known.
         opening: largest speed at which the two vehicles separate, m/s.
-        shortest: smallest length of the flight, s.
-        longest: largest length of the flight, s.
-        lost: speed that is lost in any case, m/s.
+        shortest: smallest duration of the flight, s.
+        longest: largest duration of the flight, s.
+        lost: speed that the controlled vehicle loses in any case, m/s.
 
     """
     if press > 0.0:
@@ -105,13 +117,17 @@ def lead(
 
 @compiled
 def decays(share: float, press: float, reach: float, bounce: float) -> bool:
-    """Return whether the vehicle never gains by giving up acceleration in order to bounce more strongly later. If the
-    result is True, ``reach`` limits the speed that the vehicle can gain in any flight.
+    """Return True if the vehicle never gains speed by accelerating less now in order to bounce more strongly off its
+    partner later. If the result is True, ``reach`` limits the speed that the vehicle can gain in any flight (period
+    without contact).
 
     Args:
-        share: partner's share of the mass of both vehicles, 0 to 1.
-        press: acceleration at which the two vehicles close under the best command, m/s2.
-        reach: part of ``press`` that another command can take away, m/s2; infinite: no limit is known.
+        share: mass of the partner (the neighbour of the first contact), as a share of the mass of both vehicles, 0 to
+            1.
+        press: acceleration of the two vehicles towards each other under the extreme command (full drive or full
+            braking), m/s2.
+        reach: largest amount by which another command can lower the acceleration ``press``, m/s2; infinite if no limit
+            is known.
         bounce: coefficient of restitution.
 
     """
@@ -132,21 +148,26 @@ def largest_lead(
     """Return an upper bound (m/s) on how much faster the controlled vehicle is than the centre of mass of a pair.
 
     The pair is the controlled vehicle and the neighbour of its first contact. The motion of the centre of mass is
-    computed for the best command from the first contact on. In fact the earlier command still applies in the *window*
-    (the rest of the decision step), which costs the speed ``lost``.
+    computed as if the vehicle executed the best command from the first contact on. In fact the earlier command still
+    applies in the *window* (the rest of the decision step). In the window the controlled vehicle loses the speed
+    ``lost`` (m/s).
 
-    A *flight* is a time in which the pair is apart. The bound is the maximum over three cases: the last flight before
-    the contact with the other neighbour began with the first impact, within the window, or after the window.
+    A *flight* is a period in which the two vehicles of the pair are not in contact. The bound is the maximum over three
+    cases: the last flight before the contact with the other neighbour begins with the first impact, begins within the
+    window, or begins after the window.
 
     Args:
-        share: partner's share of the mass of both vehicles, 0 to 1.
-        press: acceleration at which the two vehicles close under the best command, m/s2.
-        reach: part of ``press`` that another command can take away, m/s2; infinite: no limit is known.
+        share: mass of the partner (the neighbour of the first contact), as a share of the mass of both vehicles, 0 to
+            1.
+        press: acceleration of the two vehicles towards each other under the extreme command (full drive or full
+            braking), m/s2.
+        reach: largest amount by which another command can lower the acceleration ``press``, m/s2; infinite if no limit
+            is known.
         bounce: coefficient of restitution.
         opening: speed at which the pair separates after the first contact, m/s.
-        lost: speed that is lost in the window, m/s.
-        late: start of the window, s.
-        end: end of the window, s.
+        lost: speed that the controlled vehicle loses in the window (the rest of the decision step), m/s.
+        late: start of the window (the rest of the decision step of the first contact), s.
+        end: end of the window (the rest of the decision step of the first contact), s.
         since: earliest time of the contact with the other neighbour, s.
         until: latest time of the contact with the other neighbour, s.
 
@@ -173,18 +194,20 @@ def largest_lead(
 def widest_flight(
     share: float, slack: float, press: float, drive: float, bounce: float, closing: float, back: float, time: float
 ) -> float:
-    """Return the largest ``sqrt(p^2 + 2 press s)`` (m/s) during the flights of a vehicle and a partner that brakes
-    harder. p is the speed at which the two vehicles separate (m/s), s the gap between them (m). The result is infinite
-    if no bound is known.
+    """Return the largest value of ``sqrt(p^2 + 2 press s)`` (m/s) in the flights of a vehicle and a partner that brakes
+    harder. Here p is the speed at which the two vehicles separate (m/s), and s is the gap between them (m). A *flight*
+    is a period in which the two vehicles are not in contact. The result is infinite if no bound is known.
 
     Args:
-        share: partner's share of the mass of both vehicles, 0 to 1.
+        share: mass of the partner (the neighbour of the first contact), as a share of the mass of both vehicles, 0 to
+            1.
         slack: braking capacity of the partner minus braking capacity of the vehicle, m/s2.
-        press: acceleration at which the two vehicles close under the best command, m/s2.
+        press: acceleration of the two vehicles towards each other under the extreme command (full drive or full
+            braking), m/s2.
         drive: largest acceleration that the vehicle can command, m/s2.
         bounce: coefficient of restitution.
         closing: closing speed of the first impact, m/s.
-        back: backward speed of the vehicle after that impact, m/s.
+        back: backward speed of the vehicle after the first impact, m/s.
         time: duration for which the bound holds, s.
 
     """

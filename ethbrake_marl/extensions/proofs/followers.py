@@ -5,7 +5,7 @@ the extreme command (full drive or full braking) is best for the centre of mass 
 controlled vehicle moves faster or slower than this centre of mass only until it meets the first neighbour again;
 ``flights.largest_lead`` bounds the difference. docs/internals/proofs/lower-bound.md has the proofs.
 
-The functions bound all first contacts between the times ``early`` and ``late`` at once, starting from the state at
+Each function computes one bound for all first contacts between the times ``early`` and ``late``, from the state at
 ``early``. From ``late`` to ``end`` the command of the earlier decision still applies. This command differs from the
 extreme command by at least ``lack`` (m/s2).
 """
@@ -52,28 +52,32 @@ def least_closing(
 ) -> float:  # fmt: skip
     """Return the smallest closing speed (m/s) of the controlled vehicle's contact with its second neighbour.
 
-    The controlled vehicle had contact with its first neighbour before. The result has two parts: the closing speed of
-    the second neighbour relative to the centre of mass of the controlled vehicle and its first neighbour, minus the
-    largest difference between the speeds of the controlled vehicle and this centre of mass (``largest_lead``). In the
-    *window* the command of the earlier decision still applies, which costs the speed ``lost``. Times count from the
-    first contact, in s.
+    The controlled vehicle had contact with its first neighbour before. The bound is a difference of two speeds, v - d.
+    Here v is the closing speed of the second neighbour relative to the centre of mass of the controlled vehicle and its
+    first neighbour, and d is the largest difference between the speeds of the controlled vehicle and this centre of
+    mass (``largest_lead``). In the *window* (the rest of the decision step of the first contact) the command of the
+    earlier decision still applies. In the window the controlled vehicle loses the speed ``lost`` (m/s). All times are
+    in s after the first contact.
 
     Args:
-        start: closing speed of the second neighbour relative to the centre of mass at the first contact, m/s.
-        slope: rate of change of the closing speed ``start``, m/s2.
-        turn: first time at which the rate changes, s.
-        bend: change of the rate at ``turn``, m/s2.
-        other_turn: second time at which the rate changes, s.
-        other_bend: change of the rate at ``other_turn``, m/s2.
-        share: first neighbour's share of the mass of both vehicles of the first contact, 0 to 1.
-        press: acceleration at which the two vehicles close under the best command, m/s2.
-        reach: part of ``press`` that another command can take away, m/s2; infinite: no limit is known.
+        start: closing speed, at the time of the first contact, of the second neighbour relative to the centre of mass
+            of the controlled vehicle and its first neighbour, m/s.
+        slope: rate at which this closing speed (``start``) changes from the first contact on, m/s2.
+        turn: time at which the rate of change (``slope``) increases by ``bend``, s.
+        bend: increase of the rate of change at ``turn``, m/s2; may be negative.
+        other_turn: time at which the rate of change increases by ``other_bend``, s.
+        other_bend: increase of the rate of change at ``other_turn``, m/s2; may be negative.
+        share: mass of the first neighbour, as a share of the mass of this neighbour and the controlled vehicle, 0 to 1.
+        press: acceleration of the two vehicles towards each other under the extreme command (full drive or full
+            braking), m/s2.
+        reach: largest amount by which another command can lower the acceleration ``press``, m/s2; infinite if no limit
+            is known.
         bounce: coefficient of restitution.
         opening: speed at which the two vehicles separate after the first contact, m/s.
-        lost: speed that is lost in the window, m/s.
-        late: start of the window, s.
-        end: end of the window, s.
-        until: latest time of the second contact, s.
+        lost: speed that the controlled vehicle loses in the window (the rest of the decision step), m/s.
+        late: start of the window (the rest of the decision step of the first contact), s.
+        end: end of the window (the rest of the decision step of the first contact), s.
+        until: latest time of the contact with the second neighbour, s.
 
     """
     best = least_of_line(start, slope, turn, bend, other_turn, other_bend, 0.0, until)
@@ -97,18 +101,20 @@ def pushed_by_leader(
     """Return the smallest closing speed (m/s) at the rear pair after a first contact with the front vehicle (leader).
 
     The bound uses the centre of mass of the leader and the controlled vehicle. The result is 0 if nothing is proven. If
-    the leader stands at ``early``, later first contacts lead to the same motion, only later. The function then ignores
-    ``late``, ``end`` and ``lack``.
+    the leader is at rest at ``early``, a later first contact leads to the same motion at a later time, so the function
+    ignores ``late``, ``end`` and ``lack``.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        closing: largest closing speed of the first contact, m/s.
-        end: end of the decision step of the first contact, s; the command of this step stays in force until then.
-        lack: smallest possible difference between that command and the best command after the contact, m/s2.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        closing: largest closing speed that the first contact may have, m/s.
+        end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
+        lack: smallest possible difference between the command up to ``end`` and the best command after the contact,
+            m/s2.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     share, rest, press = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE], at[LINE.U_F] + at[LINE.A_L]
@@ -148,12 +154,13 @@ def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: 
     result is 0 if nothing is proven.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        closing: largest closing speed of the first contact, m/s.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        closing: largest closing speed that the first contact may have, m/s.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     share, rest, bounce = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE], at[LINE.RESTITUTION]
@@ -200,14 +207,16 @@ def after_front(
     centre of mass of both vehicles do not hold and are left out.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        closing: largest closing speed of the first contact, m/s.
-        end: end of the decision step of the first contact, s; the command of this step stays in force until then.
-        lack: smallest possible difference between that command and the best command after the contact, m/s2.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        closing: largest closing speed that the first contact may have, m/s.
+        end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
+        lack: smallest possible difference between the command up to ``end`` and the best command after the contact,
+            m/s2.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     share, rest = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE]
@@ -234,11 +243,11 @@ def after_front(
 @compiled
 def obstacle_harm(at: Floats, late: float, closing: float) -> float:
     """Return the smallest squared speed (m2/s2) at which the front vehicle hits the obstacle after a push from behind.
-    After the push nothing but its own brakes slows the front vehicle. The result is 0 if the front vehicle already
-    stands at the obstacle, because the push is then one impact of both vehicles and the obstacle.
+    After the push only its own brakes slow the front vehicle. The result is 0 if the front vehicle already stands at
+    the obstacle, because the push is then one impact of both vehicles and the obstacle.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         late: latest time of the push, s.
         closing: smallest closing speed of the push, m/s.
 
@@ -264,14 +273,14 @@ def braking_after(
     certain.
 
     Args:
-        gap: largest possible gap, m.
-        least_gap: smallest possible gap, m; used only if the vehicle in front brakes harder.
+        gap: largest possible gap between the two vehicles, m.
+        least_gap: smallest possible gap between the two vehicles, m; used only if the vehicle in front brakes harder.
         v_l: speed of the vehicle in front, m/s.
         a_l: braking capacity of the vehicle in front, m/s2.
         v_f: speed of the braking vehicle, m/s.
         a_f: braking capacity of the braking vehicle, m/s2.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     fill_braking(plan, 0.0, a_l)
@@ -294,15 +303,17 @@ def pushed_by_rear(
     controlled vehicle must be at least the braking capacity of the rear vehicle.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        closing: largest closing speed of the first contact, m/s.
-        end: end of the decision step of the first contact, s; the command of this step stays in force until then.
-        lack: smallest possible difference between that command and the best command after the contact, m/s2.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        closing: largest closing speed that the first contact may have, m/s.
+        end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
+        lack: smallest possible difference between the command up to ``end`` and the best command after the contact,
+            m/s2.
         gap: gap to the front vehicle at ``early``, m.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     share, rest = at[LINE.REAR_SHARE], 1.0 - at[LINE.REAR_SHARE]
@@ -331,15 +342,16 @@ def slowed_by_rear(at: Floats, early: float, closing: float, gap: float, plan: F
 
     The bound follows from the fact that the controlled vehicle stays ahead of the rear vehicle. The braking capacity of
     the controlled vehicle must be at least the braking capacity of the rear vehicle. The result is 0 if the closing
-    speed may rise.
+    speed of the front pair may rise with time.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        closing: largest closing speed of the first contact, m/s.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        closing: largest closing speed that the first contact may have, m/s.
         gap: gap to the front vehicle at ``early``, m.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     share, v_l = at[LINE.REAR_SHARE], leader(at, early)[0]

@@ -1,9 +1,10 @@
 """Find the smallest harm over all first contacts of the controlled vehicle with a rear vehicle that may do anything.
 
 Whatever it does, the rear vehicle is at least as far ahead and at least as fast as if it braked fully. The *lead* of
-the rear vehicle is the distance (m) by which it is farther ahead than under full braking. A first contact has a time, a
-lead and a closing speed; a *cell* is a range of each. The search halves cells until the smallest bound of any cell is
-close to the smallest harm found so far. docs/internals/proofs/team-bound.md has the proof.
+the rear vehicle is the distance (m) by which it is farther ahead than under full braking. The search describes a first
+contact by its time, its lead and its closing speed. A *cell* is a set of first contacts: a range of times, a range of
+leads and a range of closing speeds. The search halves cells until the smallest bound of any cell is close to the
+smallest harm that the search has reached. docs/internals/proofs/team-bound.md has the proof.
 """
 
 from __future__ import annotations
@@ -44,10 +45,10 @@ def gained(near: float, time: float, since: float, power: float) -> float:
 
     Args:
         near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m.
-        time: time of the comparison, s.
+        time: time for which the two speeds are compared, s.
         since: time from which on the rear vehicle may brake less than fully, s.
-        power: largest difference between the rear vehicle's acceleration and full braking, m/s2; infinite if other
-            vehicles may push it.
+        power: largest difference between the rear vehicle's acceleration and its full braking, m/s2; infinite if other
+            vehicles may push the rear vehicle.
 
     """
     if near <= 0.0 or time <= since:
@@ -60,14 +61,15 @@ def gained(near: float, time: float, since: float, power: float) -> float:
 
 @compiled
 def behind_full_braking(at: Floats, early: float, late: float) -> float:
-    """Return the gap (m) if the controlled vehicle brakes until ``early`` and the rear vehicle until ``late`` (s).
+    """Return the gap (m) between the controlled vehicle's position at ``early`` (s) and the rear vehicle's position at
+    ``late`` (s) if both brake fully.
 
-    A negative gap is an overlap: the rear vehicle would be that far ahead of the controlled one.
+    A negative gap is an overlap: the rear vehicle would be that far ahead of the controlled vehicle.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: end of the controlled vehicle's motion, s.
-        late: end of the rear vehicle's motion, s.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: time for which the controlled vehicle's position is computed, s.
+        late: time for which the rear vehicle's position is computed, s.
 
     """
     return float(
@@ -83,14 +85,15 @@ def soft_behind(at: Floats, early: float, late: float, near: float, far: float, 
     The *lead* is the distance by which the rear vehicle is farther ahead than under its own full braking.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        near: smallest lead of the rear vehicle, m.
-        far: largest lead of the rear vehicle, m.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m.
+        far: largest distance by which the rear vehicle is farther ahead than if it braked fully, m.
         since: time from which on the rear vehicle may brake less than fully, s.
-        power: largest difference between the rear vehicle's acceleration and full braking, m/s2; infinite if other
-            vehicles may push it.
+        power: largest difference between the rear vehicle's acceleration and its full braking, m/s2; infinite if other
+            vehicles may push the rear vehicle.
 
     """
     faster = gained(near, late, since, power)
@@ -107,20 +110,21 @@ def after_behind(
 ) -> float:  # fmt: skip
     """Return the smallest squared closing speed (m2/s2) at the front pair after a first contact with the rear vehicle.
 
-    The bound is computed for one motion, which starts from a state at ``early``. After each of the contacts, the
+    The bound is computed for one motion, which starts from a state at ``early``. After any of these first contacts, the
     controlled vehicle is at every time at least as far ahead and as fast as in this motion.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        near: smallest lead of the rear vehicle, m.
-        far: largest lead of the rear vehicle, m.
-        hard: largest closing speed of the first contact, m/s.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m.
+        far: largest distance by which the rear vehicle is farther ahead than if it braked fully, m.
+        hard: largest closing speed that the first contact may have, m/s.
         faster: smallest difference between the rear vehicle's speed and its speed under full braking, m/s.
-        moved: working memory for a second world, [LINE.WIDTH].
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     further = near - faster * (late - early)
@@ -155,20 +159,23 @@ def put_behind(
     Returns the new number of cells on the heap.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        near: smallest lead of the rear vehicle, m.
-        far: largest lead of the rear vehicle, m.
-        soft: smallest closing speed of the first contact, m/s.
-        hard: largest closing speed of the first contact, m/s.
-        search: [SEARCH] settings of the search: ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound
-            of the front pair alone, m2/s2) and ``BEST`` (smallest harm found so far, m2/s2).
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m.
+        far: largest distance by which the rear vehicle is farther ahead than if it braked fully, m.
+        soft: smallest closing speed that the first contact may have, m/s.
+        hard: largest closing speed that the first contact may have, m/s.
+        search: [SEARCH] numbers that the search needs: ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of ``gained``;
+            ``FLOOR`` is the bound of the front pair alone (m2/s2); ``BEST`` is the smallest harm that the search has
+            reached so far (m2/s2).
         count: number of cells on the heap.
-        moved: working memory for a second world, [LINE.WIDTH].
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
-        heap: [SEARCHED + 4, HEAP_WIDTH] cells ordered as a binary heap; changed in place.
+        moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
+        heap: [SEARCHED + 4, HEAP_WIDTH] binary heap with one row for each cell (range of first contacts); changed in
+            place.
 
     """
     since, power, floor = search[SINCE], search[POWER], search[FLOOR]
@@ -193,21 +200,21 @@ def put_behind(
 def try_behind(
     at: Floats, time: float, near: float, far: float, search: Floats, moved: Floats, plan: Floats, other: Floats
 ) -> None:
-    """Lower ``search[BEST]`` to the harm of the gentlest first contact with the rear vehicle at ``time``, if that is
-    smaller.
+    """Lower ``search[BEST]`` to the harm of the gentlest first contact with the rear vehicle at ``time``, if this harm
+    is smaller.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         time: time of the contact, s.
-        near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m; raised if no
-            contact has it.
+        near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m; the function
+            raises this distance if no contact at ``time`` is possible with it.
         far: largest distance by which the rear vehicle is farther ahead than if it braked fully, m.
-        search: [SEARCH] settings of the search: ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound
-            of the front pair alone, m2/s2) and ``BEST`` (smallest harm found so far, m2/s2). The function lowers
-            ``BEST``.
-        moved: working memory for a second world, [LINE.WIDTH].
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        search: [SEARCH] numbers that the search needs: ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of ``gained``;
+            ``FLOOR`` is the bound of the front pair alone (m2/s2); ``BEST`` is the smallest harm that the search has
+            reached so far (m2/s2). The function lowers ``BEST`` if it reaches a smaller harm.
+        moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     near = max(near, behind_full_braking(at, time, time))
@@ -229,15 +236,16 @@ def divide_behind(
     distance by which the rear vehicle is farther ahead than under its own full braking.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        search: [SEARCH] settings of the search: ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound
-            of the front pair alone, m2/s2) and ``BEST`` (smallest harm found so far, m2/s2). The function lowers
-            ``BEST``.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        search: [SEARCH] numbers that the search needs: ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of ``gained``;
+            ``FLOOR`` is the bound of the front pair alone (m2/s2); ``BEST`` is the smallest harm that the search has
+            reached so far (m2/s2). The function lowers ``BEST`` if it reaches a smaller harm.
         count: number of cells on the heap.
-        moved: working memory for a second world, [LINE.WIDTH].
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
-        heap: [SEARCHED + 4, HEAP_WIDTH] cells ordered as a binary heap; changed in place.
+        moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
+        heap: [SEARCHED + 4, HEAP_WIDTH] binary heap with one row for each cell (range of first contacts); changed in
+            place.
 
     """
     early, late, near, far = heap[0, EARLY], heap[0, LATE], heap[0, NEAR], heap[0, FAR]
@@ -272,15 +280,16 @@ def meetings_behind(
     The result is at most ``search[BEST]``.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         last: latest time of the contact, s after the controlled vehicle may act.
-        search: [SEARCH] settings of the search: ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound
-            of the front pair alone, m2/s2) and ``BEST`` (smallest harm found so far, m2/s2). The function lowers
-            ``BEST``.
-        moved: working memory for a second world, [LINE.WIDTH].
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
-        heap: working memory for the cells of the search, [SEARCHED + 4, HEAP_WIDTH].
+        search: [SEARCH] numbers that the search needs: ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of ``gained``;
+            ``FLOOR`` is the bound of the front pair alone (m2/s2); ``BEST`` is the smallest harm that the search has
+            reached so far (m2/s2). The function lowers ``BEST`` if it reaches a smaller harm.
+        moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
+        heap: working memory for the search, [SEARCHED + 4, HEAP_WIDTH]: one row for each cell (range of first
+            contacts).
 
     """
     since, hard, count = min(search[SINCE], last), math.sqrt(search[BEST]), 0

@@ -1,9 +1,9 @@
 """Bound the harm of the first three vehicles: Vehicle 1 is scripted, Vehicle 2 controlled, Vehicle 3 may do anything.
 
-For first contacts with the leader, the bound for one controlled vehicle also holds here (``lower_bound.front_first``):
-it assumes that the rear vehicle brakes fully, and a rear vehicle that arrives earlier never lowers the harm. For first
-contacts with the rear vehicle there is a separate search (``free_rear.meetings_behind``).
-docs/internals/proofs/team-bound.md has the proofs.
+For first contacts with the leader, the module uses ``lower_bound.front_first``, the bound for one controlled vehicle.
+This bound assumes that the rear vehicle brakes fully. The bound holds here too, because a rear vehicle that arrives
+earlier never lowers the harm. For first contacts with the rear vehicle there is a separate search
+(``free_rear.meetings_behind``). docs/internals/proofs/team-bound.md has the proofs.
 """
 
 from __future__ import annotations
@@ -40,15 +40,16 @@ def all_at_once(at: Floats, first: float, last: float, pair: Floats, plan: Float
     impossible.
 
     Let W be the smallest closing speed of the rear vehicle relative to the front vehicle. The closing speeds of the two
-    pairs add up to at least W. The closing speed of the front pair is at least its smallest value at any first contact.
+    pairs add up to at least W. The closing speed of the front pair is at least the smallest closing speed of any first
+    contact with the front vehicle.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        first: earliest first contact with the front vehicle, s.
-        last: latest first contact with the front vehicle, s.
-        pair: working memory for a pair, [PAIR_WIDTH].
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        first: earliest time of a first contact with the front vehicle, s.
+        last: latest time of a first contact with the front vehicle, s.
+        pair: working memory for the values of one pair, [PAIR_WIDTH]; overwritten.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     pair[PAIR_GAP], pair[LEADER_ONSET], pair[LEADER_FREE] = at[LINE.GAP_L] + at[LINE.GAP_R], 0.0, 0.0
@@ -66,17 +67,19 @@ def all_at_once(at: Floats, first: float, last: float, pair: Floats, plan: Float
 
 @compiled(apart=True)
 def late_meetings(at: Floats, first: float, stand: float, plan: Floats, other: Floats) -> int:
-    """Return a code: can the first contact of rear and controlled vehicle come after ``stand``?
+    """Return a code that says whether the first contact of the rear vehicle and the controlled vehicle can come after
+    ``stand``.
 
-    Code 0: no. Code 1: yes, but the harm is then at least as large as for some first contact with the front vehicle.
-    Code 2: yes, and nothing is proven about the harm.
+    Code 0: this contact cannot come after ``stand``. Code 1: this contact can come after ``stand``, but its harm is
+    then at least as large as the harm of some first contact with the front vehicle. Code 2: this contact can come after
+    ``stand``, and nothing is proven about its harm.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        first: earliest first contact with the front vehicle, s; infinite: there is none.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        first: earliest time of a first contact with the front vehicle, s; infinite if there is no such contact.
         stand: time at which the rear vehicle comes to rest under full braking, s.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     if first == math.inf or not stays_ahead(at, first, first, plan, other):
@@ -100,21 +103,24 @@ def combined_bound_of_team(
 ) -> float:  # fmt: skip
     """Return a lower bound (m2/s2) on the harm of the first three vehicles in a world with unavoidable contact.
 
-    The bound covers first contacts with either neighbour. The result is 0 if some of the harm may come after ``until``.
+    The bound covers first contacts with the front vehicle and first contacts with the rear vehicle. The result is 0 if
+    some of the harm may come after ``until``.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         until: horizon, s; later harm does not count.
-        front: bound on the harm of the front pair alone, m2/s2.
-        rear: bound on the harm of the rear pair alone, m2/s2.
+        front: lower bound on the harm of the front pair (front and controlled vehicle) alone, m2/s2.
+        rear: lower bound on the harm of the rear pair (controlled and rear vehicle) alone, m2/s2.
         since: time from which on the rear vehicle may brake less than fully, s.
-        power: largest difference between the rear vehicle's acceleration and full braking, m/s2.
-        pair: working memory for a pair, [PAIR_WIDTH].
-        moved: working memory for a second world, [LINE.WIDTH].
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
-        heap: working memory for the cells of contacts with the front vehicle, [CELLS, NEAR].
-        heap_behind: working memory for the cells of contacts with the rear vehicle, [SEARCHED + 4, HEAP_WIDTH].
+        power: largest difference between the rear vehicle's acceleration and its full braking, m/s2.
+        pair: working memory for the values of one pair, [PAIR_WIDTH]; overwritten.
+        moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
+        heap: working memory for the search of contacts with the front vehicle, [CELLS, NEAR]: one row for each cell
+            (range of first contacts).
+        heap_behind: working memory for the search of contacts with the rear vehicle, [SEARCHED + 4, HEAP_WIDTH]: one
+            row for each cell (range of first contacts).
 
     """
     rest, stand = last_rest(at)
@@ -146,15 +152,16 @@ def combined_bound_of_team(
 
 @compiled
 def bound_threes(states: Floats, until: Floats, pairs: Floats, since: Floats, power: Floats, out: Floats) -> None:
-    """Compute the combined bound of the first three vehicles in each of ``n`` worlds with unavoidable contact.
+    """Compute a lower bound on the harm of the first three vehicles together in each of ``n`` worlds with unavoidable
+    contact.
 
     Args:
         states: [n, LINE.WIDTH] worlds; ``line.LINE`` names the columns.
-        until: [n] horizon, s.
-        pairs: [n, 2] bounds of the two pairs alone, m2/s2.
+        until: [n] horizon, s; later harm does not count.
+        pairs: [n, 2] lower bounds on the harm of the first two pairs, each pair alone, m2/s2.
         since: [n] time from which on the rear vehicle may brake less than fully, s.
-        power: [n] largest acceleration that the rear vehicle can gain over full braking, m/s2.
-        out: [n] receives the bounds, m2/s2.
+        power: [n] largest difference between the rear vehicle's acceleration and its full braking, m/s2.
+        out: [n] array into which the function writes the bounds, m2/s2.
 
     """
     plan, other, pair, moved = empty_plan(), empty_plan(), np.empty(PAIR_WIDTH), np.empty(LINE.WIDTH)

@@ -61,15 +61,16 @@ _PARTS = 8  # number of parts into which the times of soft contacts are divided
 
 @compiled
 def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
-    """Return the smallest squared closing speed (m2/s2) at the rear pair's first contact, and its latest time (s).
+    """Return the smallest squared closing speed (m2/s2) at the rear pair's first contact, and the latest time of this
+    contact (s).
 
     Full drive of the controlled vehicle leads to exactly this closing speed and this time. The time is infinite if full
     drive avoids contact.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], math.inf, at[LINE.A_F])
@@ -83,14 +84,14 @@ def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
 @compiled(apart=True)
 def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
     """Return whether the gentlest first contact with one neighbour at ``time`` comes before any contact with the other
-    one.
+    neighbour.
 
     Args:
-        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST``.
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        time: time of the contact, s after the controlled vehicle may act.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST``.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        time: time of the contact, in s from the moment at which the controlled vehicle may act.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     if kind == FRONT_FIRST:
@@ -101,19 +102,20 @@ def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) ->
 @compiled(apart=True)
 def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, other: Floats) -> float:
     """Return the latest time (s) of a first contact with one neighbour that comes before any contact with the other
-    one.
+    neighbour.
 
-    The function bisects the time, because a later first contact brings the other neighbour nearer. For a later contact
-    with the front vehicle the controlled vehicle drives for a shorter time, so the rear vehicle comes nearer. For a
-    later contact with the rear vehicle it brakes for a shorter time, so it comes nearer to the front vehicle.
+    The function finds this time by bisection, because the other neighbour is nearer if the first contact is later. For
+    a later contact with the front vehicle the controlled vehicle drives for a shorter time, so the rear vehicle comes
+    nearer. For a later contact with the rear vehicle the controlled vehicle brakes for a shorter time, so it comes
+    nearer to the front vehicle.
 
     Args:
-        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST``.
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        first: time of a first contact before which the other neighbour has not arrived, s.
+        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST``.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        first: time at which a first contact with this neighbour is possible before the other neighbour arrives, s.
         last: latest time of a contact with this neighbour, s; the result is at most ``last``.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     if is_first(kind, at, last, plan, other):
@@ -129,17 +131,17 @@ def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, o
 
 @compiled(apart=True)
 def last_meeting(at: Floats, first: float, plan: Floats, other: Floats) -> tuple[float, float, bool]:
-    """Return the time (s) of the latest contact with the front vehicle, and of the latest one before the rear vehicle
-    arrives.
+    """Return the latest time (s) of a contact with the front vehicle, and the latest time (s) of such a contact before
+    the rear vehicle arrives.
 
     The third result is True if the first contact with the front vehicle may come arbitrarily late and at any closing
     speed.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        first: earliest contact with the front vehicle, s.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        first: earliest time of a contact with the front vehicle, s.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     touches = spare_gap(at[LINE.GAP_L], at[LINE.V_L], at[LINE.A_L], at[LINE.V_F], at[LINE.A_F]) >= 0.0
@@ -160,18 +162,19 @@ def front_first(
     at once.
 
     The result is at most ``best``. In a contact of all three vehicles at once, the closing speeds of the two pairs add
-    up to the closing speed W of front and rear vehicle. The front pair's part of W is at least its smallest closing
-    speed at that time. This case is included only if a first contact with the front vehicle can come at that time.
+    up to W, the closing speed of the rear vehicle relative to the front vehicle. The closing speed of the front pair is
+    at least its smallest possible value at that time. The result covers such a contact of all three vehicles only if a
+    first contact with the front vehicle can come at that time.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        floor: known lower bound on the harm of the other pair, m2/s2.
-        best: smallest harm of a first contact found so far, m2/s2.
-        enough: lower bound (m2/s2) that is proven in another way; the function returns 0 if the bound of some contact
-            is not above it.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
-        heap: working memory for the cells of the search, [CELLS, NEAR].
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        floor: known lower bound on the harm of the other pair (the pair that does not have the first contact), m2/s2.
+        best: smallest harm that the search has reached so far, m2/s2.
+        enough: lower bound that is already proven in another way, m2/s2; the function returns 0 if the bound of some
+            first contact is not above ``enough``.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
+        heap: working memory for the search, [CELLS, NEAR]: one row for each cell (range of first contacts).
 
     """
     first = meet_front(at, math.inf, plan, other)
@@ -211,14 +214,15 @@ def soft_harm(
     The result is at most ``best``.
 
     Args:
-        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST``.
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        floor: known lower bound on the harm of the other pair, m2/s2.
-        best: smallest harm of a first contact found so far, m2/s2.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST``.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        floor: known lower bound on the harm of the other pair (the pair that does not have the first contact), m2/s2.
+        best: smallest harm that the search has reached so far, m2/s2.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     soft = 0.0
@@ -239,14 +243,14 @@ def rear_first(
     """Return a lower bound (m2/s2) on the harm if the first contact is with the rear vehicle; at most ``best``.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        floor: known lower bound on the harm of the other pair, m2/s2.
-        best: smallest harm of a first contact found so far, m2/s2.
-        enough: lower bound (m2/s2) that is proven in another way; the function returns 0 if the bound of some contact
-            is not above it.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
-        heap: working memory for the cells of the search, [CELLS, NEAR].
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        floor: known lower bound on the harm of the other pair (the pair that does not have the first contact), m2/s2.
+        best: smallest harm that the search has reached so far, m2/s2.
+        enough: lower bound that is already proven in another way, m2/s2; the function returns 0 if the bound of some
+            first contact is not above ``enough``.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
+        heap: working memory for the search, [CELLS, NEAR]: one row for each cell (range of first contacts).
 
     """
     high = max(at[LINE.V_F] / at[LINE.A_F], at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R])
@@ -280,15 +284,15 @@ def rear_first(
 def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
     """Return a time (s) after which no first contact with the rear vehicle is possible.
 
-    Until its first contact, the rear vehicle passes neither the front vehicle nor the controlled one. Let the rear
-    vehicle brake harder than the controlled one, by b (m/s2). Then t seconds before the contact it was faster than the
-    controlled one by at least ``b t``, if it already braked at that time.
+    Until its first contact, the rear vehicle passes neither the front vehicle nor the controlled vehicle. Suppose that
+    the rear vehicle brakes harder than the controlled vehicle, by b (m/s2). Then t seconds before the contact the rear
+    vehicle was faster than the controlled vehicle by at least ``b t`` (m/s), if it already braked at that time.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         rest: time at which controlled and rear vehicle have both come to rest under full braking, s.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     fill_braking(plan, 0.0, at[LINE.A_L])
@@ -307,13 +311,11 @@ def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
 
 @compiled(apart=True)
 def last_rest(at: Floats) -> tuple[float, float]:
-    """Return the time (s) by which all harm in the combined bound has happened, and the time (s) when the rear vehicle
-    rests.
-
-    The rear vehicle comes to rest at the second time if it brakes fully and no other vehicle pushes it.
+    """Return the time (s) by which all harm in the combined bound has happened, and the time (s) at which the rear
+    vehicle comes to rest if it brakes fully and no other vehicle pushes it.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
 
     """
     stand = at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R]
@@ -327,18 +329,19 @@ def last_rest(at: Floats) -> tuple[float, float]:
 def combined_bound(
     at: Floats, until: float, front: float, rear: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
-    """Return a lower bound (m2/s2) on the harm of a world with unavoidable contact, over first contacts of both kinds.
+    """Return a lower bound (m2/s2) on the harm of a world with unavoidable contact.
 
-    The first contact may be with the front or the rear vehicle. The result is 0 if the harm may come after ``until``.
+    The first contact may be with the front or the rear vehicle. The result is 0 if some of this harm may come after
+    ``until``.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         until: horizon, s; later harm does not count.
-        front: bound on the harm of the front pair alone, m2/s2.
-        rear: bound on the harm of the rear pair alone, m2/s2.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
-        heap: working memory for the cells of the search, [CELLS, NEAR].
+        front: lower bound on the harm of the front pair (front and controlled vehicle) alone, m2/s2.
+        rear: lower bound on the harm of the rear pair (controlled and rear vehicle) alone, m2/s2.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
+        heap: working memory for the search, [CELLS, NEAR]: one row for each cell (range of first contacts).
 
     """
     if not last_rest(at)[0] < until:
@@ -362,11 +365,12 @@ def bound_worlds(
 
     Args:
         states: [n, LINE.WIDTH] worlds; ``line.LINE`` names the columns.
-        until: [n] horizon, s.
-        has_front: [n] True if the front pair exists and its next impact counts.
-        has_rear: [n] True if the rear pair exists and its next impact counts.
+        until: [n] horizon, s; later harm does not count.
+        has_front: [n] True if the controlled vehicle has a front vehicle and the next impact of this pair counts.
+        has_rear: [n] True if the controlled vehicle has a rear vehicle and the next impact of this pair counts.
         unavoidable: [n] True if contact is unavoidable; the combined bound is 0 in all other worlds.
-        out: [n, BOUNDS] receives the columns FRONT_BOUND, REAR_BOUND and COMBINED_BOUND, m2/s2.
+        out: [n, BOUNDS] array into which the function writes the columns FRONT_BOUND, REAR_BOUND and COMBINED_BOUND,
+            m2/s2.
 
     """
     plan, other, heap = empty_plan(), empty_plan(), np.empty((CELLS, NEAR))
@@ -404,25 +408,25 @@ def lower_bound(
 ) -> LowerBound:
     """Return a proven lower bound on the harm of every world, over all commands of one vehicle.
 
-    ``harm = early + max((front_pair + rear_pair), combined)``. Each part is lowered by the largest possible rounding
-    error (``rounding``). The combined bound is 0 where contact can be avoided. Harm that may come only after the
-    horizon counts as 0. The function covers the same lines as ``avoidability``.
+    ``harm = early + max((front_pair + rear_pair), combined)``. Each term of this formula is lowered by the largest
+    possible rounding error (``rounding``). ``combined`` is 0 in worlds in which contact can be avoided. Harm that may
+    come only after ``horizon_s`` counts as 0. The function covers the same lines as ``avoidability``.
 
-    With brake build-up, the bound holds for commands that change at any time, and it is smaller. ``contact``, the
-    verdict on avoidable contact, is then None, even if brakes build up in only one of the worlds.
+    If brakes build up, the bound holds for commands that change at any time, and it is weaker (smaller). ``contact``,
+    the verdict on avoidable contact, is None if brakes build up in any of the worlds.
 
     Args:
-        worlds: the worlds now, [n].
+        worlds: the ``n`` worlds in their present state.
         vehicle: index of the controlled vehicle, from 0.
-        harm_count: ``first`` or ``total``. With ``first``, only the first impact of each pair counts, even if it came
-            before now.
+        harm_count: which impacts count: ``first`` or ``total``. With ``first``, only the first impact of each pair
+            counts: if a pair has had an impact before now, no later impact of this pair counts.
         horizon_s: time until which harm counts, s after the alert.
-        scripts: script name of each other vehicle, by index. Every script must be full_brake. None: all other vehicles
-            brake fully.
-        time_step_s: time between two decisions, s. With a time step the bound is larger, but it holds only for commands
-            that change at decisions. The first decision comes when the vehicle may act, and the next ones every
-            ``time_step_s`` after it, as for every agent. The computation takes ten times as long. None: commands may
-            change at any time.
+        scripts: maps the index of each vehicle that is not controlled to the name of its script. The only script
+            allowed is full_brake. If ``scripts`` is None, all vehicles that are not controlled brake fully.
+        time_step_s: time between two decisions, s. If ``time_step_s`` is a number, the bound is larger, but it holds
+            only for commands that change at decisions. The first decision comes when the vehicle may act, and the next
+            ones every ``time_step_s`` after it, as for every agent. With a time step the computation takes ten times as
+            long as with None. If ``time_step_s`` is None, commands may change at any time.
 
     Raises ``InvalidInput`` for other lines, for an unknown ``harm_count``, for a time step below ``LEAST_TIME_STEP_S``,
     and for a horizon that is not finite or lies before the vehicle may act.

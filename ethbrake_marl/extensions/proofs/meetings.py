@@ -1,7 +1,8 @@
-"""Compute the gentlest first contact of the controlled vehicle with a neighbour at a given time.
+"""Compute the gentlest first contact (smallest closing speed) of the controlled vehicle with a neighbour at a given
+time.
 
-Times count from the moment at which the controlled vehicle (f) may act. The front vehicle (leader, l) already brakes at
-time 0. The rear vehicle (r) coasts until its onset and then brakes. All speeds and gaps are at least 0.
+Times are measured from the moment at which the controlled vehicle (f) may act. The front vehicle (leader, l) already
+brakes at time 0. The rear vehicle (r) coasts until its onset and then brakes. All speeds and gaps are at least 0.
 docs/internals/proofs/lower-bound.md has the proofs.
 """
 
@@ -26,15 +27,15 @@ _GUARD = 2.0**-46  # largest relative rounding error of positions; closing speed
 
 @compiled(apart=True)
 def gentlest_front(at: Floats, time: float) -> tuple[float, float]:
-    """Return the smallest closing speed (m/s) of a contact with the front vehicle at ``time``, and the length of the
-    drive.
+    """Return the smallest closing speed (m/s) of a contact with the front vehicle at ``time``, and the duration of the
+    drive before it (s).
 
-    The controlled vehicle arrives at the place of the contact at ``time`` most slowly if it drives first (for the
-    second result, in s), and then brakes.
+    The controlled vehicle reaches the place of the contact at ``time`` with the smallest possible speed if it drives
+    first and then brakes.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        time: time of the contact, s after the controlled vehicle may act.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        time: time of the contact, in s from the moment at which the controlled vehicle may act.
 
     """
     v_l, way = leader(at, time)
@@ -61,9 +62,9 @@ def braked_then_driven(at: Floats, brake: float, time: float) -> tuple[float, fl
     A vehicle that brakes to rest waits there until it drives.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        brake: duration of the braking, s.
-        time: time of the result, s.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        brake: how long the vehicle brakes before it drives, s.
+        time: time at which the function computes distance and speed, s.
 
     """
     v, u, a = at[LINE.V_F], at[LINE.U_F], at[LINE.A_F]
@@ -79,12 +80,12 @@ def braked_then_driven(at: Floats, brake: float, time: float) -> tuple[float, fl
 
 @compiled(apart=True)
 def braking_to_rear(at: Floats, time: float, further: float) -> float:
-    """Return how long (s) the controlled vehicle must brake before it drives, for contact with the rear vehicle at
-    ``time``.
+    """Return how long (s) the controlled vehicle must brake before it drives, so that it has contact with the rear
+    vehicle at ``time``.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        time: time of the contact, s after the controlled vehicle may act.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        time: time of the contact, in s from the moment at which the controlled vehicle may act.
         further: distance by which the rear vehicle is farther ahead than under full braking, m.
 
     """
@@ -101,16 +102,16 @@ def braking_to_rear(at: Floats, time: float, further: float) -> float:
 
 @compiled(apart=True)
 def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
-    """Return the smallest closing speed (m/s) of a contact with the rear vehicle at ``time``, and the length of the
-    braking.
+    """Return the smallest closing speed (m/s) of a contact with the rear vehicle at ``time``, and the duration of the
+    braking before it (s).
 
-    The controlled vehicle arrives at the place of the contact at ``time`` with the largest speed if it brakes first
-    (for the second result, in s), and then drives. The second result is infinite if the vehicle reaches its speed limit
-    by ``time``.
+    The controlled vehicle reaches the place of the contact at ``time`` with the largest possible speed if it brakes
+    first and then drives. The duration of the braking is returned as infinite if the vehicle reaches its speed limit by
+    ``time``.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        time: time of the contact, s after the controlled vehicle may act.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        time: time of the contact, in s from the moment at which the controlled vehicle may act.
 
     """
     brake = braking_to_rear(at, time, 0.0)
@@ -120,15 +121,16 @@ def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
 
 @compiled(apart=True)
 def gentlest(kind: int, at: Floats, time: float) -> tuple[float, float]:
-    """Return the smallest closing speed (m/s) of a first contact at ``time``, and how long (s) to drive or brake first.
+    """Return the smallest closing speed (m/s) of a first contact at ``time``, and how long (s) the controlled vehicle
+    drives or brakes first.
 
-    With brake build-up the second result is 0.
+    With brake build-up this duration is returned as 0.
 
     Args:
-        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
-            ``RAMPED_REAR``).
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        time: time of the contact, s after the controlled vehicle may act.
+        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
+            build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        time: time of the contact, in s from the moment at which the controlled vehicle may act.
 
     """
     if kind >= RAMPED_FRONT:
@@ -138,15 +140,16 @@ def gentlest(kind: int, at: Floats, time: float) -> tuple[float, float]:
 
 @compiled(apart=True)
 def meet_front(at: Floats, drive: float, plan: Floats, other: Floats) -> float:
-    """Return the time (s) of the controlled vehicle's contact with the front one if it drives first and then brakes.
+    """Return the time (s) at which a controlled vehicle that drives first and then brakes has contact with the front
+    vehicle.
 
     The result is infinite if there is no contact.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        drive: duration of the drive, s; infinite: the vehicle never brakes.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        drive: how long the vehicle drives before it brakes, s; infinite if it never brakes.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], drive, at[LINE.A_F])
@@ -156,15 +159,16 @@ def meet_front(at: Floats, drive: float, plan: Floats, other: Floats) -> float:
 
 @compiled(apart=True)
 def meet_rear(at: Floats, brake: float, plan: Floats, other: Floats) -> float:
-    """Return the time (s) of the rear vehicle's contact with the controlled one, which brakes first and then drives.
+    """Return the time (s) at which a controlled vehicle that brakes first and then drives has contact with the rear
+    vehicle.
 
     The result is infinite if there is no contact.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        brake: duration of the braking, s.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        brake: how long the vehicle brakes before it drives, s.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     fill_brake_then_drive(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], brake, at[LINE.A_F])
@@ -176,14 +180,15 @@ def meet_rear(at: Floats, brake: float, plan: Floats, other: Floats) -> float:
 
 @compiled(apart=True)
 def stays_ahead(at: Floats, drive: float, until: float, plan: Floats, other: Floats) -> bool:
-    """Return whether the controlled vehicle avoids the rear vehicle until ``until`` if it drives first and then brakes.
+    """Return whether a controlled vehicle that drives first and then brakes avoids contact with the rear vehicle until
+    ``until``.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        drive: duration of the drive, s.
-        until: end of the comparison, s.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        drive: how long the vehicle drives before it brakes, s.
+        until: time until which there must be no contact, s.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], drive, at[LINE.A_F])
@@ -193,15 +198,15 @@ def stays_ahead(at: Floats, drive: float, until: float, plan: Floats, other: Flo
 
 @compiled(apart=True)
 def stays_behind(at: Floats, brake: float, until: float, plan: Floats, other: Floats) -> bool:
-    """Return whether the controlled vehicle avoids the front vehicle until ``until`` if it brakes first and then
-    drives.
+    """Return whether a controlled vehicle that brakes first and then drives avoids contact with the front vehicle until
+    ``until``.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        brake: duration of the braking, s.
-        until: end of the comparison, s.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        brake: how long the vehicle brakes before it drives, s.
+        until: time until which there must be no contact, s.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     fill_brake_then_drive(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], brake, at[LINE.A_F])

@@ -1,8 +1,8 @@
 """Bound the harm that must follow a first contact if an obstacle is ahead of the leader (the front vehicle).
 
 ``beyond`` is the squared speed (m2/s2) at which the leader hits the obstacle. This speed limits how far ahead the
-leader can be at any time. Positions count from the controlled vehicle's position at its onset. Masses are in units of
-the controlled vehicle's mass. docs/internals/proofs/lower-bound-obstacle.md has the proofs.
+leader can be at any time. Position 0 is the place of the controlled vehicle at the moment at which it may act. Masses
+are in units of the controlled vehicle's mass. docs/internals/proofs/lower-bound-obstacle.md has the proofs.
 """
 
 from __future__ import annotations
@@ -41,10 +41,11 @@ def all_three(at: Floats) -> tuple[float, float, float, float]:
     (m/s2).
 
     Masses are in units of the controlled vehicle's mass. The third result is the largest deceleration of the centre of
-    mass before the rear vehicle's onset. The fourth is the additional deceleration by the rear vehicle's brakes.
+    mass before the rear vehicle brakes. The fourth result is the additional deceleration of this centre of mass by the
+    rear vehicle's brakes.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
 
     """
     front, rear = at[LINE.FRONT_SHARE] / (1.0 - at[LINE.FRONT_SHARE]), at[LINE.REAR_SHARE] / (1.0 - at[LINE.REAR_SHARE])
@@ -59,9 +60,9 @@ def leader_pushed(at: Floats, early: float, beyond: float) -> tuple[float, float
     The push is just strong enough that the front vehicle hits the obstacle with the speed ``sqrt(beyond)``.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: time of the push, s.
-        beyond: squared speed at the obstacle, m2/s2.
+        beyond: squared speed at which the front vehicle hits the obstacle, m2/s2.
 
     """
     v = math.sqrt(max(beyond + 2.0 * at[LINE.A_L] * (at[LINE.WALL] - leader(at, early)[1]), 0.0))
@@ -74,17 +75,18 @@ def least_beyond(
 ) -> float:
     """Return the smallest squared speed (m2/s2) at which the front vehicle, pushed at ``early``, hits the obstacle.
 
-    The bound uses the centre of mass of all three vehicles: it cannot reach the obstacle before the front vehicle does.
+    The bound uses the centre of mass of all three vehicles, which cannot reach the obstacle before the front vehicle
+    does.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: time of the push, s.
-        late: time at which the vehicles have ``place`` and ``speed``, s.
-        place: smallest position of the centre of mass of all three vehicles at ``late``, m.
-        speed: speed of this centre of mass at ``late``, m/s.
-        least: lower bound that is known already, m2/s2; the result is at least ``least``.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        late: time for which ``place`` and ``speed`` are given, s.
+        place: smallest possible position, at ``late``, of the centre of mass of all three vehicles, m.
+        speed: speed of the centre of mass of all three vehicles at ``late``, m/s.
+        least: lower bound on the result that is known already, m2/s2; the result is at least ``least``.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     if not speed > 0.0:
@@ -109,10 +111,11 @@ def slowest(at: Floats, early: float, late: float, faster: float) -> tuple[float
     that no command and no push brings the vehicle further behind.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        faster: speed by which the vehicle is faster than the front vehicle after the contact, m/s.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        faster: speed of the vehicle minus speed of the front vehicle after the first contact, m/s.
 
     """
     v_l, way = leader(at, late)
@@ -130,7 +133,7 @@ def last_drive(room: float, speed: float, brakes: float, drive: float, time: flo
     The result is infinite if the vehicle cannot travel so far.
 
     Args:
-        room: distance to travel, m.
+        room: distance that the vehicle must travel, m.
         speed: speed now, m/s.
         brakes: deceleration while the vehicle brakes, m/s2.
         drive: acceleration while the vehicle drives, m/s2.
@@ -154,18 +157,20 @@ def stopped_there(
     time.
 
     The distance (m) is the vehicle's largest distance from the obstacle; it is infinite if no limit is known. The speed
-    (m/s) is the vehicle's largest backward speed. The time (s) is the longest time that it spends near the obstacle.
+    (m/s) is the vehicle's largest backward speed. The time (s) is the longest time that the vehicle can spend near the
+    obstacle.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        hard: largest closing speed of the first contact, m/s.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        hard: largest closing speed that the first contact may have, m/s.
         beyond: squared speed at which the front vehicle hits the obstacle, m2/s2.
         struck: time at which the front vehicle hits the obstacle, s.
         until: time by which the rear vehicle arrives, s.
-        place: smallest position of the vehicle at ``late``, m.
-        speed: smallest speed of the vehicle at ``late``, m/s.
+        place: smallest possible position of the vehicle at ``late``, m.
+        speed: smallest possible speed of the vehicle at ``late``, m/s.
         brakes: deceleration of the vehicle, m/s2.
 
     """
@@ -198,20 +203,22 @@ def behind_leader(
 ) -> float:  # fmt: skip
     """Return the smallest squared closing speed (m2/s2) at the rear pair after a first contact with the front vehicle.
 
-    The front vehicle is assumed to hit the obstacle with at most ``sqrt(beyond)`` m/s. No vehicle passes the front
-    vehicle or the obstacle. The result is LARGE (a huge number) if these assumptions contradict each other.
+    The function assumes that the front vehicle hits the obstacle with at most ``sqrt(beyond)`` m/s, and that no vehicle
+    passes the front vehicle or the obstacle. The result is LARGE (a huge number) if these assumptions contradict each
+    other.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        soft: smallest closing speed of the first contact, m/s.
-        hard: largest closing speed of the first contact, m/s.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        soft: smallest closing speed that the first contact may have, m/s.
+        hard: largest closing speed that the first contact may have, m/s.
         beyond: largest squared speed at which the front vehicle hits the obstacle, m2/s2.
-        place: smallest position of the centre of mass of all three vehicles at ``late``, m.
-        speed: speed of this centre of mass at ``late``, m/s.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        place: smallest possible position, at ``late``, of the centre of mass of all three vehicles, m.
+        speed: speed of the centre of mass of all three vehicles at ``late``, m/s.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     wall, drive, onset = at[LINE.GAP_L] + at[LINE.WALL], at[LINE.U_F], at[LINE.ONSET_R]
@@ -281,17 +288,19 @@ def behind_leader(
 def after_at_obstacle(
     at: Floats, early: float, late: float, soft: float, hard: float, follows: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the smallest harm (m2/s2) of rear pair and obstacle together after a first contact with the front vehicle.
+    """Return the smallest harm (m2/s2) at the rear pair and at the obstacle together after a first contact with the
+    front vehicle.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        soft: smallest closing speed of the first contact, m/s.
-        hard: largest closing speed of the first contact, m/s.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        soft: smallest closing speed that the first contact may have, m/s.
+        hard: largest closing speed that the first contact may have, m/s.
         follows: known lower bound on the harm of the rear pair, m2/s2.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     share = at[LINE.FRONT_SHARE]
@@ -327,13 +336,14 @@ def beyond_rear(
     rear vehicle.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        closing: largest closing speed of the first contact, m/s.
-        least: lower bound that is known already, m2/s2; the result is at least ``least``.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        closing: largest closing speed that the first contact may have, m/s.
+        least: lower bound on the result that is known already, m2/s2; the result is at least ``least``.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     v_l, way_l = leader(at, late)
@@ -350,17 +360,20 @@ def beyond_rear(
 def after_rear(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the smallest harm (m2/s2) of front pair and obstacle together after a first contact with the rear vehicle.
+    """Return the smallest harm (m2/s2) at the front pair and at the obstacle together after a first contact with the
+    rear vehicle.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        closing: largest closing speed of the first contact, m/s.
-        end: end of the decision step of the first contact, s; the command of this step stays in force until then.
-        lack: smallest possible difference between that command and the best command after the contact, m/s2.
-        plan: working memory for the motion of one vehicle, from ``empty_plan``.
-        other: second working memory of the same kind.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        closing: largest closing speed that the first contact may have, m/s.
+        end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
+        lack: smallest possible difference between the command up to ``end`` and the best command after the contact,
+            m/s2.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     share, rest = at[LINE.REAR_SHARE], 1.0 - at[LINE.REAR_SHARE]
@@ -391,19 +404,22 @@ def after(
     kind: int, at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats,
     other: Floats,
 ) -> float:  # fmt: skip
-    """Return the smallest harm (m2/s2) of the other pair (and the obstacle) after a first contact with one neighbour.
+    """Return the smallest harm (m2/s2) at the other pair (and at an obstacle) after a first contact with one neighbour.
 
     Args:
-        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
-            ``RAMPED_REAR``).
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        closing: largest closing speed of the first contact, m/s.
-        end: end of the decision step of the first contact, s; the command of this step stays in force until then.
-        lack: smallest possible difference between that command and the best command after the contact, m/s2.
-        plan: working memory for the motion of one vehicle, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: second working memory of the same kind.
+        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
+            build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        closing: largest closing speed that the first contact may have, m/s.
+        end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
+        lack: smallest possible difference between the command up to ``end`` and the best command after the contact,
+            m/s2.
+        plan: working memory for the motion of one vehicle, an array from ``empty_plan`` (with brake build-up from
+            ``empty_legs``); overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     if kind >= RAMPED_FRONT:

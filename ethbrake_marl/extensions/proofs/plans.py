@@ -1,8 +1,9 @@
 """Simulate two vehicles with piecewise constant acceleration: their smallest gap and their first contact.
 
-A *plan* is the motion of one vehicle, an array [2, PIECES]. Row ENDS has the end of each piece (s from now; the last
-piece never ends), row ACCELERATIONS the acceleration in it (m/s2). A vehicle that brakes to rest stays at rest. No time
-steps are needed, because the motion in each piece has a closed form.
+A *plan* is the motion of one vehicle, an array [2, PIECES]. A *piece* is a time interval of constant acceleration. Row
+ENDS has the end of each piece (in s from now; the last piece never ends). Row ACCELERATIONS has the acceleration in
+each piece (m/s2). A vehicle that brakes to rest stays at rest. No time steps are needed, because the motion in each
+piece has a closed form.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ PIECES = 4
 
 @compiled
 def empty_plan() -> Floats:
-    """Return an uninitialised plan, [2, PIECES]. The caller fills row 0 with the ends of the pieces (s), row 1 with
-    accelerations (m/s2).
+    """Return an uninitialised plan, [2, PIECES]. A plan consists of intervals of constant acceleration: the caller
+    fills row 0 with their ends (s) and row 1 with their accelerations (m/s2).
     """
     return np.empty((2, PIECES))
 
@@ -32,7 +33,7 @@ def empty_plan() -> Floats:
 def fill_plan(
     plan: Floats, end_0: float, u_0: float, end_1: float, u_1: float, end_2: float, u_2: float, u_3: float
 ) -> None:
-    """Write a plan with four accelerations (m/s2) and their ends (s).
+    """Write a plan with four constant accelerations (m/s2), one after the other.
 
     The acceleration is ``u_0`` until ``end_0``, ``u_1`` until ``end_1``, ``u_2`` until ``end_2``, and ``u_3``
     afterwards. ``plan`` [2, PIECES] is overwritten.
@@ -78,11 +79,11 @@ def fill_drive_then_brake(plan: Floats, v: float, u: float, limit: float, drive:
     """Write a plan: drive for ``drive`` seconds, at most up to the speed limit, then brake to rest.
 
     Args:
-        plan: [2, PIECES] receives the plan.
+        plan: [2, PIECES] array into which the function writes the motion.
         v: speed now, m/s.
         u: driving acceleration, m/s2.
         limit: speed limit, m/s.
-        drive: duration of the drive, s.
+        drive: how long the vehicle drives before it brakes, s.
         braking: deceleration, m/s2, positive.
 
     """
@@ -95,11 +96,11 @@ def fill_brake_then_drive(plan: Floats, v: float, u: float, limit: float, brake:
     """Write a plan: brake for ``brake`` seconds, at most to rest, then drive up to the speed limit and keep that speed.
 
     Args:
-        plan: [2, PIECES] receives the plan.
+        plan: [2, PIECES] array into which the function writes the motion.
         v: speed now, m/s.
         u: driving acceleration, m/s2.
         limit: speed limit, m/s.
-        brake: duration of the braking, s.
+        brake: how long the vehicle brakes before it drives, s.
         braking: deceleration, m/s2, positive.
 
     """
@@ -109,10 +110,12 @@ def fill_brake_then_drive(plan: Floats, v: float, u: float, limit: float, brake:
 
 @compiled
 def piece_at(plan: Floats, now: float, v: float) -> tuple[float, float, bool]:
-    """Return the acceleration at ``now`` (m/s2), the time until which it lasts (s), and whether the vehicle then stops.
+    """Return the acceleration at ``now`` (m/s2), the time until which this acceleration lasts (s), and whether the
+    vehicle stops at that time.
 
     Args:
-        plan: [2, PIECES] ends (s) and accelerations (m/s2) of the pieces of the motion.
+        plan: [2, PIECES] motion of the vehicle: ends (s) and accelerations (m/s2) of its intervals of constant
+            acceleration.
         now: present time, s.
         v: speed at ``now``, m/s.
 
@@ -135,7 +138,7 @@ def walk(
     gap: float, v_front: float, front: Floats, v_rear: float, rear: Floats, until: float
 ) -> tuple[float, float, float]:
     """Return the smallest gap of two vehicles (m), the time (s) of their first contact, and the squared closing speed
-    (m2/s2).
+    (m2/s2) of this contact.
 
     If there is no contact, the time is infinite and the closing speed 0. The motion is computed as if the vehicles
     could pass through each other, so a negative smallest gap is the depth of their overlap. A gap that reaches 0 and
@@ -145,9 +148,10 @@ def walk(
     Args:
         gap: gap now, m.
         v_front: speed of the front vehicle, m/s.
-        front: plan of the front vehicle, [2, PIECES]: ends (s) and accelerations (m/s2) of the pieces.
+        front: motion of the front vehicle, [2, PIECES]: ends (s) and accelerations (m/s2) of its intervals of constant
+            acceleration.
         v_rear: speed of the rear vehicle, m/s.
-        rear: plan of the rear vehicle, [2, PIECES].
+        rear: motion of the rear vehicle, an array like ``front``.
         until: time at which the motion ends, s.
 
     """

@@ -41,14 +41,14 @@ def combined_ramped(
     The first contact may be with the front or the rear vehicle. The result is 0 if nothing is proven.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         until: horizon, s; later harm does not count.
-        front: bound on the harm of the front pair alone, m2/s2.
-        rear: bound on the harm of the rear pair alone, m2/s2.
-        contact_s: time by which some contact is certain, s; infinite: no contact is known to be certain.
-        plan: working memory for the motion of one vehicle, [3, LEGS].
-        other: second working memory of the same kind, [3, LEGS].
-        heap: working memory for the cells of the search, [CELLS, NEAR].
+        front: lower bound on the harm of the front pair (front and controlled vehicle) alone, m2/s2.
+        rear: lower bound on the harm of the rear pair (controlled and rear vehicle) alone, m2/s2.
+        contact_s: time by which some contact is certain, s; infinite if no contact is known to be certain.
+        plan: working memory for the motion of one vehicle, an array from ``empty_legs``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
+        heap: working memory for the search, [CELLS, NEAR]: one row for each cell (range of first contacts).
 
     """
     if min(at[LINE.GAP_L], at[LINE.GAP_R]) <= TOUCHING_M:
@@ -86,10 +86,11 @@ def bound_ramped(states: Floats, has_front: Bools, has_rear: Bools, both: Bools,
 
     Args:
         states: [n, LINE.WIDTH] worlds; ``line.LINE`` names the columns.
-        has_front: [n] True if the front pair exists and its next impact counts.
-        has_rear: [n] True if the rear pair exists and its next impact counts.
-        both: [n] True for worlds whose combined bound is computed; it is 0 in all other worlds.
-        out: [n, BOUNDS] receives the columns FRONT_BOUND, REAR_BOUND and COMBINED_BOUND, m2/s2.
+        has_front: [n] True if the controlled vehicle has a front vehicle and the next impact of this pair counts.
+        has_rear: [n] True if the controlled vehicle has a rear vehicle and the next impact of this pair counts.
+        both: [n] True for worlds whose combined bound is computed; the combined bound is 0 in all other worlds.
+        out: [n, BOUNDS] array into which the function writes the columns FRONT_BOUND, REAR_BOUND and COMBINED_BOUND,
+            m2/s2.
 
     """
     plan, other, heap = empty_legs(), empty_legs(), np.empty((CELLS, NEAR))
@@ -117,7 +118,7 @@ def ramped_states(worlds: Worlds, i: int, until: Floats) -> Floats:
     Args:
         worlds: the worlds, [n], at the moment when vehicle ``i`` may act.
         i: index of the controlled vehicle.
-        until: [n] horizon, s after that moment; later harm does not count.
+        until: [n] horizon, in s from the moment when vehicle ``i`` may act; later harm does not count.
 
     """
     v, at = worlds.vehicles, onset_states(worlds, i, None)

@@ -1,10 +1,10 @@
 """First contacts with brake build-up, the harm that must follow them, and functions that all lower bounds share.
 
 ``sign`` is 1 for first contacts with the leader and -1 for first contacts with the rear vehicle. The functions treat
-contacts with the rear vehicle as the mirror image of contacts with the leader. A *force* is an acceleration (m/s2). The
-controlled vehicle's force times ``sign`` first rises and later falls: it drives and then brakes towards the leader, and
-does the reverse towards the rear vehicle. ``place`` is a position times ``sign`` (m).
-docs/internals/proofs/lower-bound-cases.md has the proofs.
+contacts with the rear vehicle as the mirror image of contacts with the leader. Here *force* means force per mass, which
+is an acceleration (m/s2). ``sign`` times the controlled vehicle's force first rises and later falls. For a contact with
+the leader the controlled vehicle drives and then brakes; for a contact with the rear vehicle it brakes and then drives.
+``place`` is a position times ``sign`` (m). docs/internals/proofs/lower-bound-cases.md has the proofs.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 def fill_leader(at: Floats, plan: Floats) -> None:
     """Write the motion of the front vehicle, if no other vehicle pushes it, to ``plan`` [3, LEGS].
 
-    A plan is a piecewise linear acceleration over time. ``at`` is the state of one world, [LINE.WIDTH].
+    A plan describes a vehicle's acceleration as a piecewise linear function of time. ``at`` is the state of one world,
+    [LINE.WIDTH] numbers in the order of ``line.LINE``.
     """
     fill_build_up(plan, 0.0, at[LINE.FORCE_L], -at[LINE.A_L], at[LINE.FALL_L])
 
@@ -46,22 +47,24 @@ def fill_leader(at: Floats, plan: Floats) -> None:
 def fill_follower(at: Floats, plan: Floats) -> None:
     """Write the motion of the rear vehicle, if no other vehicle pushes it, to ``plan`` [3, LEGS].
 
-    A plan is a piecewise linear acceleration over time. ``at`` is the state of one world, [LINE.WIDTH].
+    A plan describes a vehicle's acceleration as a piecewise linear function of time. ``at`` is the state of one world,
+    [LINE.WIDTH] numbers in the order of ``line.LINE``.
     """
     fill_build_up(plan, at[LINE.ONSET_R], at[LINE.FORCE_R], -at[LINE.A_R], at[LINE.FALL_R])
 
 
 @compiled
 def range_of(sign: float, at: Floats) -> tuple[float, float, float, float]:
-    """Return the limits of ``sign`` times the controlled vehicle's force: largest force, rate up, least force, rate
-    down.
+    """Return the limits of ``sign`` times the controlled vehicle's force: largest value, fastest rise, smallest value
+    and fastest fall.
 
-    A *force* is an acceleration (m/s2); rates are in m/s3. The least force is negative and is returned without its
-    minus sign. If ``sign`` is 1, the largest force is full drive; if ``sign`` is -1, it is full braking.
+    Here *force* means force per mass, which is an acceleration (m/s2); rates are in m/s3. The smallest value is
+    negative and is returned without its minus sign. If ``sign`` is 1, the largest value is full drive; if ``sign`` is
+    -1, it is full braking.
 
     Args:
-        sign: 1 or -1.
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        sign: 1 or -1, the factor of the force.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
 
     """
     if sign > 0.0:
@@ -72,17 +75,17 @@ def range_of(sign: float, at: Floats) -> tuple[float, float, float, float]:
 @compiled
 def fill_controlled(at: Floats, sign: float, switch: float, time: float, final: float, plan: Floats) -> None:
     """Write a plan of the controlled vehicle: ``sign`` times its force rises as fast as possible until ``switch``, then
-    falls.
+    falls as fast as possible.
 
-    A *force* is an acceleration (m/s2). After ``switch`` it falls as fast as possible.
+    Here *force* means force per mass, which is an acceleration (m/s2).
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        sign: 1 for a contact with the front vehicle, -1 with the rear vehicle.
-        switch: time at which the force begins to fall, s.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        sign: 1 for a contact with the front vehicle, -1 for a contact with the rear vehicle.
+        switch: time at which ``sign`` times the force begins to fall, s.
         time: time of the contact, s.
-        final: force times ``sign`` at ``time``, m/s2; -inf: no condition.
-        plan: [3, LEGS] receives the plan.
+        final: required value of ``sign`` times the force at ``time``, m/s2; -inf if no value is required.
+        plan: [3, LEGS] array into which the function writes the motion.
 
     """
     high, rise, low, fall = range_of(sign, at)
@@ -93,21 +96,20 @@ def fill_controlled(at: Floats, sign: float, switch: float, time: float, final: 
 def switch_for(
     at: Floats, sign: float, time: float, place: float, final: float, halvings: int, plan: Floats
 ) -> tuple[float, float, float]:
-    """Return two times (s) just before and after the switch that brings the controlled vehicle to ``place`` at
-    ``time``.
+    """Return a time (s) just before, and a time (s) just after, the switch that brings the controlled vehicle to
+    ``place`` at ``time``.
 
     The *switch* is the time at which ``sign`` times the vehicle's force stops rising and begins to fall; a *force* is
-    an acceleration. Two switches can satisfy the condition; the third result is the speed (m/s) at ``time`` with the
-    earlier one.
+    an acceleration. The third result is the speed (m/s) at ``time`` if the switch is at the earlier of the two times.
 
     Args:
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        sign: 1 for a contact with the front vehicle, -1 with the rear vehicle.
-        time: time of the contact, s after the controlled vehicle may act.
-        place: position times ``sign`` at ``time``, m.
-        final: force times ``sign`` at ``time``, m/s2; -inf: no condition.
-        halvings: number of bisections.
-        plan: working memory for the motion of one vehicle, [3, LEGS].
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        sign: 1 for a contact with the front vehicle, -1 for a contact with the rear vehicle.
+        time: time of the contact, in s from the moment at which the controlled vehicle may act.
+        place: ``sign`` times the position that the vehicle must reach at ``time``, m.
+        final: required value of ``sign`` times the force at ``time``, m/s2; -inf if no value is required.
+        halvings: number of bisection steps in the search for the switch.
+        plan: working memory for the motion of one vehicle, an array from ``empty_legs``; overwritten.
 
     """
     low, high = (-1.0 if range_of(sign, at)[1] == math.inf else 0.0), time
@@ -124,16 +126,16 @@ def switch_for(
 
 @compiled
 def met_at(kind: int, at: Floats, time: float, plan: Floats) -> tuple[float, float, float]:
-    """Return sign, speed (m/s) and place (m) at ``time`` of the neighbour of the first contact, if no other vehicle
-    pushes it.
+    """Return the sign of the first contact, and the speed (m/s) and the place (m) of the neighbour at ``time`` if no
+    other vehicle pushes this neighbour.
 
-    The *sign* is 1 for the front vehicle and -1 for the rear one. The *place* is the position times the sign.
+    The *sign* is 1 for the front vehicle and -1 for the rear vehicle. The *place* is the position times the sign.
 
     Args:
-        kind: neighbour of the first contact, ``RAMPED_FRONT`` or ``RAMPED_REAR``.
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        time: time of the contact, s after the controlled vehicle may act.
-        plan: working memory for the motion of one vehicle, [3, LEGS].
+        kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        time: time of the contact, in s from the moment at which the controlled vehicle may act.
+        plan: working memory for the motion of one vehicle, an array from ``empty_legs``; overwritten.
 
     """
     if kind == RAMPED_FRONT:
@@ -150,9 +152,9 @@ def gentlest_ramped(kind: int, at: Floats, time: float) -> float:
     """Return the smallest closing speed (m/s) of a first contact at ``time``, with brake build-up.
 
     Args:
-        kind: neighbour of the first contact, ``RAMPED_FRONT`` or ``RAMPED_REAR``.
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        time: time of the contact, s after the controlled vehicle may act.
+        kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        time: time of the contact, in s from the moment at which the controlled vehicle may act.
 
     """
     plan = empty_legs()
@@ -171,13 +173,14 @@ def slack_of(
     ``late``.
 
     Args:
-        kind: neighbour of the first contact, ``RAMPED_FRONT`` or ``RAMPED_REAR``.
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
+        kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
         v: speed of the neighbour at ``early``, m/s.
-        hard: largest closing speed of the first contact, m/s.
-        plan: working memory for the motion of one vehicle, [3, LEGS].
+        hard: largest closing speed that the first contact may have, m/s.
+        plan: working memory for the motion of one vehicle, an array from ``empty_legs``; overwritten.
 
     """
     span = late - early
@@ -192,10 +195,11 @@ def gentlest_ramped_between(kind: int, at: Floats, early: float, late: float) ->
     """Return the smallest closing speed (m/s) of first contacts between ``early`` and ``late``, with brake build-up.
 
     Args:
-        kind: neighbour of the first contact, ``RAMPED_FRONT`` or ``RAMPED_REAR``.
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
+        kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
 
     """
     plan = empty_legs()
@@ -212,18 +216,18 @@ def gentlest_ramped_between(kind: int, at: Floats, early: float, late: float) ->
 
 @compiled(apart=True)
 def force_of_meeting(kind: int, at: Floats, early: float, late: float, hard: float) -> float:
-    """Return an upper bound (m/s2) on the controlled vehicle's acceleration at a first contact of closing speed
-    ``hard``.
+    """Return an upper bound (m/s2) on the controlled vehicle's acceleration at a first contact whose closing speed is
+    at most ``hard``.
 
-    The bound covers all smaller closing speeds too. For a contact with the rear vehicle the acceleration has the
-    opposite sign, so the bound is on the braking.
+    For a contact with the rear vehicle, the result is an upper bound on the controlled vehicle's deceleration instead.
 
     Args:
-        kind: neighbour of the first contact, ``RAMPED_FRONT`` or ``RAMPED_REAR``.
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        hard: largest closing speed of the first contact, m/s.
+        kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        hard: largest closing speed that the first contact may have, m/s.
 
     """
     plan = empty_legs()
@@ -247,19 +251,20 @@ def force_of_meeting(kind: int, at: Floats, early: float, late: float, hard: flo
 def after_ramped(
     kind: int, at: Floats, early: float, late: float, hard: float, plan: Floats, other: Floats
 ) -> float:  # fmt: skip
-    """Return the smallest squared closing speed (m2/s2) at the other neighbour after a first contact, with brake
-    build-up.
+    """Return the smallest squared closing speed (m2/s2) of the contact with the other neighbour that follows a first
+    contact, with brake build-up.
 
     The bound uses the motion of the controlled vehicle alone.
 
     Args:
-        kind: neighbour of the first contact, ``RAMPED_FRONT`` or ``RAMPED_REAR``.
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        early: earliest time of the first contact, s after the controlled vehicle may act.
-        late: latest time of the first contact, s.
-        hard: largest closing speed of the first contact, m/s.
-        plan: working memory for the motion of one vehicle, [3, LEGS].
-        other: second working memory of the same kind, [3, LEGS].
+        kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
+            act.
+        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        hard: largest closing speed that the first contact may have, m/s.
+        plan: working memory for the motion of one vehicle, an array from ``empty_legs``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     sign = 1.0 if kind == RAMPED_FRONT else -1.0
@@ -305,11 +310,11 @@ def is_first_ramped(kind: int, at: Floats, time: float, plan: Floats, other: Flo
     """Return whether a first contact at ``time`` or later is possible before the other neighbour arrives.
 
     Args:
-        kind: neighbour of the first contact, ``RAMPED_FRONT`` or ``RAMPED_REAR``.
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        time: time of the contact, s after the controlled vehicle may act.
-        plan: working memory for the motion of one vehicle, [3, LEGS].
-        other: second working memory of the same kind, [3, LEGS].
+        kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        time: time of the contact, in s from the moment at which the controlled vehicle may act.
+        plan: working memory for the motion of one vehicle, an array from ``empty_legs``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     sign, _, place = met_at(kind, at, time, plan)
@@ -332,15 +337,16 @@ def is_first_ramped(kind: int, at: Floats, time: float, plan: Floats, other: Flo
 def meet_ramped(kind: int, at: Floats, sign: float, plan: Floats, other: Floats) -> tuple[float, float, float]:
     """Return time (s) and closing speed (m/s) of the contact with a neighbour under full drive or full braking.
 
-    Brakes build up at finite rates. The time is infinite and the speed 0 if there is no contact. The third result is
-    the smallest closing speed (m/s) over all motions of the pair whose gap is never larger than in this motion.
+    Brakes build up at finite rates. The time is infinite and the closing speed 0 if there is no contact. The third
+    result is the smallest closing speed (m/s) over all motions of the pair whose gap is never larger than in this
+    motion.
 
     Args:
-        kind: neighbour of the first contact, ``RAMPED_FRONT`` or ``RAMPED_REAR``.
-        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
-        sign: 1: the controlled vehicle drives fully; -1: it brakes fully.
-        plan: working memory for the motion of one vehicle, [3, LEGS].
-        other: second working memory of the same kind, [3, LEGS].
+        kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
+        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
+        sign: 1 if the controlled vehicle drives fully, -1 if it brakes fully.
+        plan: working memory for the motion of one vehicle, an array from ``empty_legs``; overwritten.
+        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
     """
     fill_controlled(at, sign, math.inf, math.inf, -math.inf, plan)
@@ -392,14 +398,14 @@ def at_onset_of(
 ) -> tuple[Worlds, Floats, Floats, Bools]:
     """Simulate worlds until the first of ``vehicles`` may act.
 
-    Returns the worlds at that moment, the time of that moment ([n] s), the harm so far ([n] m2/s2), and a mask of
-    pairs, [n, P]. The mask is True for pairs whose next impact counts and whose vehicles move forward.
+    Returns the worlds at that moment, the time of that moment ([n], s), the harm up to that moment ([n], m2/s2), and a
+    boolean mask of pairs, [n, P]. The mask is True for pairs whose next impact counts and whose vehicles move forward.
 
     Args:
-        where: name of the caller, for error messages.
-        worlds: the worlds now, [n].
+        where: name of the calling function, with which error messages begin.
+        worlds: the ``n`` worlds in their present state.
         vehicles: indices of the controlled vehicles.
-        harm_count: ``first`` or ``total`` impacts.
+        harm_count: which impacts count: ``first`` or ``total``.
         horizon_s: horizon, s.
 
     Raises ``InvalidInput`` if the horizon is not finite, or lies before a vehicle may act.
@@ -422,9 +428,9 @@ def check_asked(where: str, harm_count: str, horizon_s: object, time_step_s: obj
     """Raise ``InvalidInput`` for an unknown harm count, a horizon that is not a number, or an invalid time step.
 
     Args:
-        where: name of the caller, which begins the error message.
+        where: name of the calling function, with which the error message begins.
         harm_count: must be ``first`` or ``total``.
-        horizon_s: must be a number.
+        horizon_s: time until which harm counts; must be a number of seconds.
         time_step_s: must be None or a number of at least ``LEAST_TIME_STEP_S``.
 
     """
@@ -447,22 +453,23 @@ def rounding(worlds: Worlds, vehicle: int | Ints, way_m: Floats | float = 0.0) -
 
     A squared closing speed is ``D = w^2 + 2 b g``, with closing speed w, closing acceleration b and gap g. Let ``V`` be
     the largest speed in the line, ``G`` the sum of its gaps (plus ``way_m``), ``A`` the largest closing acceleration
-    and ``a`` the weakest brakes. Then ``w^2`` is at most ``V^2``. No gap grows beyond ``G + V^2 / 2a`` (plus ``V a /
+    and ``a`` the weakest brakes. Then ``w^2`` is at most ``V^2``. No gap grows beyond ``G + V^2 / (2 a)`` (plus ``V a /
     r`` if brakes build up at rate r). So all terms of D stay below ``S = V^2 (1 + A / a) + 2 A G``.
 
-    A segment of motion rounds each speed twice and each gap five times. A round of impacts rounds each speed by up to 8
-    eps of the largest speed. Each segment and each round changes D by at most 8 eps S (eps = 2^-52). These errors add
-    up and do not multiply, because the proofs compare a motion only with the formulas for this same motion.
-    ``BOUND_EPS`` allows for 500 segments and rounds. This is enough: an episode of 8 s has 80 steps, and the
-    computation of the bound rounds a few hundred times.
+    In a segment of motion, the computation rounds each speed twice and each gap five times. In a round of impacts,
+    rounding changes each speed by up to 8 eps of the largest speed. Rounding in one segment, or in one round of
+    impacts, changes D by at most 8 eps S (eps = 2^-52). These errors add up and do not multiply, because the proofs
+    compare a motion only with the formulas for this same motion. ``BOUND_EPS`` allows for 500 segments and rounds of
+    impacts. This is enough: an episode of 8 s has 80 steps, and the computation of the bound itself rounds a few
+    hundred times.
 
-    With several controlled vehicles (a team), V is the largest speed limit if any of them may drive, and A includes the
-    largest driving capacity.
+    If controlled vehicles may drive, V is at least the largest of their speed limits, and A includes the largest of
+    their driving capacities.
 
     Args:
         worlds: the worlds, [n].
         vehicle: index of the controlled vehicle, or several indices.
-        way_m: further distance to add to the gaps, a number or [n], m.
+        way_m: distance to add to the sum of the gaps, m; one number, or [n] with a number for each world.
 
     """
     v, chosen = worlds.vehicles, np.atleast_1d(vehicle)
@@ -479,13 +486,13 @@ def rounding(worlds: Worlds, vehicle: int | Ints, way_m: Floats | float = 0.0) -
 def onset_states(worlds: Worlds, i: int, time_step_s: float | Floats | None) -> Floats:
     """Return the worlds as an array with the columns of ``line.LINE``, [n, LINE.WIDTH].
 
-    Columns of a missing neighbour are 0.
+    If the controlled vehicle has no front or no rear vehicle, the columns of this neighbour are 0.
 
     Args:
         worlds: the worlds, [n], at the moment when vehicle ``i`` may act.
         i: index of the controlled vehicle.
-        time_step_s: time between two decisions, a number or [n], s. None (0 in the array): commands may change at any
-            time.
+        time_step_s: time between two decisions, s; one number, or [n] with a number for each world. None, or 0 in an
+            array, means that commands may change at any time.
 
     """
     v = worlds.vehicles

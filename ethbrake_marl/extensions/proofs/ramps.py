@@ -1,9 +1,10 @@
 """Simulate two vehicles whose accelerations change at finite rates: their first contact and its closing speed.
 
-A *force* is an acceleration (m/s2). A *plan* is the motion of one vehicle, an array [3, LEGS]. Row ENDS has the end of
-each leg (s from now; the last leg never ends), row FORCES the force at its start (m/s2), row JERKS the rate of change
-(m/s3). A vehicle at rest stays there until its force is above 0. A vehicle at its speed limit keeps that speed until
-its force is below 0. No time steps are needed, because the gap is piecewise a cubic polynomial of time.
+Here *force* means force per mass, which is an acceleration (m/s2). A *plan* is the motion of one vehicle, an array [3,
+LEGS]. A *leg* is a time interval of constant jerk. Row ENDS has the end of each leg (in s from now; the last leg never
+ends). Row FORCES has the force at the start of each leg (m/s2). Row JERKS has the rate at which the force changes in
+each leg (m/s3). A vehicle at rest stays there until its force is above 0. A vehicle at its speed limit keeps that speed
+until its force is below 0. No time steps are needed, because the gap is piecewise a cubic polynomial of time.
 docs/internals/proofs/lower-bound-cases.md has the proof, under "Brakes that build up".
 """
 
@@ -27,8 +28,8 @@ _MEETING_HALVINGS = 30
 
 @compiled
 def empty_legs() -> Floats:
-    """Return an uninitialised plan, [3, LEGS], with rows for the end (s), the initial acceleration and the jerk of each
-    leg.
+    """Return an uninitialised plan, [3, LEGS]. Its rows are for the end (s), the initial acceleration (m/s2) and the
+    jerk (m/s3) of each interval of constant jerk.
     """
     return np.empty((3, LEGS))
 
@@ -61,21 +62,21 @@ def fill_switch(
 ) -> None:  # fmt: skip
     """Write a plan: the force rises from ``force`` to at most ``high`` until ``switch``, then falls to ``-low``.
 
-    Before ``time`` the force rises again, and reaches ``final`` at ``time``. A *force* is an acceleration in m/s2; all
-    forces below are multiplied by ``sign``.
+    Before ``time`` the force rises again, and reaches ``final`` at ``time``. A *force* is an acceleration in m/s2; the
+    arguments below are forces that are already multiplied by ``sign``.
 
     Args:
-        plan: [3, LEGS] receives the plan.
-        sign: 1 or -1.
+        plan: [3, LEGS] array into which the function writes the motion.
+        sign: 1 or -1, the factor of all forces.
         force: force now.
         high: largest force.
         rise: rate at which the force rises, m/s3; may be infinite.
-        low: least force, without its minus sign.
+        low: magnitude of the smallest force, which is negative.
         fall: rate at which the force falls, m/s3.
         switch: time at which the force begins to fall, s. If ``rise`` is infinite, ``switch`` may be from -1 to 0: the
-            force then jumps to ``force + (1 + switch) (high - force)`` and falls at once.
+            force in this case jumps to ``force + (1 + switch) (high - force)`` and falls at once.
         time: time at which the force is ``final``, s.
-        final: force at ``time``; -inf: no condition.
+        final: required force at ``time``; -inf if no force is required.
 
     """
     full = (high - force) / rise
@@ -98,13 +99,14 @@ def fill_switch(
 
 @compiled
 def leg_at(plan: Floats, now: float, v: float, limit: float) -> tuple[float, float, float, float]:
-    """Return acceleration (m/s2) and jerk (m/s3) at ``now``, the end of this interval (s), and the speed at its end
-    (m/s).
+    """Return acceleration (m/s2) and jerk (m/s3) at ``now``, the time until which this jerk lasts (s), and the speed at
+    that time (m/s).
 
-    The speed is NaN unless the interval ends at rest or at the speed limit.
+    The speed is NaN unless the vehicle is at rest or at the speed limit at that time.
 
     Args:
-        plan: [3, LEGS] end (s), initial acceleration (m/s2) and jerk (m/s3) of each leg of the motion.
+        plan: [3, LEGS] motion of the vehicle: end (s), initial acceleration (m/s2) and jerk (m/s3) of each interval of
+            constant jerk.
         now: present time, s.
         v: present speed, m/s.
         limit: speed limit, m/s.
@@ -140,7 +142,8 @@ def speed_after(v: float, u: float, jerk: float, step: float, reached: float) ->
     """Return the speed (m/s) after ``step`` seconds of constant ``jerk`` (m/s3), from the initial acceleration ``u``
     (m/s2).
 
-    ``v`` is the speed at the start (m/s). ``reached`` is the speed at the end if it is known, otherwise NaN.
+    ``v`` is the speed at the start (m/s). ``reached`` is the speed after these ``step`` seconds if it is known already,
+    and NaN if not.
     """
     return max(v + (u + 0.5 * jerk * step) * step, 0.0) if math.isnan(reached) else reached
 
@@ -150,7 +153,8 @@ def travel(plan: Floats, v: float, limit: float, until: float) -> tuple[float, f
     """Return speed (m/s) and distance (m) at ``until`` (s) of a vehicle that follows ``plan``.
 
     Args:
-        plan: [3, LEGS] end (s), initial acceleration (m/s2) and jerk (m/s3) of each leg.
+        plan: [3, LEGS] motion of the vehicle: end (s), initial acceleration (m/s2) and jerk (m/s3) of each interval of
+            constant jerk.
         v: speed at the start, m/s.
         limit: speed limit, m/s.
         until: end of the motion, s.
@@ -169,7 +173,9 @@ def travel(plan: Floats, v: float, limit: float, until: float) -> tuple[float, f
 
 @compiled
 def force_of(plan: Floats, now: float) -> float:
-    """Return the force (acceleration, m/s2) of a plan [3, LEGS] at ``now`` (s), whether or not the vehicle moves."""
+    """Return the force (m/s2) of a plan [3, LEGS] at ``now`` (s), even if the vehicle stands still. Here *force* means
+    force per mass, which is an acceleration.
+    """
     return leg_at(plan, now, 1.0, math.inf)[0]
 
 
@@ -204,25 +210,26 @@ def meeting(
     gap: float, slack: float, v_front: float, front: Floats, front_limit: float, v_rear: float, rear: Floats,
     rear_limit: float, since: float, until: float,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """Return the time (s) of two vehicles' first contact, its closing speed w (m/s), and the smallest forced closing
-    speed.
+    """Return the time (s) of two vehicles' first contact, its closing speed (m/s), and the *forced closing speed*
+    (m/s).
 
     The results are inf, 0, 0 if there is no contact. The forced closing speed is the smallest value of ``w + (gap -
-    slack) / t`` until the contact, with t counted from ``since``. It is also a lower bound on the closing speed of
-    other motions of the pair. The gap of such a motion may be smaller by ``slack`` at ``since``. For the bound to hold,
-    the other motion's closing speed minus the closing speed here must never decrease.
+    slack) / t`` until the contact. Here w is the closing speed (m/s) and gap the gap (m) at the time t (s) after
+    ``since``. The forced closing speed is also a lower bound on the closing speed of another motion of the pair if two
+    conditions hold. First, at ``since`` the gap of the other motion is smaller than the gap of this motion by at most
+    ``slack``. Second, the other motion's closing speed minus the closing speed of this motion never decreases.
 
     Args:
         gap: gap at ``since``, m.
-        slack: distance by which the gap of another motion may be smaller, m.
+        slack: largest distance by which the gap of another motion of the pair may be smaller at ``since``, m.
         v_front: speed of the front vehicle at ``since``, m/s.
-        front: plan of the front vehicle, [3, LEGS].
+        front: motion of the front vehicle, [3, LEGS].
         front_limit: speed limit of the front vehicle, m/s.
         v_rear: speed of the rear vehicle at ``since``, m/s.
-        rear: plan of the rear vehicle, [3, LEGS].
+        rear: motion of the rear vehicle, [3, LEGS].
         rear_limit: speed limit of the rear vehicle, m/s.
-        since: start, s.
-        until: end, s.
+        since: time at which the motion starts, s.
+        until: time at which the motion ends, s.
 
     """
     now, least = since, math.inf

@@ -1,7 +1,7 @@
 """``team_bound``: a proven lower bound on the harm of every world, whatever several controlled vehicles do.
 
-If Vehicle 2 is the first controlled vehicle, the first three vehicles are bounded together. If Vehicle 1 is controlled
-and an obstacle is ahead, the obstacle is treated as the first vehicle of the line, which nothing can move.
+If Vehicle 2 is the first controlled vehicle, one bound covers the harm of the first three vehicles together. If Vehicle
+1 is controlled and an obstacle is ahead, the obstacle is treated as an immovable first vehicle of the line.
 docs/internals/proofs/team-bound.md has the proofs.
 """
 
@@ -42,18 +42,20 @@ _UNMOVED_T = 1e30  # mass of an obstacle, t; the other mass is negligible
 def _combined_bound_of_line(
     now: Worlds, onset: Floats, counts: Bools, chosen: Ints, until: Floats, pairs: Floats, time_step_s: float | None
 ) -> Floats:
-    """Return the combined bound of the first two pairs, [n] m2/s2, or 0 if nothing is proven.
+    """Return the combined bound: a lower bound on the harm of the first two pairs together, [n] m2/s2, or 0 if nothing
+    is proven.
 
-    The combined bound is 0 unless the first vehicle brakes already. The second vehicle is treated as if it may act now.
+    The combined bound is 0 in worlds in which the first vehicle does not brake yet. The second vehicle is treated as if
+    it may act now.
 
     Args:
-        now: the worlds now, [n].
+        now: the ``n`` worlds in their present state.
         onset: [n, N] time from now at which each vehicle may act, s.
         counts: [n, P] True for pairs whose next impact counts and whose vehicles move forward.
         chosen: indices of the controlled vehicles; they include the second vehicle.
         until: [n] horizon, s from now.
-        pairs: [n, 2] bounds of both pairs alone, m2/s2.
-        time_step_s: time between two decisions, s; None: commands may change at any time.
+        pairs: [n, 2] lower bounds on the harm of the first two pairs, each pair alone, m2/s2.
+        time_step_s: time between two decisions, s; None if commands may change at any time.
 
     """
     v = now.vehicles
@@ -114,7 +116,7 @@ class TeamBound:
     def impact_proven(self) -> Bools:
         """Worlds in which an impact is certain whatever the controlled vehicles do: boolean mask, [n].
 
-        False means that no impact is proven. It does not mean that an impact can be avoided.
+        False means that no impact is proven; an impact may be unavoidable nevertheless.
         """
         return np.asarray(self.harm > 0.0, np.bool_)
 
@@ -130,30 +132,30 @@ def team_bound(
 ) -> TeamBound:
     """Return a proven lower bound on the harm of every world, whatever several controlled vehicles do together.
 
-    ``harm = early + obstacle + max((pairs[:, 0] + pairs[:, 1]), combined) + pairs[:, 2:].sum(axis=1)``. Each part is
-    lowered by the largest possible rounding error. If Vehicle 1 is controlled, ``combined`` covers the obstacle,
-    Vehicle 1 and Vehicle 2: ``harm = early + max((obstacle + pairs[:, 0]), combined) + pairs[:, 1:].sum(axis=1)``. Harm
-    that may come only after the horizon counts as 0.
+    ``harm = early + obstacle + max((pairs[:, 0] + pairs[:, 1]), combined) + pairs[:, 2:].sum(axis=1)``. Each term of
+    this formula is lowered by the largest possible rounding error. If Vehicle 1 is controlled, ``combined`` covers the
+    obstacle, Vehicle 1 and Vehicle 2: ``harm = early + max((obstacle + pairs[:, 0]), combined) + pairs[:,
+    1:].sum(axis=1)``. Harm that may come only after ``horizon_s`` counts as 0.
 
     All other vehicles brake fully from their latencies on. With a single controlled vehicle, ``lower_bound`` gives
     larger bounds for the lines that it covers.
 
     Args:
-        worlds: the worlds now, [n].
+        worlds: the ``n`` worlds in their present state.
         vehicles: indices of the controlled vehicles, from 0.
-        harm_count: ``first`` or ``total``. With ``first``, only the first impact of each pair counts, even if it came
-            before now.
+        harm_count: which impacts count: ``first`` or ``total``. With ``first``, only the first impact of each pair
+            counts: if a pair has had an impact before now, no later impact of this pair counts.
         horizon_s: time until which harm counts, s after the alert.
-        scripts: script name of each other vehicle, by index. Every script must be full_brake. None: all other vehicles
-            brake fully.
-        time_step_s: time between two decisions, s. With a time step the bound holds only for commands that change at
-            decisions. The first decision comes when the first controlled vehicle may act, and the next ones every
-            ``time_step_s`` after it. The bound is then larger if Vehicle 2 is the first controlled vehicle that may
-            act. None: commands may change at any time.
+        scripts: maps the index of each vehicle that is not controlled to the name of its script. The only script
+            allowed is full_brake. If ``scripts`` is None, all vehicles that are not controlled brake fully.
+        time_step_s: time between two decisions, s. If ``time_step_s`` is a number, the bound holds only for commands
+            that change at decisions. The first decision comes when the first controlled vehicle may act, and the next
+            ones every ``time_step_s`` after it. If Vehicle 2 is the first controlled vehicle that may act, the bound is
+            larger with a number than with None. If ``time_step_s`` is None, commands may change at any time.
 
-    Raises ``InvalidInput`` for vehicles that are empty, unknown or repeated, another script, an unknown harm count, a
-    time step below ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before the first of the vehicles may
-    act.
+    Raises ``InvalidInput`` if ``vehicles`` is empty, or has an unknown or repeated index. The function also raises
+    ``InvalidInput`` for another script, an unknown harm count, a time step below ``LEAST_TIME_STEP_S``, and a horizon
+    that is not finite or lies before the first of the vehicles may act.
 
     """
     check_asked("team_bound", harm_count, horizon_s, time_step_s)
@@ -229,8 +231,9 @@ def _pair_bound(columns: Mapping[int, Floats | float], until: Floats, counts: Bo
     count.
 
     Args:
-        columns: values of each column of a pair (``PAIR_GAP`` to ``FOLLOWER_A``); columns that are left out are 0.
-        until: [n] horizon, s.
+        columns: maps columns of the array of pairs (``PAIR_GAP`` to ``FOLLOWER_A``) to their values; columns that are
+            left out are 0.
+        until: [n] horizon, s; later harm does not count.
         counts: [n] True for worlds in which the next impact of the pair counts.
 
     """
