@@ -132,7 +132,7 @@ class Terms:
         )
 
     def potentials(self, worlds: Worlds, scenario: Game) -> Floats:
-        """Return the potential of each vehicle for shaping, [n, N]; the potential of vehicles that do not learn is 0."""
+        """Return the shaping potential of each vehicle, [n, N]; it is 0 for vehicles that do not learn."""
         potentials = np.zeros(worlds.speeds_mps.shape)
         shared = self.params.potential(worlds, self._learners, scenario.horizon_s)
         potentials[:, self._learner_index] = shared[:, np.newaxis]
