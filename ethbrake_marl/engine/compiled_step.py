@@ -121,7 +121,7 @@ class Step(NamedTuple):
 
 @compiled(apart=True, bare=True)
 def place_row(table: Floats, state: Floats, params: Floats, k: int, pieces: Floats) -> None:
-    """Write the quantities that matter only if brakes take time to build up into the ``table`` of world ``k``.
+    """Fill in those quantities in the ``table`` of world ``k`` that matter only if brakes take time to build up.
 
     The present accelerations come from row ``k`` of ``state``, and the rates of build-up from row ``k`` of ``params``.
     ``pieces`` [N, 2 K] are braking profiles with K intervals of constant command. If this code were inside the loop of
@@ -162,8 +162,8 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
         outcome: array that receives the harm of the step in each world and whether the episode has ended,
             [OUTCOME_ROWS, n].
 
-    Returns ``(-1, FLAG.DONE)`` if all worlds were advanced. If not, returns the row number of a world that was not
-    advanced, and ``BAD_ACTION`` or the status code of the physics.
+    Returns ``(-1, FLAG.DONE)`` if all worlds were advanced. If not all were advanced, returns the row number of a
+    world that was not advanced, and ``BAD_ACTION`` or the status code of the physics.
 
     """
     n, N = wanted.shape

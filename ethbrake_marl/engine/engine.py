@@ -80,7 +80,7 @@ class Ruling(NamedTuple):
 
 
 class Guard(Protocol):
-    """A shield inside an engine: it replaces proposed actions by the actions that are applied.
+    """A shield inside an engine: it may replace the actions that the learners propose.
 
     The engine calls the guard in every ``Engine.step``, so no action can bypass the guard. The engine stores the
     guard's memory and answer together with the state of its episodes, and replaces all three in a single assignment. If
@@ -340,7 +340,7 @@ class Engine:
 
     @property
     def _nobody_refuses_steps(self) -> bool:
-        """Whether a step cannot raise an error; if so, the engine changes its arrays in place, which is faster."""
+        """True if a step cannot raise an error; the engine then changes its arrays in place, which is faster."""
         return not (self.guard or self._now.watched or self._terms.are_foreign or self._own_grid.scripts)
 
     def _columns(self, actions: Actions) -> Floats:
@@ -453,7 +453,7 @@ class Engine:
         return way
 
     def _add_terms(self, step: Step, harm_before: Ledger | None, start: Worlds | None) -> None:
-        """Complete the results of a step by the reward terms that the compiled step cannot compute.
+        """Add to the results of a step the reward terms that the compiled step cannot compute.
 
         Args:
             step: results of the step; changed in place.
@@ -527,7 +527,7 @@ class Engine:
 
     @property
     def _nobody_refuses_episodes(self) -> bool:
-        """Whether the start of an episode cannot raise an error; if so, the engine changes its arrays in place."""
+        """True if the start of an episode cannot raise an error; the engine then changes its arrays in place."""
         return not (self._now.watched or self._remembering or self.guard or self._terms.count_impacts)
 
     def cut(self, step: Step, most_steps: int) -> None:

@@ -1,4 +1,4 @@
-"""Memories of scripts: nested tuples and mappings of arrays with one row per world; and checked calls of scripts."""
+"""Memories of scripts (nested tuples and mappings of arrays), and functions that call scripts and check the results."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ Stop = tuple[Floats, Floats]  # state [n, S] of all worlds at a script's decisio
 
 
 class Way(NamedTuple):
-    """Result of the first part of a step, which ends at the last decision that a script makes within the step."""
+    """Results of the first part of a step. This part ends at the last decision that a script makes within the step."""
 
     reward: Floats  # [n, N] reward of this part
     harm: Floats  # [2, n] harm of the line in this part: first-impact harm, total harm (m2/s2)
@@ -124,7 +124,7 @@ class OwnGrid:
         return way
 
     def _decide(self, state: State, rules: Rules, running: Bools, until_s: Floats, actions: Floats) -> Way:
-        """Make all decisions of the scripts before ``until_s`` [n]; return the result of this part of the step.
+        """Let the scripts decide in each world until the time ``until_s`` [n]; return the result of this part of the step.
 
         Only worlds of ``state`` for which the mask ``running`` [n] is True are advanced, in place. ``_decide`` moves a
         world to a decision only if this decision changes a command: stopping at other decisions, too, would change the

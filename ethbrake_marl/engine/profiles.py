@@ -110,7 +110,7 @@ class ProfileProblem(NamedTuple):
     def even_grid(self, number: int) -> Floats:
         """Return ``number`` evenly spaced commands of each controlled vehicle, [n, number, C] m/s2.
 
-        They range from the vehicle's full braking to its full driving, without exceeding a capacity by rounding.
+        The commands range from full braking to full driving. No command exceeds a capacity by a rounding error.
         """
         low, high = self.bounds[:, np.newaxis, :, 0], self.bounds[:, np.newaxis, :, 1]
         share = np.linspace(0.0, 1.0, number)[:, np.newaxis]
@@ -366,9 +366,9 @@ class Profiles(NamedTuple):
 
     @staticmethod
     def padded(parts: Sequence[Profiles], least: int) -> list[Profiles]:
-        """Return copies of all ``parts`` that have the same number of phases, at least ``least``.
+        """Return copies of all ``parts``, extended by empty phases to the same number of phases (at least ``least``).
 
-        The added phases are empty: they begin and end where the last phase ends.
+        An added phase begins and ends where the last phase ends.
         """
         width = max([least, *(part.ends.shape[1] for part in parts)])
         return [

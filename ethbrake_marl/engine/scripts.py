@@ -17,9 +17,10 @@ class Script(Protocol):
     its attributes:
 
     - ``begin(alert, vehicle, scripts) -> memory`` is called when episodes start in the worlds ``alert``, at t = 0.
-      ``scripts`` maps the index of each scripted vehicle to its script; all other vehicles decide freely.
-    - ``act(worlds, memory, vehicle) -> (command, memory)`` returns the command [n] m/s2, and the new memory. In some of
-      the ``worlds`` no decision may be due at this moment; the results for these worlds are ignored.
+      ``scripts`` maps the index of each scripted vehicle to its script; learners, and the vehicles
+      that the evaluated agent drives, are left out.
+    - ``act(worlds, memory, vehicle) -> (command, memory)`` returns the command [n] m/s2, and the new memory. ``worlds``
+      can include worlds in which no decision is due at this moment; the results for these worlds are ignored.
 
     A memory is None, an array with one row per world, or a tuple or mapping of memories. The caller may select or
     replace rows of a memory, or use it several times. For this reason a script must never change a memory in place. If

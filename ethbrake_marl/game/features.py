@@ -180,7 +180,7 @@ class RegisteredFeature:
             vehicle: index of the observing vehicle (0 = front).
             neighbour: index of the neighbour; None for a feature of the vehicle itself.
             counts: whether to use the function's value in each world, a mask [n] or one truth value for all worlds.
-                Where it is False, the feature has the value ``unknown``.
+                Where ``counts`` is False, the feature has the value ``unknown``.
             steps: number of steps that each episode has taken, [n], for error messages; None: not known.
 
         """
@@ -248,7 +248,7 @@ def harm_weight(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> F
 def place(worlds: Worlds, vehicle: int) -> Floats:
     """Return the number of vehicles ahead of ``vehicle`` (index, 0 = front) in the line, [n].
 
-    If several vehicles share a policy, this feature tells the policy which vehicle it drives.
+    If several vehicles share a policy, this feature shows the policy which vehicle it drives.
     """
     return np.full(worlds.n, float(vehicle))
 
@@ -260,7 +260,7 @@ def _single(
 
 
 def _knows(piece: Piece) -> RegisteredFeature:
-    """Return the feature that is 1 if the observer knows a certain number of a neighbour, such as ``piece="mass"``."""
+    """Return the feature that is 1 if the observer knows one property of a neighbour, such as ``piece="mass"``."""
     meaning = f"1 if the neighbour's {piece.replace('_', ' ')} is known, from a message or from sensors"
     feature = Feature(f"{piece}_known", "1", 1.0, 0.0, 1.0, meaning)
     return RegisteredFeature(feature, _certain, "neighbour", 0.0, (1.0, 1.0, 1.0), (piece,))
@@ -485,7 +485,7 @@ def register_feature(
     The docstring of ``function`` is shown as the meaning of the feature.
 
     An installed package registers a feature with an entry point of the group ``ethbrake_marl.features``. The entry
-    point names a ``Part``, which contains all arguments but ``name``.
+    point names a ``Part``, which contains all arguments of this function except ``name``.
 
     A feature with ``of="own"`` can read data that no message contained. Registering the same feature again changes
     nothing. Raises ``AlreadyExists`` if the name is in use, and ``InvalidInput`` for invalid arguments, or if the

@@ -45,7 +45,8 @@ def state_features(scenario: Game) -> tuple[Feature, ...]:
 def full_state(worlds: Worlds, scenario: Game) -> Observations:
     """Return the full state of every world, [n, S] float32.
 
-    For N vehicles and P = N - 1 pairs, S is 7 N + 2 P + 1, plus 2 if there is an obstacle ahead.
+    For N vehicles and P = N - 1 pairs, there are S = 7 N + 2 P + 1 features, and two more if there is an obstacle
+    ahead.
     """
     latency = worlds.vehicles.latency_s  # includes the delays of the channel
     whole_latency = replace(worlds.vehicles, own_latency_s=latency, known_from_s=Vehicles.known_at_once(latency))

@@ -194,11 +194,12 @@ def split(pair_harm: Floats, mass_t: Floats) -> Floats:
 
 @compiled
 def front_share(harm: float, front_mass: float, rear_mass: float) -> float:
-    """Return the part of a pair's ``harm`` that the front vehicle bears: ``harm rear_mass / (front_mass + rear_mass)``.
+    """Return the part of a pair's ``harm`` that the front vehicle bears.
 
-    If the rear vehicle bears the larger part, its part is computed by the same kind of formula and subtracted from
-    ``harm``. This subtraction is exact, so the parts of the two vehicles add up to ``harm`` without rounding error. The
-    two masses must have the same unit. The result has the unit of ``harm``.
+    This part is ``harm * rear_mass / (front_mass + rear_mass)``. If the rear vehicle bears the larger part, its
+    part is computed by the same kind of formula and subtracted from ``harm``. This subtraction is exact, so the parts
+    of the two vehicles add up to ``harm`` without rounding error. The two masses must have the same unit. The result
+    has the unit of ``harm``.
     """
     if front_mass <= rear_mass:
         return rear_mass / (front_mass + rear_mass) * harm

@@ -39,7 +39,7 @@ MeasureFunction = Callable[[Any], Any]  # maps a ``StepOutcome`` or ``EpisodeImp
 
 @dataclass(frozen=True, slots=True)
 class NamedMeasure:
-    """A measure with its name. Evaluations can show the measure, and rewards can use it as a term."""
+    """A measure, with its name, unit and function. Evaluations can show it, and rewards can use it as a term."""
 
     name: str  # name of the measure, and key of its weight in a reward
     meaning: str  # what it measures, in words
@@ -66,8 +66,8 @@ class NamedMeasure:
 
         Args:
             given: the data from which the measure is computed: a step, or the impacts of an episode.
-            counts: whether to use the value in each world, a mask [n]; the result is 0 where it is False. None: use the
-                value in all worlds.
+            counts: whether to use the value in each world, a mask [n]; the result is 0 where ``counts`` is False. None:
+                use the value in all worlds.
             steps: number of steps that each episode has taken, [n], for error messages.
 
         """
@@ -124,7 +124,7 @@ class NamedMeasure:
         """Return how much the value of this measure has changed during a step, [n] or [n, N]; ``by`` is ``"impacts"``.
 
         ``before``: impacts of the episodes up to the beginning of the step. ``after``: impacts of the same episodes up
-        to its end. ``steps``: number of steps that each episode has taken, [n], for error messages.
+        to the end of the step. ``steps``: number of steps that each episode has taken, [n], for error messages.
         """
         if len(before.rows.world) == len(after.rows.world):
             return np.zeros(after.worlds.speeds_mps.shape[: 2 if self.form.endswith("vehicle") else 1])
@@ -140,7 +140,7 @@ def register_measure(name: str, function: MeasureFunction, *, unit: str = "1", b
 
     Registering the same measure again changes nothing. Raises ``AlreadyExists`` if the name belongs to another measure,
     and ``InvalidInput`` for invalid arguments, or if the function, called for two test worlds, fails or returns a wrong
-    shape or a number that is not finite.
+    shape or number.
 
     Args:
         name: name of the measure, 1 to 64 characters ``a-z``, ``0-9`` and ``_``, beginning with a letter. The name must
@@ -148,9 +148,9 @@ def register_measure(name: str, function: MeasureFunction, *, unit: str = "1", b
             reward, as ``metric_NAME`` in results, and as ``reward_NAME`` in the infos of a step.
         function: function of one argument: an ``EpisodeImpacts`` (``by="impacts"``) or a ``StepOutcome``
             (``by="step"``). The function returns one number per world, [n], or per vehicle, [n, N]; with ``by="step"``
-            it may also return one number per learner, [n, L]. It must work for any number of vehicles. Its docstring
-            describes the measure. If a function with ``by="impacts"`` returns truth values, evaluations show the share
-            of worlds (or vehicles) with the value True.
+            it may also return one number per learner, [n, L]. The function must work for any number of vehicles. The
+            docstring of the function describes the measure. If a function with ``by="impacts"`` returns truth values,
+            evaluations show the share of worlds (or vehicles) with the value True.
         unit: unit of the numbers that the function returns.
         by: ``impacts``: the measure is computed from all impacts of an episode; ``step``: it is computed from each
             step.

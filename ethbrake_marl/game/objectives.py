@@ -222,7 +222,7 @@ def aim_of(objective: Objective, line: Weighed, vehicle: int) -> tuple[Floats, b
 
 
 def standard_objectives() -> tuple[str, ...]:
-    """Return the objectives that every scenario can use: names of built-in and of already loaded registered ones."""
+    """Return the names of the objectives that every scenario can use, including registered ones that are loaded."""
     return (*STANDARD, *(name for name, kind in OBJECTIVES.loaded.items() if kind.function is not None))
 
 
@@ -232,8 +232,8 @@ def register_objective(name: str, function: ObjectiveFunction) -> None:
     An installed package registers an objective with an entry point of the group ``ethbrake_marl.objectives`` that names
     the function.
 
-    Registering the same function again changes nothing. Raises ``AlreadyExists`` if the name belongs to another
-    objective, and ``InvalidInput`` for an invalid name or a function without a docstring.
+    Registering the same function again under the same name changes nothing. Raises ``AlreadyExists`` if the name
+    belongs to another objective, and ``InvalidInput`` for an invalid name or a function without a docstring.
 
     Args:
         name: name of the objective, 1 to 64 characters ``a-z``, ``0-9``, ``-`` and ``_``, beginning with a letter or

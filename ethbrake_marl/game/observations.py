@@ -429,7 +429,7 @@ def _observe_rows(
 def _hide_untold(
     state: Floats, params: Floats, observers: Ints, offsets: Ints, role: bool, with_obstacle: bool, out: Observations
 ) -> None:
-    """Set the features in ``out`` to 0 for which the observer lacks data, because messages do not contain them.
+    """Set the features in ``out`` to 0 for which the observer lacks data that messages do not contain.
 
     If the observer knows no data of a neighbour, all features of this neighbour become 0. An observer knows the
     obstacle only if it knows the place of Vehicle 1.

@@ -140,7 +140,8 @@ class RewardParams(FileModel):
 
     @model_validator(mode="after")
     def _harm_is_meant(self) -> Self:
-        """Raise an error if weights are given without the weight of harm, or if harm has weight 0 and an objective.
+        """Raise an error if weights are given without the weight of harm, or if an objective is given although
+        harm has weight 0.
 
         If the weight of harm is not given, it is 1; without this error, harm would be added to the given terms without
         notice.
@@ -174,7 +175,7 @@ class RewardParams(FileModel):
     def shared(self, harm: Value, safe_end: Value) -> dict[str, Value]:
         """Return the terms whose values all vehicles of a world share, by name: ``harm`` and ``terminal``.
 
-        A term without a weight is left out. The term harm is also left out if there is an objective, because its values
+        A term with weight 0 is left out. The term harm is also left out if there is an objective, because its values
         then differ between vehicles.
 
         Args:
@@ -201,7 +202,7 @@ class RewardParams(FileModel):
         return total
 
     def settled(self, of_scenario: Declared, vehicles: int) -> tuple[RewardParams, tuple[Objective, ...]]:
-        """Return a copy of this reward with a decided ``objective``, and the parsed objective of each vehicle.
+        """Return a copy of this reward with the objective that applies, and the parsed objective of each vehicle.
 
         The objective comes from the reward or, if the reward has none, from the scenario. If all vehicles have the
         objective ``total``, or if harm has weight 0, ``objective`` becomes None and the tuple of parsed objectives is
@@ -266,7 +267,7 @@ Reward = str | RewardParams | Mapping[str, Any]  # a name, or settings
 
 
 def reward_params(reward: Reward) -> RewardParams:
-    """Return the ``RewardParams`` for a name in ``REWARDS`` or for a mapping of settings; keep a ``RewardParams``.
+    """Convert a name in ``REWARDS`` or a mapping of settings to ``RewardParams``; return ``RewardParams`` unchanged.
 
     Raises ``UnknownName`` for an unknown name or setting, and ``InvalidInput`` for an invalid value.
     """
