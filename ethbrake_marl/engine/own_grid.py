@@ -124,7 +124,7 @@ class OwnGrid:
         return way
 
     def _decide(self, state: State, rules: Rules, running: Bools, until_s: Floats, actions: Floats) -> Way:
-        """Let the scripts decide in each world until the time ``until_s`` [n]; return the result of this part of the step.
+        """Let the scripts make all decisions before ``until_s`` [n] s; return the result of this part of the step.
 
         Only worlds of ``state`` for which the mask ``running`` [n] is True are advanced, in place. ``_decide`` moves a
         world to a decision only if this decision changes a command: stopping at other decisions, too, would change the

@@ -1,8 +1,8 @@
 """The harm ledger: a record of the harm of each pair of vehicles, as first-impact harm and as total harm.
 
 The harm of an impact of pair (i, i + 1) with closing speed ``w`` is ``w^2`` (m2/s2). The two vehicles, with masses
-``m_i`` and ``m_{i+1}``, bear this harm in inverse proportion to their masses (the paper's eq. harm): ``H_i = w^2
-m_{i+1} / (m_i + m_{i+1})`` and ``H_{i+1} = w^2 - H_i``.
+``m_i`` and ``m_{i+1}``, bear this harm in inverse proportion to their masses (the paper's eq. harm):
+``H_i = w^2 * m_{i+1} / (m_i + m_{i+1})`` and ``H_{i+1} = w^2 - H_i``.
 
 An impact of Vehicle 1 with an immovable obstacle ahead has the harm ``v_1^2``, where ``v_1`` is the speed of Vehicle 1.
 Vehicle 1 bears all harm of such an impact.
