@@ -1,1 +1,1 @@
-"""The engine: it runs a batch of episodes, with a compiled step and a stream of worlds for new episodes."""
+"""The engine: it runs many episodes of one scenario side by side, and draws the worlds of new episodes."""

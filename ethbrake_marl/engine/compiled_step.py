@@ -82,37 +82,37 @@ class Step(NamedTuple):
 
     @property
     def failed(self) -> Ints:
-        """Status code of the physics for each world that could not be advanced, 0 for all other worlds, [n]."""
+        """Status code of the physics for each world that this step could not advance, 0 for all other worlds, [n]."""
         return np.asarray(self.outcome[FAILED], np.int64)
 
     @property
     def safe_end(self) -> Bools:
-        """Whether this step ended the episode and the whole episode had no impact, [n]."""
+        """Whether this step ended the episode and the episode had no impact from its beginning to its end, [n]."""
         return self._is(SAFE_END)
 
     @property
     def first_impact_harm(self) -> Floats:
-        """First-impact harm that the step added to the whole line, [n] m2/s2."""
+        """First-impact harm of this step, summed over the line, [n] m2/s2."""
         return np.asarray(self.outcome[STEP_FIRST_HARM], np.float64)
 
     @property
     def total_harm(self) -> Floats:
-        """Total harm that the step added to the whole line, [n] m2/s2."""
+        """Total harm of this step, summed over the line, [n] m2/s2."""
         return np.asarray(self.outcome[STEP_TOTAL_HARM], np.float64)
 
     @property
     def shared(self) -> dict[str, Floats]:
-        """Reward terms that all vehicles of a world share, unweighted: dictionary from name to values, [n]."""
+        """Reward terms with the same value for all vehicles of a world, before weighting: {name: values, [n]}."""
         return self.params.shared(self.counted_harm, self.outcome[SAFE_END])
 
     @property
     def terms(self) -> dict[str, Floats]:
-        """All reward terms, unweighted: dictionary from name to values, [n] (the same for all vehicles) or [n, N]."""
+        """All reward terms before weighting: {name: values}; [n] if all vehicles have the same value, else [n, N]."""
         return self.shared | self.further
 
     @property
     def counted_harm(self) -> Floats:
-        """Harm that the step added to the whole line, in the count of harm that the reward uses, [n] m2/s2."""
+        """Harm of this step, summed over the line, [n] m2/s2: first-impact or total harm, whichever the reward uses."""
         return self.first_impact_harm if self.params.harm_count == "first" else self.total_harm
 
     def _is(self, row: int) -> Bools:
@@ -121,11 +121,11 @@ class Step(NamedTuple):
 
 @compiled(apart=True, bare=True)
 def place_row(table: Floats, state: Floats, params: Floats, k: int, pieces: Floats) -> None:
-    """Write into the ``table`` of world ``k`` the quantities that matter only if brakes take time to build up.
+    """Fill in those quantities in the ``table`` of world ``k`` that matter only if brakes take time to build up.
 
-    These are the present accelerations and the rates of build-up, both read from row ``k`` of ``state`` and ``params``,
-    and the braking profiles ``pieces`` [N, 2 K] (sequences of K constant commands). If this code were inside the loop
-    of ``step_worlds``, it would slow down worlds without build-up.
+    The present accelerations come from row ``k`` of ``state``, and the rates of build-up from row ``k`` of ``params``.
+    ``pieces`` [N, 2 K] are braking profiles with K intervals of constant command. If this code were inside the loop of
+    ``step_worlds``, it would slow down worlds without build-up.
     """
     column, N = columns(state), pieces.shape[0]
     command, brake_rate, release_rate = column.command, column.brake_rate, column.release_rate
@@ -140,19 +140,21 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
     state: Floats, params: Floats, clock: Floats, actions: Floats, learners: Ints, settings: Floats, no_rows: Floats,
     builds_up: bool, pieces: Floats, wanted: Floats, reward: Floats, outcome: Floats,
 ) -> tuple[int, int]:  # fmt: skip
-    """Advance every running world by one step.
+    """Advance the world of every running episode by one step.
 
-    If an action is outside [-1, 1], no world moves. A world that cannot be advanced keeps its state; its episode is
-    truncated with the reward 0, and ``outcome`` contains the failure.
+    If an action is outside [-1, 1], no world moves. A world that the physics cannot advance keeps its state; its
+    episode is truncated with the reward 0, and ``outcome`` contains the status code of the failure.
 
     Args:
         state: motion and harm of the worlds, [n, S]; changed in place.
         params: parameters of the vehicles, one row per world, in the layout of ``physics.columns``.
-        clock: times and numbers of steps (see the module), [n, CLOCK_WIDTH]; changed in place.
+        clock: first decision, steps taken, last step and end of each episode (see the module docstring),
+            [n, CLOCK_WIDTH]; changed in place.
         actions: actions of the learners, [n, L].
-        learners: indices of the learners, [L].
-        settings: ``TIME_STEP``, ``HORIZON``, ``HARM_WEIGHT``, ``HARM_IS_TOTAL``, ``TERMINAL_WEIGHT``, [5].
-        no_rows: ``NO_ROWS``, an empty array of impacts, so that no single impact is recorded.
+        learners: indices of the learners (0 = front), [L].
+        settings: five numbers with the indices ``TIME_STEP``, ``HORIZON``, ``HARM_WEIGHT``, ``HARM_IS_TOTAL`` and
+            ``TERMINAL_WEIGHT``.
+        no_rows: ``NO_ROWS``, an empty array: the physics then keeps no list of single impacts.
         builds_up: True if brakes take time to build up in some world, or if a script follows a braking profile.
         pieces: braking profiles with K intervals of constant command, [N, 2 K]; used only if ``builds_up`` is True.
         wanted: commands of all vehicles, [n, N] m/s2; this function overwrites the learners' commands.
@@ -160,8 +162,8 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
         outcome: array that receives the harm of the step in each world and whether the episode has ended,
             [OUTCOME_ROWS, n].
 
-    Returns ``(-1, FLAG.DONE)`` if all worlds were advanced. Otherwise returns the row of a world and its error:
-    ``BAD_ACTION``, or the status of the physics.
+    Returns ``(-1, FLAG.DONE)`` if all worlds were advanced. If not all were advanced, returns the row number of a
+    world that was not advanced, and ``BAD_ACTION`` or the status code of the physics.
 
     """
     n, N = wanted.shape
@@ -265,7 +267,7 @@ NO_ROWS = np.empty((0, LISTED.WIDTH))  # an empty array of impacts, so that no i
 
 
 class Rules(NamedTuple):
-    """Settings that all steps of an engine share, and the compiled step that uses them."""
+    """The settings of an engine's steps, and the compiled step that uses these settings."""
 
     learners: Ints  # [L] indices of the learners
     settings: Floats  # [5] TIME_STEP, HORIZON, HARM_WEIGHT, HARM_IS_TOTAL, TERMINAL_WEIGHT
@@ -275,19 +277,20 @@ class Rules(NamedTuple):
     def step(
         self, worlds: Packed, clock: Floats, actions: Floats, wanted: Floats, reward: Floats, outcome: Floats
     ) -> int:
-        """Advance every running world by one step and return a status.
+        """Advance the world of every running episode by one step, and return a status code.
 
         Args:
-            worlds: rows of n worlds; changed in place.
-            clock: times and numbers of steps (see the module), [n, CLOCK_WIDTH]; changed in place.
+            worlds: n packed worlds, one row per world; changed in place.
+            clock: first decision, steps taken, last step and end of each episode (see the module docstring),
+                [n, CLOCK_WIDTH]; changed in place.
             actions: actions of the learners in [-1, 1], [n, L].
             wanted: commands of all vehicles, [n, N] m/s2; this function overwrites the learners' commands.
             reward: array that receives the reward of each vehicle, [n, N].
             outcome: array that receives the harm of the step in each world and whether the episode has ended,
                 [OUTCOME_ROWS, n].
 
-        The status is ``FLAG.DONE``; ``BAD_ACTION`` if an action is outside [-1, 1], so that no world was moved; or the
-        code of a check of the physics that failed.
+        The status code is ``FLAG.DONE`` if all worlds were advanced. It is ``BAD_ACTION`` if an action is outside
+        [-1, 1]; no world was moved then. Any other code names a check of the physics that failed in some world.
 
         """
         _, status = step_worlds(
@@ -297,7 +300,7 @@ class Rules(NamedTuple):
         return status
 
     def unpack(self, packed: Packed) -> Worlds:
-        """Return packed worlds as ``Worlds`` in new arrays, whose vehicles follow the braking profiles ``pieces``."""
+        """Return packed worlds as ``Worlds`` with new arrays; their vehicles follow the braking profiles ``pieces``."""
         worlds = packed.worlds()
         if self.pieces.shape[1] == 0:
             return worlds

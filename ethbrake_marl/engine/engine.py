@@ -50,21 +50,21 @@ Actions = Mapping[int, NDArray[np.floating]] | NDArray[np.floating]
 class Watcher(Protocol):
     """Observer that follows an engine's episodes without changing them, for example to record them for a picture.
 
-    The engine stores the watcher's memory together with its own state. The engine replaces its state and the watcher's
-    memory in a single assignment, so neither has changed after an error or an interrupt. A watcher must therefore never
-    change its memory in place.
+    The engine stores the watcher's memory together with the state of its episodes, and replaces both in a single
+    assignment. If a step fails or is interrupted, neither has changed. For this reason a watcher must never change its
+    memory in place.
     """
 
     def begun(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
-        """Return the watcher's memory after episodes have started in the rows with the indices ``rows``.
+        """Return the watcher's new memory after episodes have started in the rows (worlds) with the indices ``rows``.
 
-        ``alert``: the worlds of these rows only, at t = 0. ``memory``: the watcher's previous memory.
+        ``alert``: the worlds in which episodes have started, at t = 0. ``memory``: the watcher's previous memory.
         """
 
     def stepped(self, memory: Any, before: Engine, after: Engine) -> Any:
         """Return the watcher's memory after a step; ``memory`` is its memory before the step.
 
-        ``before`` and ``after`` are the engine before and after the step.
+        ``before`` is the engine before the step, and ``after`` the engine after the step.
         """
 
 
@@ -80,27 +80,27 @@ class Ruling(NamedTuple):
 
 
 class Guard(Protocol):
-    """A shield inside an engine: it replaces proposed actions by the actions that are applied.
+    """A shield inside an engine: it may replace the actions that the learners propose.
 
     The engine calls the guard in every ``Engine.step``, so no action can bypass the guard. The engine stores the
-    guard's memory together with its own state. The engine replaces its state, the guard's memory and the guard's answer
-    in a single assignment, so none of them has changed after an error or an interrupt. A guard must therefore never
-    change its memory in place.
+    guard's memory and answer together with the state of its episodes, and replaces all three in a single assignment. If
+    a step fails or is interrupted, none of the three has changed. For this reason a guard must never change its memory
+    in place.
     """
 
     def begin(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
-        """Return the guard's memory after episodes have started in the rows with the indices ``rows``.
+        """Return the guard's new memory after episodes have started in the rows (worlds) with the indices ``rows``.
 
-        ``alert``: the worlds of these rows only, at t = 0. ``memory``: the guard's previous memory; None before the
-        first episode.
+        ``alert``: the worlds in which episodes have started, at t = 0. ``memory``: the guard's previous memory; None
+        before the first episode.
         """
 
     def decide(self, running: Engine, memory: Any, proposed: Floats) -> Ruling:
-        """Return the actions to apply in the next step.
+        """Return the guard's answer (``Ruling``), which contains the actions to apply in the next step.
 
         Args:
             running: the engine before the step.
-            memory: the guard's memory.
+            memory: the guard's memory before the step.
             proposed: actions of the learners, [n, L]; a column of NaN means that this learner proposed no action.
 
         """
@@ -108,14 +108,14 @@ class Guard(Protocol):
     def check(self, ruling: Ruling, after: Engine) -> Any:
         """Return the guard's memory after the step, or raise ``UncertifiedStep`` to undo the step.
 
-        ``ruling``: the guard's answer before the step. ``after``: the engine after the step.
+        ``ruling``: the answer that ``decide`` returned before the step. ``after``: the engine after the step.
         """
 
     def report(self, running: Engine) -> dict[str, NDArray[Any]]:
-        """Return the guard's information about the last step, for ``info``: dictionary name -> values, [n, N].
+        """Return what the guard reports in ``info`` about the last step: dictionary name -> values, [n, N].
 
-        Before the first step of an episode, the information is about what the guard decided at the alert. ``running``
-        is the engine.
+        Before the first step of an episode, the report describes what the guard decided at the alert. ``running`` is
+        the engine that the guard protects.
         """
 
 
@@ -133,13 +133,13 @@ class Now(NamedTuple):
     stops: tuple[Stop, ...] = ()  # decisions of scripts within the last step, see ``own_grid``
 
     def apart(self) -> Now:
-        """Return a copy whose arrays can be changed without changing the arrays of this object."""
+        """Return a copy; a change of the copy's arrays does not change the arrays of this object."""
         return self._replace(state=self.state.copy(), roster=self.roster.apart(), stream=copy.copy(self.stream))
 
     def kept(self, packed: Packed) -> Packed:
-        """Return the worlds ``packed`` with the same columns as the worlds of this engine.
+        """Return the packed worlds ``packed``, with the same columns as the worlds of this engine.
 
-        Columns for an obstacle and for messages are added if the engine's worlds have such columns.
+        Columns for an obstacle and columns for messages are added if the engine's worlds have them.
         """
         return packed.widened(self.obstacle, self.by_link)
 
@@ -147,8 +147,8 @@ class Now(NamedTuple):
 class Engine:
     """A batch of ``n`` running episodes of one scenario.
 
-    A step goes from one decision of the ``deciders`` to the next. The first step begins when the latency of the first
-    decider has elapsed. With a ``guard`` (a shield), the applied actions may differ from the proposed actions. If the
+    A step leads from one decision of the ``deciders`` to their next decision. The first step begins when the shortest
+    latency of a decider has elapsed. A ``guard`` (a shield) may replace the actions that the learners propose. If the
     physics cannot advance a world, the world's episode is truncated and ``roster`` lists the world; the other worlds
     continue.
 
@@ -161,13 +161,13 @@ class Engine:
         observation: observation of all vehicles, or a dictionary vehicle name -> observation; None: the observation of
             the scenario.
         seed: seed of the training stream, from which the worlds come if ``worlds`` is None.
-        deciders: indices of the vehicles whose decisions delimit the steps; None: the learners. In an evaluation the
-            engine has no learners, so the vehicles that the evaluated agent drives are passed here.
+        deciders: indices of the vehicles at whose decisions each step begins and ends; None: the learners. In an
+            evaluation the engine has no learners; there ``deciders`` are the vehicles that the evaluated agent drives.
         worlds: worlds of the first episodes, at t = 0; None: the first worlds of the training stream.
-        guard: function that receives this engine and returns its guard (shield); None: proposed actions are applied
-            unchanged.
-        reward_vector: components of a vector reward in addition to the reward (``game.reward_vector``); None: no vector
-            reward.
+        guard: function that receives this engine and returns its guard (shield); None: the engine applies the
+            learners' actions unchanged.
+        reward_vector: components of the vector reward that each step returns besides the reward
+            (``game.reward_vector``); None: no vector reward.
 
     >>> import ethbrake_marl as eb
     >>> engine = eb.make_engine("paper-random", 4, seed=7)
@@ -225,10 +225,10 @@ class Engine:
         self._now = self._started(stream, None, worlds, {})
 
     def check_time_step(self, drivers: Mapping[int, Script]) -> None:
-        """Raise ``InvalidInput`` if an agent was made for a time between decisions that differs from the scenario's.
+        """Raise ``InvalidInput`` if an agent was made for another time between decisions than the scenario has.
 
-        ``drivers`` maps vehicle indices to agents or scripts. An agent without the attribute ``time_step_s`` fits every
-        scenario.
+        ``drivers`` maps vehicle indices to agents or scripts. An agent without the attribute ``time_step_s`` can be
+        used in every scenario.
         """
         for script in drivers.values():
             step, here = getattr(script, "time_step_s", None), self.scenario.time_step_s
@@ -240,11 +240,11 @@ class Engine:
                 )
 
     def reset(self, *, seed: int | None = None, worlds: Worlds | None = None) -> None:
-        """Start new episodes in all rows. If this fails, the running episodes continue.
+        """Start a new episode in each of the n worlds. If this call fails, the running episodes continue.
 
         Args:
-            seed: restart the training stream from the first world of this seed; None: continue in the stream.
-            worlds: n worlds at t = 0; None: the next worlds of the training stream.
+            seed: seed whose first world becomes the next world of the training stream; None: the stream continues.
+            worlds: worlds of the new episodes, n worlds at t = 0; None: the next worlds of the training stream.
 
         """
         stream = copy.copy(self._now.stream)
@@ -253,9 +253,10 @@ class Engine:
         self._now = self._started(stream, self._now.state.guarded, worlds, self._now.watched)
 
     def _started(self, stream: Stream, guarded: Any, worlds: Worlds | None, watched: dict[Watcher, Any]) -> Now:
-        """Return new episodes in all rows, from ``worlds`` (at t = 0) or, if None, from the next worlds of ``stream``.
+        """Return new episodes that start in ``worlds`` (n worlds at t = 0).
 
-        ``guarded`` and ``watched`` are the previous memories of the guard and the watchers.
+        If ``worlds`` is None, the episodes start in the next worlds of ``stream``. ``guarded`` is the previous memory
+        of the guard, and ``watched`` contains the previous memories of the watchers.
         """
         if worlds is not None:
             check_alert(worlds, self.n, self.scenario.vehicles)
@@ -274,11 +275,11 @@ class Engine:
         return new._now
 
     def _begin(self, rows: Ints, start: Start) -> None:
-        """Start episodes in the rows with the indices ``rows``, in place.
+        """Start new episodes in the rows (worlds) with the indices ``rows``, in place.
 
-        ``start`` contains the worlds of these episodes, at the alert and at the first decision. Scripts, guard and
-        watchers get their first memory. Messages that arrive before the first step are delivered, and scripts that
-        decide before the first step choose their commands.
+        ``start`` contains the worlds of the new episodes, at the alert and at the first decision. Scripts, guard and
+        watchers get their memory for the new episodes. Messages that arrive before the first step are delivered, and
+        scripts that decide before the first step choose their commands.
         """
         if not self._nobody_refuses_episodes:
             alert, memories = start.alert, self.memories
@@ -318,8 +319,8 @@ class Engine:
 
         ``actions`` contains a number in [-1, 1] for each learner: an array [n, L] with columns in the order of
         ``learners``, or a mapping from vehicle index to [n]. If the engine has a guard, the mapping may leave out
-        learners that propose no action. An episode that has ended does not move until ``renew`` or ``reset``. If the
-        guard raises ``UncertifiedStep``, nothing changes.
+        learners that propose no action. An episode that has ended stands still until ``renew`` or ``reset`` starts a
+        new one. If the guard raises ``UncertifiedStep``, the engine stays as it was before the step.
         """
         columns = self._columns(actions)
         if self._nobody_refuses_steps:
@@ -339,13 +340,13 @@ class Engine:
 
     @property
     def _nobody_refuses_steps(self) -> bool:
-        """Whether a step cannot fail. The engine then changes its arrays in place, which is faster."""
+        """True if a step cannot raise an error; the engine then changes its arrays in place, which is faster."""
         return not (self.guard or self._now.watched or self._terms.are_foreign or self._own_grid.scripts)
 
     def _columns(self, actions: Actions) -> Floats:
         """Return the learners' actions, which are an array or a mapping as in ``step``, as an array [n, L].
 
-        The range of the actions is checked later.
+        For a float or integer array of this shape, ``_columns`` does not check whether the actions are in [-1, 1].
         """
         shape = (self.n, len(self.learners))
         if type(actions) is np.ndarray and actions.shape == shape and actions.dtype.kind in "fiu":
@@ -369,17 +370,17 @@ class Engine:
         return columns
 
     def _in_range(self, columns: Floats) -> Floats:
-        """Return the actions ``columns`` [n, L], clipped to [-1, 1] where they exceed it by a float32 rounding error.
+        """Return the learners' actions ``columns`` [n, L]; an action just outside [-1, 1] is clipped to this range.
 
-        Raises ``InvalidInput`` for an action that is outside [-1, 1] by more than a rounding error.
+        Raises ``InvalidInput`` for an action that is outside [-1, 1] by more than a float32 rounding error.
         """
         each = [checked_action(columns[:, c], (self.n,), f"vehicle_{i + 1}") for c, i in enumerate(self.learners)]
         return np.stack(each, axis=1) if each else columns
 
     def _ruled(self, before: Engine, columns: Floats, *, checked: bool) -> Ruling:
-        """Return the guard's answer to the actions ``columns`` [n, L].
+        """Return the guard's answer to the learners' actions ``columns`` [n, L].
 
-        ``before`` is the engine before the step. ``checked`` says that the actions are known to be in [-1, 1].
+        ``before`` is the engine before the step. If ``checked`` is True, the actions are known to be in [-1, 1].
         """
         assert self.guard is not None
         if before.guarded is None:
@@ -404,9 +405,9 @@ class Engine:
         return step
 
     def _ask_scripts(self) -> dict[int, Memory]:
-        """Let the scripts with a memory that decide once per step choose commands; return vehicle index -> new memory.
+        """Write the commands of the scripts that have a memory and decide once per step to ``state.wanted``.
 
-        The commands of these scripts are written to ``state.wanted``.
+        Returns the new memories of these scripts: dictionary from vehicle index to memory.
         """
         asked: dict[int, Memory] = {}
         own_grid = self._own_grid.scripts
@@ -419,9 +420,9 @@ class Engine:
         return asked
 
     def _move(self, columns: Floats) -> tuple[Step, bool]:
-        """Move the worlds by one step under the actions ``columns`` [n, L], and deliver messages.
+        """Move the worlds by one step under the learners' actions ``columns`` [n, L], and deliver messages.
 
-        Returns the results of the step, and whether some world could not be advanced.
+        Returns the results of the step, and True if some world could not be advanced.
         """
         if self._now.stops:
             self._now = self._now._replace(stops=())
@@ -442,9 +443,9 @@ class Engine:
         return Step(reward, outcome, self.reward, {}), some_failed
 
     def _drive_own_grid(self, columns: Floats) -> Way:
-        """Move the worlds to the last decision that a script makes between two decisions of the deciders.
+        """Advance the worlds through the decisions that scripts make within the step, up to the last one.
 
-        Returns this first part of the step. ``columns`` [n, L] are the learners' actions.
+        Returns the results of this first part of the step. ``columns`` [n, L] contains the learners' actions.
         """
         way = self._own_grid.drive_step(self.state, self._now.rules, self._in_range(columns))
         self._change(memories=way.memories)
@@ -452,12 +453,13 @@ class Engine:
         return way
 
     def _add_terms(self, step: Step, harm_before: Ledger | None, start: Worlds | None) -> None:
-        """Add the reward terms that the compiled step does not know to the step's results.
+        """Add to the results of a step the reward terms that the compiled step cannot compute.
 
         Args:
-            step: the step just made; changed in place.
-            harm_before: harm of each pair before the step; None if the reward counts the harm of the whole line.
-            start: the worlds before the step; None if the reward has no measure of single impacts.
+            step: results of the step; changed in place.
+            harm_before: harm of each pair before the step; None if every vehicle's reward counts the harm of the whole
+                line.
+            start: the worlds before the step; None if no term of the reward is computed from single impacts.
 
         """
         impacts = self.state.impacts
@@ -469,7 +471,7 @@ class Engine:
         self._now = self._now._replace(state=state)
 
     def _change(self, **fields: Any) -> None:
-        """Replace the named fields of ``state``."""
+        """Replace the fields of ``self.state`` that ``fields`` names."""
         self._now = self._now._replace(state=self._now.state._replace(**fields))
 
     def observe(self, vehicle: int) -> Observations:
@@ -487,7 +489,7 @@ class Engine:
             vehicles: indices of the vehicles (0 = front); None: all learners.
             rows: indices of the worlds to observe; None: all n worlds.
 
-        Raises ``InvalidInput`` if these vehicles observe different features.
+        Raises ``InvalidInput`` if the vehicles observe different features.
 
         """
         vehicles = self._learner_index if vehicles is None else vehicles
@@ -504,9 +506,10 @@ class Engine:
         return plan.observe(motion, params, vehicles, clock[:, STEP] if rows is None else clock[rows, STEP])
 
     def renew(self, rows: Ints) -> None:
-        """Start the next episodes of the training stream in the rows with the indices ``rows``.
+        """Start new episodes, in the next worlds of the training stream, in the rows with the indices ``rows``.
 
-        The other rows continue. If this fails, nothing changes. Raises ``InvalidInput`` for a repeated or unknown row.
+        The episodes of all other rows continue. If this call fails, the engine stays as it was. Raises ``InvalidInput``
+        if an index occurs twice or is not in 0..n - 1.
         """
         if len(rows) == 0:
             return
@@ -524,27 +527,27 @@ class Engine:
 
     @property
     def _nobody_refuses_episodes(self) -> bool:
-        """Whether the start of an episode cannot fail. The engine then changes its arrays in place, which is faster."""
+        """True if the start of an episode cannot raise an error; the engine then changes its arrays in place."""
         return not (self._now.watched or self._remembering or self.guard or self._terms.count_impacts)
 
     def cut(self, step: Step, most_steps: int) -> None:
         """Truncate the episodes that have taken ``most_steps`` steps or more.
 
-        ``step``, the result of the last step, is changed accordingly.
+        ``step`` is the result of the last step; it is changed in place to show that these episodes were truncated.
         """
         cut = (self.steps >= most_steps) & (step.ended | ~self.ended)
         step.outcome[TRUNCATED, cut] = self._now.state.clock[cut, ENDED] = 1.0
 
     def segments(self, before: Worlds, last_mps2: Floats) -> Iterator[tuple[Worlds, Floats, Floats]]:
-        """Yield the parts of the last step, which are separated by decisions that scripts made within the step.
+        """Yield the segments of the last step: intervals between decisions that scripts made within the step.
 
-        After a reset and before the first step, the parts lead from the alert to the first decision. Each part is a
-        tuple of the worlds at its start, the commands that the vehicles followed in it [n, N] m/s2, and the time of its
-        end [n] s.
+        After a reset and before the first step, the segments lead from the alert to the first decision. Each segment is
+        a tuple: the worlds at the start of the segment, the vehicles' commands in the segment ([n, N] m/s2), and the
+        time at the end of the segment ([n] s).
 
         Args:
             before: the worlds at the start of the step.
-            last_mps2: commands of the last part, [n, N] m/s2.
+            last_mps2: commands of the last segment, [n, N] m/s2.
 
         """
         for motion, wanted in self._now.stops:
@@ -559,9 +562,9 @@ class Engine:
         self._now = self._now._replace(state=self._now.state._replace(guarded=None), ruling=None)
 
     def remember(self, guarded: Any) -> None:
-        """Set the memory of the guard; for callers that move the worlds by ``place`` instead of ``step``.
+        """Set the guard's memory to ``guarded``, which ``Guard.begin`` or ``Guard.check`` has returned.
 
-        ``guarded`` is a memory that ``Guard.begin`` or ``Guard.check`` has returned.
+        A caller that moves the worlds by ``place`` instead of ``step`` must set the memory itself.
         """
         self._now = self._now._replace(state=self._now.state._replace(guarded=guarded))
 
@@ -570,11 +573,11 @@ class Engine:
         return self._now.watched[watcher]
 
     def watch(self, watcher: Watcher, memory: Any) -> None:
-        """Add a watcher of the episodes; ``memory`` is its memory until the next episode begins."""
+        """Add a watcher of the episodes; ``memory`` is the watcher's first memory."""
         self._now = self._now._replace(watched={**self._now.watched, watcher: memory})
 
     def snapshot(self) -> Arrays:
-        """Return a dictionary of copies of all arrays that change while the engine runs; ``restore`` takes it.
+        """Return copies of all arrays that change while the engine runs, as a dictionary for ``restore``.
 
         The snapshot contains the state, the position in the stream of worlds, and the memories of the scripts.
         """
@@ -586,10 +589,10 @@ class Engine:
         return arrays | {f"script.{name}": array for name, array in flat(self.memories).items()}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Continue exactly from ``arrays``, a ``snapshot`` of an engine of the same scenario, size and scripts.
+        """Continue exactly from ``arrays``, a ``snapshot`` of an engine with the same scenario, n and scripts.
 
-        Raises ``InvalidInput``, before anything changes, for a missing array and for an array of another shape. Also
-        raises it if the engine has a guard, because a snapshot does not contain a guard's memory.
+        Raises ``InvalidInput``, before anything changes, if an array is missing or has a wrong shape, and if the engine
+        has a guard, because a snapshot does not contain a guard's memory.
         """
         if self.guard is not None:
             raise InvalidInput(
@@ -613,28 +616,28 @@ class Engine:
         self._now = self._now._replace(state=state, stream=stream, roster=roster, rules=self._rules_for(state))
 
     def _rules_for(self, state: State) -> Rules:
-        """Return the settings of steps that advance the worlds of ``state`` instead of this engine's worlds.
+        """Return the settings of the compiled step (``Rules``) for the worlds of ``state``.
 
-        The settings differ from the settings of this engine if brakes take time to build up in ``state`` but not in the
-        engine's own worlds.
+        The result differs from the settings for this engine's own worlds if brakes take time to build up only in the
+        worlds of ``state``.
         """
         builds_up = self.scenario.builds_up or state.packed.builds_up or self.in_pieces
         return self._now.rules._replace(builds_up=builds_up)
 
     def place(self, worlds: Worlds, ledger: Ledger | None = None, *, ended: Bools | None = None) -> None:
-        """Replace the worlds in all rows, for example by worlds that another simulator has moved.
+        """Replace all n worlds, for example by worlds that another simulator has moved.
 
-        Vehicles, memories and times of decisions do not change. The next step goes to the next decision after the
-        worlds' time.
+        The parameters of the vehicles, the memories and the times of decisions do not change. The next step leads from
+        the time of ``worlds`` to the next decision.
 
         Args:
             worlds: n worlds at any time of their episodes.
             ledger: harm and impacts since the episodes began; None: no harm and no impacts.
-            ended: whether each episode has ended, so that no step moves its world, [n]. None: the episodes whose time
-                is at or after the horizon have ended.
+            ended: whether each episode has ended, [n]; steps do not move the world of an ended episode. None: an
+                episode has ended if its time is at or after the horizon.
 
-        Raises ``InvalidInput`` for another number of worlds or vehicles than the engine's, and if the reward needs
-        every single impact.
+        Raises ``InvalidInput`` if ``worlds`` has another number of worlds or vehicles than the engine, or if a term of
+        the reward is computed from single impacts.
 
         """
         state = self.state
@@ -657,11 +660,14 @@ class Engine:
         self._now = self._now._replace(state=state._replace(motion=motion, clock=clock), ruling=None)
 
     def moment(self) -> State:
-        """Return a copy of the state, from which ``branch`` can continue."""
+        """Return a copy of the present state; ``branch`` can continue from this copy."""
         return self.state.copy()
 
     def first_moments(self, count: int) -> tuple[Worlds, State]:
-        """Return the first ``count`` worlds of the training stream at the alert, and their state at the first step."""
+        """Return the first ``count`` worlds of the training stream twice: at the alert, and as a ``State``.
+
+        The ``State`` contains the worlds at their first decision.
+        """
         stream = copy.copy(self._now.stream)
         stream.restart(self.seed)
         alert, new = stream.take(count).alert, self._unwatched(count, self._now)
@@ -672,8 +678,8 @@ class Engine:
     def branch(self, state: State) -> Engine:
         """Return a new engine whose episodes continue from ``state``, under the same guard.
 
-        This engine does not change. Raises ``InvalidInput`` for a reward with shaping, because potentials of shaping
-        depend on more than the state.
+        This engine does not change. Raises ``InvalidInput`` if the reward is shaped, because the potentials of shaping
+        depend on more than ``state``.
         """
         if self.reward.shaping > 0.0:
             raise InvalidInput(f"branch: the reward has shaping = {self.reward.shaping:g}; branch needs shaping = 0")
@@ -684,20 +690,20 @@ class Engine:
         return self._unwatched(n, self._now._replace(state=state.copy(), roster=roster, ruling=None, rules=rules))
 
     def _unwatched(self, n: int, now: Now) -> Engine:
-        """Return an engine of the same scenario for ``n`` worlds, with the contents ``now`` and without watchers."""
+        """Return a copy of this engine that runs the ``n`` episodes in ``now`` and has no watchers."""
         new = self._at(now._replace(watched={}))
         new.n = n
         return new
 
     def _at(self, now: Now) -> Engine:
-        """Return a copy of this engine with the contents ``now``."""
+        """Return a copy of this engine that runs the episodes in ``now``."""
         new = copy.copy(self)
         new._now = now
         return new
 
     @property
     def state(self) -> State:
-        """State of the running episodes. The state is not a copy, so do not change it."""
+        """State of the running episodes; not a copy, so do not change it."""
         return self._now.state
 
     @property
@@ -707,12 +713,12 @@ class Engine:
 
     @property
     def packed(self) -> Packed:
-        """Running worlds as two arrays (layout: ``physics.columns``), without copying; do not change them."""
+        """Running worlds packed into two arrays (layout: ``physics.columns``); not a copy, so do not change them."""
         return self._now.state.packed
 
     @property
     def wanted_mps2(self) -> Floats:
-        """Acceleration that each vehicle commanded in the last step, [n, N] m/s2, without copying."""
+        """Acceleration that each vehicle commanded in the last step, [n, N] m/s2; not a copy."""
         return self._now.state.wanted
 
     @property
@@ -732,7 +738,7 @@ class Engine:
 
     @property
     def roster(self) -> Roster:
-        """Record of the number of the world in each row, and of the worlds that the physics could not advance."""
+        """Record of which world of the training stream runs in each row, and which worlds could not be advanced."""
         return self._now.roster
 
     @property
@@ -742,25 +748,25 @@ class Engine:
 
     @property
     def observation(self) -> ObservationSpec:
-        """Observation of all learners. Raises ``InvalidInput`` if learners observe different features."""
+        """Observation that all learners share. Raises ``InvalidInput`` if learners observe different features."""
         return common_observation(self.observations, self.scenario)
 
     @property
     def memories(self) -> dict[int, Memory]:
-        """Dictionary from vehicle index to the memory of the vehicle's script, for scripts with a memory."""
+        """Memories of the scripts that have one: dictionary from vehicle index to memory."""
         return self._now.state.memories
 
     @property
     def guarded(self) -> Any:
-        """Memory of the guard; None without a guard, or before its first episode."""
+        """Memory of the guard; None if there is no guard, or before the guard's first episode."""
         return self._now.state.guarded
 
     @property
     def ruling(self) -> Ruling | None:
-        """The guard's answer in the last step; None without a guard or before the first step."""
+        """The guard's answer in the last step; None if there is no guard, or before the first step."""
         return self._now.ruling
 
     @property
     def in_pieces(self) -> bool:
-        """Whether some script follows a braking profile, which is a sequence of intervals of constant command."""
+        """Whether some script follows a braking profile: a sequence of intervals with a constant command each."""
         return bool(self._now.rules.pieces.shape[1] > 0)

@@ -1,4 +1,4 @@
-"""Memories of scripts (nested tuples and mappings of arrays, one row per world), and calls of scripts with checks."""
+"""Memories of scripts (nested tuples and mappings of arrays), and functions that call scripts and check the results."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ _SHAPES = (
 
 
 def map_memory(function: Callable[..., Any], memory: Memory, *others: Memory) -> Memory:
-    """Return a copy of a memory in which every array is replaced by ``function(array, ...)``.
+    """Return a copy of ``memory`` in which every array is replaced by ``function(array, *other_arrays)``.
 
-    ``others`` are memories of the same form; their corresponding arrays are passed as further arguments.
+    ``others`` are memories with the same keys and lengths as ``memory``. For each array of ``memory``,
+    ``other_arrays`` are the arrays at the same place in ``others``.
     """
     if memory is None:
         return None
@@ -45,8 +46,8 @@ def take_memory(memory: Memory, rows: Ints) -> Memory:
 def renew_memory(memory: Memory, rows: Ints, part: Memory) -> Memory:
     """Return a copy of ``memory`` in which the memory of the worlds with the indices ``rows`` is replaced by ``part``.
 
-    Entries that are missing or None in ``part`` keep their old values. Raises ``InvalidInput`` if ``part`` has keys
-    that ``memory`` lacks.
+    Arrays of ``memory`` that are missing or None in ``part`` keep their old values. Raises ``InvalidInput`` if ``part``
+    has keys that ``memory`` lacks.
     """
     if part is None:
         return memory
@@ -65,11 +66,11 @@ def renew_memory(memory: Memory, rows: Ints, part: Memory) -> Memory:
 
 
 def checked_memory(memory: Memory, n: int, what: str = "state") -> Memory:
-    """Return ``memory`` if it is valid; otherwise raise ``InvalidInput``.
+    """Return the memory of a script if it is valid; otherwise raise ``InvalidInput``.
 
     Every array must have ``n`` rows. Arrays of objects are invalid, because a copy of such an array still contains the
-    same objects. Keys of mappings must be identifiers, because a snapshot joins them with dots. ``what`` is the name of
-    the memory for the message.
+    same objects. Keys of mappings must be identifiers, because a snapshot joins the keys with dots. ``what`` is the
+    name of the memory in error messages.
     """
 
     def check(array: Any) -> Any:
@@ -98,9 +99,10 @@ Arrays = dict[str, NDArray[Any]]
 
 
 def flat(memory: Memory) -> Arrays:
-    """Return the arrays of a memory as a dictionary from path to array.
+    """Return the arrays of a nested memory as a dictionary from path to array.
 
-    For ``{"a": x, "b": (y, z)}`` the result is ``{"a": x, "b.0": y, "b.1": z}``. None becomes an empty array.
+    For the memory ``{"a": x, "b": (y, z)}`` the result is ``{"a": x, "b.0": y, "b.1": z}``. A None in the memory
+    becomes an empty array.
     """
     if isinstance(memory, Mapping | tuple):
         parts = memory.items() if isinstance(memory, Mapping) else enumerate(memory)
@@ -127,8 +129,9 @@ def unflat(arrays: Mapping[str, NDArray[Any]], place: str) -> Memory:
 def _check_kept(before: Memory, after: Memory, who: str) -> None:
     """Raise ``InvalidInput`` if a call of ``act`` changed the keys, shapes or dtypes of a memory.
 
-    After such a change, the engine could not restart the episodes of single rows. ``before`` and ``after`` are the
-    memory before and after the call. ``who`` is the beginning of the message.
+    After such a change, the engine could not replace the memory of single worlds when new episodes start there.
+    ``before`` is the memory before the call, and ``after`` the memory after the call. The error message begins with
+    ``who``.
     """
     began, kinds = (map_memory(lambda array: (array.dtype, *array.shape[1:]), each) for each in (before, after))
     if began != kinds:
@@ -139,24 +142,24 @@ def _check_kept(before: Memory, after: Memory, who: str) -> None:
 
 
 def is_state_free(script: Script) -> bool:
-    """Return whether the script's command never changes during an episode (its attribute ``state_free``)."""
+    """Return whether the script says, by its attribute ``state_free``, that its command is constant in an episode."""
     return bool(getattr(script, "state_free", False))
 
 
 def is_ours(script: Script) -> bool:
     """Return whether the script's class belongs to this package.
 
-    All other scripts get read-only worlds and copies of their memory.
+    Scripts from outside this package get read-only worlds and copies of their memory.
     """
     return type(script).__module__.startswith("ethbrake_marl.")
 
 
 def begin_script(script: Script, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-    """Return the memory of a script after episodes have started; None for a script without a memory.
+    """Return the first memory of a script for new episodes; None for a script without a memory.
 
     Args:
         script: the script.
-        alert: worlds of these episodes, at t = 0.
+        alert: worlds of the new episodes, at t = 0.
         vehicle: index of the script's vehicle (0 = front).
         scripts: dictionary from the index of each scripted vehicle to the vehicle's script.
 
@@ -182,11 +185,11 @@ def begin_script(script: Script, alert: Worlds, vehicle: int, scripts: Mapping[i
 
 
 def ask_script(script: Script, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-    """Return a script's command for ``vehicle`` (index, 0 = front), [n] m/s2, and its new memory.
+    """Return a script's command for ``vehicle`` (index, 0 = front), [n] m/s2, and the script's new memory.
 
-    ``memory`` is the script's memory for these worlds; None for a script without memory. Raises ``AgentFailed``, which
-    names script, world and time, if the script does not return one number per world. Raises ``InvalidInput``, which
-    names the script, if a user's script raises an exception or changes its own attributes.
+    ``memory`` is the script's present memory for ``worlds``; None for a script without memory. Raises ``AgentFailed``,
+    which names the script, world and time, if the script does not return one number per world. Raises
+    ``InvalidInput``, which names the script, if a user's script raises an exception or changes its own attributes.
     """
     remembers = hasattr(script, "begin")
     try:
@@ -238,15 +241,15 @@ def _who(script: Script, vehicle: int) -> str:
 def _named(error: Exception, script: Script, what: str, worlds: Worlds, vehicle: int) -> Exception:
     """Return the exception to raise in place of ``error``, which a script raised.
 
-    The result is an ``InvalidInput`` that names the script. An ``error`` that is an exception class of this package, or
-    that a script of this package raised, is returned unchanged.
+    The result is an ``InvalidInput`` that names the script. If the script belongs to this package, or if ``error`` is
+    an ``EthBrakeError``, the result is ``error`` itself.
 
     Args:
-        error: the exception.
+        error: the exception that the script raised.
         script: the script.
-        what: name of the method that raised the error.
-        worlds: the worlds that were passed to the method.
-        vehicle: index of the script's vehicle.
+        what: name of the script's method that raised the error.
+        worlds: the worlds that were passed to this method.
+        vehicle: index of the script's vehicle (0 = front).
 
     """
     if isinstance(error, EthBrakeError) or is_ours(script):
@@ -262,11 +265,11 @@ def within_capacity(
     """Return a script's command if it is within the vehicle's capacities; otherwise raise ``AgentFailed``.
 
     Args:
-        command_mps2: commanded accelerations, [n] m/s2.
+        command_mps2: accelerations that the script commands, [n] m/s2.
         worlds: n worlds.
         vehicle: index of the vehicle (0 = front).
-        script: the script, for the message.
-        due: whether to check the command in each world, [n]; None: check it in all worlds.
+        script: the script, whose name the error message contains.
+        due: whether to check the command in each world, [n]; None: check the command in all worlds.
 
     """
     low, high = -worlds.vehicles.braking_capacity_mps2[:, vehicle], worlds.vehicles.driving_capacity_mps2[:, vehicle]

@@ -1,7 +1,7 @@
-"""Scripts that decide at their own regular times, which lie within the engine's steps.
+"""Scripts that decide at times between the beginning and the end of an engine's steps.
 
-The decisions of a script begin when the latency of its vehicle has elapsed. The engine's steps begin with the first
-decision of the *deciders*, which are the learners or the evaluated agents.
+A script first decides when the latency of its vehicle has elapsed. The engine's first step begins with the first
+decision of the *deciders*: the learners or, in an evaluation, the vehicles that the evaluated agent drives.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Stop = tuple[Floats, Floats]  # state [n, S] of all worlds at a script's decisio
 
 
 class Way(NamedTuple):
-    """Result of the first part of a step, which ends at the last decision that a script makes within the step."""
+    """Results of the first part of a step. This part ends at the last decision that a script makes within the step."""
 
     reward: Floats  # [n, N] reward of this part
     harm: Floats  # [2, n] harm of the line in this part: first-impact harm, total harm (m2/s2)
@@ -48,13 +48,13 @@ class Way(NamedTuple):
     stops: tuple[Stop, ...]  # the worlds at each of the decisions, in order
 
     def add_to(self, motion: Floats, column: Columns, reward: Floats, outcome: Floats) -> None:
-        """Add this first part of a step to the results of the rest of the step, in place.
+        """Add the results of this first part of a step to the results of the rest of the step, in place.
 
         Args:
             motion: state of the worlds after the step, [n, S].
-            column: columns of ``motion``.
-            reward: reward of the rest of the step, [n, N].
-            outcome: outcome of the rest of the step, [OUTCOME_ROWS, n].
+            column: numbers of the columns of ``motion`` (``physics.columns``).
+            reward: reward of each vehicle in the rest of the step, [n, N].
+            outcome: results of the compiled step for the rest of the step, [OUTCOME_ROWS, n].
 
         """
         reward += self.reward
@@ -65,16 +65,16 @@ class Way(NamedTuple):
 
 
 class OwnGrid:
-    """Scripts with a memory whose decisions fall between the decisions of an engine's deciders.
+    """Scripts with a memory that decide within an engine's steps.
 
-    Each script first decides when the latency of its vehicle has elapsed, and then after every time step. An engine's
-    step goes from one decision of its deciders (the learners or the evaluated agents) to the next, so a script with
-    another latency decides within the step.
+    Each script first decides when the latency of its vehicle has elapsed, and then once in every time step. An engine's
+    step leads from one decision of its deciders (the learners or the evaluated agent's vehicles) to their next
+    decision, so a script of a vehicle with another latency decides within the step.
 
     Args:
-        scripts: dictionary from vehicle index to script.
+        scripts: dictionary from vehicle index (0 = front) to the vehicle's script.
         time_step_s: time between two decisions of a script, s.
-        horizon_s: time at which an episode is truncated, s.
+        horizon_s: time after the alert at which an episode is truncated, s.
 
     """
 
@@ -83,10 +83,10 @@ class OwnGrid:
         self._time_step_s, self._horizon_s = time_step_s, horizon_s
 
     def drive_step(self, state: State, rules: Rules, actions: Floats) -> Way:
-        """Let the scripts decide within the step that begins; return the result of this first part of the step.
+        """Let the scripts make their decisions within the next step; return the result of this first part of the step.
 
-        ``state`` is changed in place: each world is moved to its last decision that changed a command. ``rules``:
-        settings of the step. ``actions``: actions of the learners, [n, L].
+        Each world of ``state`` is moved, in place, to the last decision that changed a command. ``rules`` contains the
+        settings of the step, and ``actions`` the learners' actions, [n, L].
         """
         column = state.packed.column
         in_force = state.motion[:, column.command : column.previous].copy()
@@ -98,16 +98,16 @@ class OwnGrid:
         return way._replace(in_force=in_force)
 
     def drive_to_start(self, state: State, rules: Rules, rows: Ints, start_s: Floats) -> Way:
-        """Let the scripts decide between the alert and the first step of new episodes; return their result (``Way``).
+        """Let the scripts make their decisions between the alert and the first step; return the result (``Way``).
 
         Learners and deciders coast until the first step, and the scripts observe this.
 
         Args:
-            state: all running episodes, with the new episodes at the alert. The new episodes are moved to their first
-                step, in place.
-            rules: settings of the steps.
-            rows: rows of the new episodes.
-            start_s: times at which the first steps of the new episodes begin, [len(rows)] s.
+            state: all running episodes; the new episodes are at the alert. ``drive_to_start`` moves the new episodes to
+                their first step, in place.
+            rules: settings of the engine's steps.
+            rows: row numbers of the new episodes in ``state``.
+            start_s: time at which the first step of each new episode begins, [len(rows)] s.
 
         Raises ``PhysicsError``, which lists the worlds that could not be advanced.
 
@@ -124,11 +124,12 @@ class OwnGrid:
         return way
 
     def _decide(self, state: State, rules: Rules, running: Bools, until_s: Floats, actions: Floats) -> Way:
-        """Make all decisions of the scripts before ``until_s`` [n]; return the result of this part of the step.
+        """Let the scripts make all decisions before ``until_s`` [n] s; return the result of this part of the step.
 
-        Only the worlds of ``state`` that the mask ``running`` [n] marks are advanced, in place. A world is moved to a
-        decision only if this decision changes a command, because the rounding of the motion depends on where it is
-        interrupted. ``rules``: settings of the step. ``actions``: actions of the learners, [n, L].
+        Only worlds of ``state`` for which the mask ``running`` [n] is True are advanced, in place. ``_decide`` moves a
+        world to a decision only if this decision changes a command: stopping at other decisions, too, would change the
+        rounding of the motion. ``rules`` contains the settings of the step, and ``actions`` the learners' actions,
+        [n, L].
         """
         motion, params, _, wanted_so_far, *_ = state
         (n, N), column = wanted_so_far.shape, state.packed.column
@@ -175,10 +176,11 @@ class OwnGrid:
         """Return copies of the worlds, advanced to ``until_s``, with their reward [n, N] and outcome [OUTCOME_ROWS, n].
 
         Args:
-            state: the worlds; only the learners' commands in its array ``wanted`` are changed.
+            state: the worlds before the motion. In ``state.wanted`` the learners' commands are overwritten; nothing
+                else in ``state`` changes.
             rules: settings of the step.
-            until_s: times, [n] s; a world whose time is not before ``until_s`` does not move.
-            decision_s: time of the deciders' next decision, [n] s; periodic messages depend on it.
+            until_s: time to which each world is advanced, [n] s; a world that has reached this time does not move.
+            decision_s: time of the deciders' next decision, [n] s; the delivery of periodic messages depends on it.
             actions: actions of the learners, [n, L]; L may be 0.
 
         """

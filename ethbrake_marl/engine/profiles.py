@@ -1,7 +1,7 @@
-"""Search problem of searches and shields: which command profiles of whole episodes cause the least harm?
+"""The problem that searches and shields solve: which commands over a whole episode cause the least harm?
 
-A *profile* contains the commands of the controlled vehicles from the first decision to the horizon, in at most K
-phases. A *phase* is an interval of constant command that ends at a decision.
+A *profile* contains the commands of the controlled vehicles from the first decision to the horizon. It consists of at
+most K *phases*: intervals with constant commands that end at a decision.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MOST_PHASES = 12
 
 
 class SearchWorld(NamedTuple):
-    """One world of a ``ProfileProblem``, prepared for simulating candidate profiles."""
+    """One world of a ``ProfileProblem``, prepared so that a search can simulate many profiles in it."""
 
     episode: Episode  # working memory in which the world is simulated (``physics.episode``)
     bounds: Floats  # [C, 2] smallest and largest command of each controlled vehicle (m/s2)
@@ -37,8 +37,8 @@ class SearchWorld(NamedTuple):
 def copy_rows(rows: Floats, to_rows: Floats, n: int) -> None:
     """Copy the first ``n`` rows of ``rows`` to the first ``n`` rows of ``to_rows``, element by element.
 
-    Both arrays have at least ``n`` rows and the same columns. An assignment of slices would take ten times longer to
-    compile, because numba also compiles its error message.
+    Both arrays have at least ``n`` rows and the same number of columns. ``to_rows[:n] = rows[:n]`` would take ten times
+    longer to compile, because numba would also compile the error message of this assignment.
     """
     for k in range(n):
         for c in range(rows.shape[1]):
@@ -51,7 +51,7 @@ TIME_STEP_S = 0.1  # default time between two decisions
 class ProfileProblem(NamedTuple):
     """The problem of choosing command profiles of the controlled vehicles in n worlds; made by ``profile_problem``.
 
-    If a line has an obstacle, the obstacle is vehicle 0 in all arrays, and the indices of the vehicles start from 1.
+    If there is an obstacle ahead, the obstacle has index 0 in all arrays, and Vehicle 1 has index 1.
     """
 
     vehicles: Ints  # [C] indices of the controlled vehicles
@@ -74,12 +74,12 @@ class ProfileProblem(NamedTuple):
         return len(self.start)
 
     def take(self, rows: Ints) -> ProfileProblem:
-        """Return the search problem of only the worlds with the indices ``rows``."""
+        """Return the same problem for only the worlds with the indices ``rows``."""
         arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in self._fields[1:]}
         return self._replace(**arrays)
 
     def put(self, rows: Ints, new: ProfileProblem) -> ProfileProblem:
-        """Return a copy in which the worlds of ``new``, in order, replace the worlds with the indices ``rows``."""
+        """Return a copy of this problem in which the worlds of ``new`` replace the worlds with the indices ``rows``."""
         arrays: dict[str, Any] = {name: getattr(self, name).copy() for name in self._fields[1:]}
         for name, array in arrays.items():
             array[rows] = getattr(new, name)
@@ -87,15 +87,15 @@ class ProfileProblem(NamedTuple):
 
     @property
     def last_step(self) -> Ints:
-        """Number of decisions before the horizon, [n]."""
+        """Number of decisions before the horizon in each world, [n]."""
         return self.clock[:, CLOCK.LAST_STEP].astype(np.int64)
 
     def constant(self, commands_mps2: Floats) -> Profiles:
-        """Return profiles of constant commands.
+        """Return profiles in which each controlled vehicle keeps one command from the first decision to the horizon.
 
-        ``commands_mps2`` [n, Q, C] are Q constant commands for each world and controlled vehicle. The result has n * Q
-        profiles: first the Q profiles of world 0, then the Q profiles of world 1, and so on. Each profile has
-        ``MOST_PHASES`` phases with the same command, so that a search can change them later.
+        ``commands_mps2`` [n, Q, C] contains, for each of n worlds, Q commands of each of the C controlled vehicles. The
+        result has n * Q profiles: first the Q profiles of world 0, then the Q profiles of world 1, and so on. Each
+        profile has ``MOST_PHASES`` phases with the same command; a search can later change single phases.
         """
         n, Q, C = commands_mps2.shape
         borders = np.array([2, 5, 9, 14, 20] + (MOST_PHASES - 5) * [np.iinfo(np.int64).max])
@@ -108,10 +108,9 @@ class ProfileProblem(NamedTuple):
         )
 
     def even_grid(self, number: int) -> Floats:
-        """Return ``number`` evenly spaced commands of each vehicle, [n, number, C] m/s2.
+        """Return ``number`` evenly spaced commands of each controlled vehicle, [n, number, C] m/s2.
 
-        The commands include the vehicle's smallest and largest command. No command exceeds the largest command by a
-        rounding error.
+        The commands range from full braking to full driving. No command exceeds a capacity by a rounding error.
         """
         low, high = self.bounds[:, np.newaxis, :, 0], self.bounds[:, np.newaxis, :, 1]
         share = np.linspace(0.0, 1.0, number)[:, np.newaxis]
@@ -120,11 +119,12 @@ class ProfileProblem(NamedTuple):
     def minimising(self, weights: Floats, *, largest: bool = False) -> ProfileProblem:
         """Return a copy of this problem in which a search minimises the weighted harm of the vehicles.
 
-        The count of harm (first-impact or total) stays the same. ``identity`` stays the same, too.
+        The harm count (first-impact or total harm) and the field ``identity`` stay the same.
 
         Args:
-            weights: weight of the harm that each vehicle bears, at least 0, [n, N], without a column for an obstacle.
-            largest: whether to minimise the largest weighted harm of a vehicle instead of the sum.
+            weights: weight of the harm that each vehicle bears, at least 0, [n, N]; an obstacle has no weight.
+            largest: True: minimise the largest weighted harm of a vehicle; False: minimise the sum of all weighted
+                harms.
 
         """
         mass, obstacle = self.mass, self.mass.shape[1] - weights.shape[1]
@@ -138,18 +138,18 @@ class ProfileProblem(NamedTuple):
     def follow(self, profiles: Profiles) -> tuple[Floats, Floats]:
         """Return the first-impact harm and the total harm of one profile per world, [n] m2/s2 each.
 
-        Both harms equal the harms in the engine to the last bit. Raises ``InvalidInput`` for profiles that do not fit
-        the problem or exceed a capacity, and ``PhysicsError``, which lists the worlds in which a check of the physics
-        failed.
+        An engine whose vehicles follow the same commands computes exactly the same harm, to the last bit. Raises
+        ``InvalidInput`` for profiles that do not fit the problem or exceed a capacity, and ``PhysicsError``, which
+        lists the worlds in which a check of the physics failed.
         """
         first, total = self.follow_pairs(profiles)
         return line_sum(first, np.zeros(self.n)), line_sum(total, np.zeros(self.n))
 
     def values(self, profiles: Profiles) -> dict[HarmCount, Floats]:
-        """Return the value that a search minimises, for one profile per world: {count of harm: value, [n] m2/s2}.
+        """Return the value that a search minimises, for one profile per world: {harm count: value, [n] m2/s2}.
 
-        The value is the harm of the line or, after ``minimising``, the sum or the largest of the vehicles' weighted
-        harms. Raises the same errors as ``follow``.
+        The value is the harm of the line. For a result of ``minimising``, the value is instead the sum of the vehicles'
+        weighted harms, or the largest of them. Raises the same errors as ``follow``.
         """
         if (self.clock[:, CLOCK.AIM] == WHOLE).all():
             return dict(zip(HARM_COUNTS, self.follow(profiles), strict=True))
@@ -163,9 +163,9 @@ class ProfileProblem(NamedTuple):
         return harms
 
     def borne(self, profiles: Profiles) -> dict[HarmCount, Floats]:
-        """Return the harm that each vehicle bears under one profile per world: {count of harm: [n, N] m2/s2}.
+        """Return the harm that each vehicle bears under one profile per world: {harm count: [n, N] m2/s2}.
 
-        There is no column for an obstacle. The harm equals the harm in the engine to the last bit. Raises the same
+        The arrays have no column for an obstacle. An engine computes the same harm, to the last bit. Raises the same
         errors as ``follow``.
         """
         obstacle, harms = int(np.isinf(self.mass[:, 0]).any()), {}
@@ -178,7 +178,7 @@ class ProfileProblem(NamedTuple):
     def follow_pairs(self, profiles: Profiles) -> tuple[Floats, Floats]:
         """Return the first-impact harm and the total harm of each pair under one profile per world, [n, P] m2/s2 each.
 
-        If there is an obstacle ahead, the obstacle and Vehicle 1 are the first pair. Raises the same errors as
+        If there is an obstacle ahead, the first pair consists of the obstacle and Vehicle 1. Raises the same errors as
         ``follow``.
         """
         self.check(profiles)
@@ -193,8 +193,8 @@ class ProfileProblem(NamedTuple):
     def check(self, profiles: Profiles) -> None:
         """Raise ``InvalidInput`` for profiles that do not fit this problem.
 
-        There must be one profile per world. Commands must be within the capacities. No phase may end before the
-        previous phase, and the last phase must end at the last step.
+        There must be one profile per world, and its commands must be within the vehicles' capacities. No phase may end
+        before the previous phase ends, and the last phase must end at the last step.
         """
         n, C = self.n, len(self.vehicles)
         K = profiles.ends.shape[-1]
@@ -230,24 +230,24 @@ def profile_problem(
     deciders: Sequence[int] | None = None,
     written_out: bool = False,
 ) -> ProfileProblem:
-    """Return the problem of choosing whole command profiles of some vehicles with the least harm.
+    """Return the problem of choosing commands of some vehicles over a whole episode that cause the least harm.
 
     Args:
         worlds: n worlds.
         vehicles: indices of the controlled vehicles (0 = front).
-        harm_count: count of harm to minimise: ``first`` (first-impact harm) or ``total`` (total harm).
-        horizon_s: end of the episodes, s.
+        harm_count: harm to minimise: ``first`` (first-impact harm) or ``total`` (total harm).
+        horizon_s: time after the alert at which the episodes end, s.
         time_step_s: time between two decisions, s.
         others_mps2: constant commands of the other vehicles, [n, N] m/s2 (columns of ``vehicles`` are ignored); None:
             full braking.
-        deciders: indices of the vehicles whose smallest latency is the time of the first decision. If this time has
+        deciders: indices of vehicles; the first decision is at the shortest latency of these vehicles. If this time has
             passed in a world, the first decision is at the world's present time. None: ``vehicles``.
-        written_out: whether every world gets an obstacle as the vehicle in front (``Worlds.with_obstacle``) even if no
-            world has an obstacle. An added obstacle is out of reach. If some world has an obstacle, every world gets
-            one.
+        written_out: whether the arrays contain an obstacle, as an additional vehicle in front, even if no world has an
+            obstacle (``Worlds.with_obstacle``). If some world has an obstacle, the arrays always contain one. Worlds
+            without an obstacle then get one that no vehicle can reach.
 
-    Raises ``InvalidInput`` if ``vehicles`` is empty, and for a repeated or unknown vehicle, an unknown harm count, a
-    command beyond capacity, or a horizon before the first decision.
+    Raises ``InvalidInput`` if ``vehicles`` is empty, repeats an index or contains an unknown index, if the harm count
+    is unknown, if a command exceeds a capacity, or if the horizon is not after the first decision.
 
     """
     chosen = _checked_vehicles(vehicles, worlds.N)
@@ -303,11 +303,11 @@ def profile_problem(
 
 
 def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -> UInt64s:
-    """Return a hash of each world's search problem, [n]: 8 bytes of BLAKE2b over everything that the harm depends on.
+    """Return a hash of each world's problem, [n]: 8 bytes of BLAKE2b over all data that a profile's harm depends on.
 
-    The harm depends on the world's state and parameters, the other vehicles' ``command`` [n, N], the times of decisions
-    and the horizon in ``clock`` [n, CLOCK.WIDTH], and the indices ``vehicles`` of the controlled vehicles. The hash
-    does not depend on the harm count.
+    These data are the world's state and parameters, the other vehicles' ``command`` [n, N], the times of decisions and
+    the horizon in ``clock`` [n, CLOCK.WIDTH], and the indices ``vehicles`` of the controlled vehicles. The hash is the
+    same for first-impact harm and total harm.
     """
     packed = Packed.of(worlds)
     (state, params), column = packed, packed.column
@@ -346,31 +346,32 @@ def _checked_vehicles(vehicles: Sequence[int], N: int) -> Ints:
 
 
 class Profiles(NamedTuple):
-    """One profile per world: ``commands_mps2[k, j]`` is in force from decision ``ends[k, j - 1]`` to ``ends[k, j]``.
+    """One profile per world: phase j of world k lasts from decision ``ends[k, j - 1]`` to decision ``ends[k, j]``.
 
-    Phases that are not needed are empty: they begin and end at the last step.
+    During this phase the commands ``commands_mps2[k, j]`` apply. Phases that a profile does not need are empty: they
+    begin and end at the last step.
     """
 
     ends: Ints  # [n, K] number of the decision at which each phase ends
     commands_mps2: Floats  # [n, K, C] commands in each phase
 
     def at(self, step: Ints) -> Floats:
-        """Return the commands in force after decision number ``step`` [n] of each world, [n, C] m/s2.
+        """Return the commands that apply right after decision number ``step`` [n] of each world, [n, C] m/s2.
 
-        Decisions are numbered from 0. The last command continues after the last phase.
+        Decisions are numbered from 0. The command of the last phase also applies after the end of this phase.
         """
         phase = np.minimum((self.ends <= step[:, np.newaxis]).sum(axis=1), self.ends.shape[1] - 1)
         return np.asarray(self.commands_mps2[np.arange(len(phase)), phase], np.float64)
 
     def take(self, rows: Ints | slice) -> Profiles:
-        """Return the profiles of the worlds with the indices ``rows``."""
+        """Return the profiles of only the worlds with the indices ``rows``."""
         return Profiles(self.ends[rows], self.commands_mps2[rows])
 
     @staticmethod
     def padded(parts: Sequence[Profiles], least: int) -> list[Profiles]:
-        """Return copies of all ``parts`` with the same number of phases, which is at least ``least``.
+        """Return copies of all ``parts``, extended by empty phases to the same number of phases (at least ``least``).
 
-        The added phases are empty: they end at the end of the last phase.
+        An added phase begins and ends where the last phase ends.
         """
         width = max([least, *(part.ends.shape[1] for part in parts)])
         return [
@@ -384,9 +385,9 @@ class Profiles(NamedTuple):
 
 @compiled
 def make_search_world(problem: ProfileProblem, k: int, random: UInt64s) -> SearchWorld:
-    """Return world number ``k`` of a problem, with its own working memory.
+    """Return world number ``k`` of a problem, with working memory of its own for simulations.
 
-    ``random`` [n] contains the states of the random generators of all worlds; the result refers to entry ``k``.
+    ``random`` [n] contains the state of each world's random generator; the result shares number ``k`` of this array.
     """
     N = problem.mass.shape[1]
     table = np.zeros((rows_for(problem.pieces.shape[2]), N))
@@ -402,10 +403,10 @@ def make_search_world(problem: ProfileProblem, k: int, random: UInt64s) -> Searc
 def follow_worlds(
     problem: ProfileProblem, ends: Ints, commands: Floats, first: Floats, total: Floats, failed: Bools
 ) -> None:
-    """Simulate one profile in each world; write the harm of each pair to ``first`` and ``total`` [n, P] m2/s2.
+    """Simulate one profile in each world, and write the harm of each pair into two arrays [n, P] m2/s2.
 
-    ``ends`` [n, K] and ``commands`` [n, K, C] are the fields of ``Profiles``. ``failed`` [n] is set to True for a world
-    in which a check of the physics failed.
+    ``first`` receives the first-impact harm, ``total`` the total harm. ``ends`` [n, K] and ``commands`` [n, K, C] are
+    the fields of ``Profiles``. If a check of the physics fails in world k, ``failed[k]`` is set to True.
     """
     start, no_random = problem.start, np.zeros(problem.start.shape[0], np.uint64)
     for k in range(start.shape[0]):

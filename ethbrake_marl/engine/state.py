@@ -16,7 +16,7 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints
 
 
 class State(NamedTuple):
-    """Running episodes at one moment, a row for each of n worlds."""
+    """The running episodes of an engine at one moment, with one row for each of n worlds."""
 
     motion: Floats  # [n, S] time, speeds, gaps and harm so far, in the columns of ``physics.columns``
     params: Floats  # [n, K] parameters of the vehicles, and the periodic messages that have reached them
@@ -29,7 +29,7 @@ class State(NamedTuple):
 
     @property
     def packed(self) -> Packed:
-        """The worlds packed into two arrays (``physics.columns``), without copying."""
+        """The worlds packed into two arrays (layout: ``physics.columns``); not a copy."""
         return Packed(self.motion, self.params)
 
     @property
@@ -57,12 +57,12 @@ class State(NamedTuple):
         return Ledger(*packed.ledger(), *(each.copy() for each in of_worlds))
 
     def copy(self) -> State:
-        """Return a copy with its own arrays; memories are shared, because they are never changed in place."""
+        """Return a copy with arrays of its own; it shares the scripts' memories, which are never changed in place."""
         motion, params, clock, wanted, potential = (array.copy() for array in self[:5])
         return State(motion, params, clock, wanted, potential, self.memories, self.guarded, self.impacts)
 
     def take(self, rows: Ints) -> State:
-        """Return the state of the rows with the indices ``rows``, which may be repeated."""
+        """Return the state of only the worlds with the indices ``rows``; an index may occur several times."""
         guarded = None if self.guarded is None else self.guarded.take(rows)
         motion, params, clock, wanted, potential, memories = take_memory(self[:6], rows)
         impacts = None if self.impacts is None else self.impacts.take(rows)
@@ -70,10 +70,10 @@ class State(NamedTuple):
 
     @staticmethod
     def join(states: list[State]) -> State:
-        """Return one state with the rows of several states, one after the other.
+        """Return one state with the worlds of all ``states``, one state after the other.
 
-        All states must come from one engine. Raises ``InvalidInput`` if the engine has a guard (shield), because
-        memories of guards cannot be joined.
+        All ``states`` must come from the same engine. Raises ``InvalidInput`` if this engine has a guard (shield),
+        because memories of guards cannot be joined.
         """
         if states[0].guarded is not None:
             raise InvalidInput("states: cannot be joined if the engine has a shield; use an engine without a shield")

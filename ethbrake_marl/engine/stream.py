@@ -34,29 +34,29 @@ class Start(NamedTuple):
 
     @property
     def alert(self) -> Worlds:
-        """These n worlds at the alert, t = 0."""
+        """The worlds of the new episodes at the alert, t = 0, n of them."""
         return self.origin.take(np.arange(self.first, self.first + len(self.clock)))
 
     def part(self, first: int, count: int) -> Start:
-        """Return ``count`` of these worlds, starting from row ``first``."""
+        """Return ``count`` consecutive worlds, beginning with world number ``first`` of this object."""
         rows = slice(first, first + count)
         packed = Packed(self.packed.state[rows], self.packed.params[rows])
         return Start(self.origin, self.first + first, packed, self.clock[rows], self.wanted[rows])
 
 
 class FailedWorld(UserWarning):
-    """Warning that a world could not be advanced, so that its episode was truncated. The other worlds continue."""
+    """Warning that the physics could not advance a world; this world's episode is truncated or left out."""
 
 
 class Roster:
-    """Record of which world runs in each row of a batch, and of the rows whose worlds could not be advanced.
+    """Record of which world runs in each row of an engine's arrays, and which worlds could not be advanced.
 
     Args:
-        n: number of rows.
+        n: number of rows, one per world.
         seed: seed of the stream of worlds.
-        first: number, in the stream, of the world in row 0; row k has world ``first + k``. None: the worlds have no
-            numbers, because the caller passed them.
-        given: the worlds at the alert, if the caller passed them; None: the worlds come from the stream.
+        first: number of the world in row 0, counted from the beginning of the stream; row k has world ``first + k``.
+            None: the worlds do not come from the stream.
+        given: the worlds at the alert, if they do not come from the stream; None: they come from the stream.
 
     """
 
@@ -68,7 +68,7 @@ class Roster:
         self.numbers = np.full(n, -1, np.int64) if first is None else first + np.arange(n)  # [n]; -1: passed
 
     def apart(self) -> Roster:
-        """Return an independent copy."""
+        """Return a copy of this record; a change of the copy does not change this record."""
         new = copy.copy(self)
         new.failed, new.numbers = dict(self.failed), self.numbers.copy()
         return new
@@ -76,19 +76,19 @@ class Roster:
     def renew(self, rows: Ints, first: int) -> None:
         """Record that new worlds run in the rows with the indices ``rows``.
 
-        The new worlds are the worlds ``first``, ``first + 1``, ... of the stream.
+        The new worlds have the numbers ``first``, ``first + 1``, ... in the stream.
         """
         self.numbers[rows] = first + np.arange(len(rows))
         for row in self.failed.keys() & rows.tolist() if self.failed else ():
             del self.failed[row]
 
     def mark(self, status: Ints, from_s: Floats, until_s: Floats) -> None:
-        """Record the worlds that a step could not advance, and give a ``FailedWorld`` warning.
+        """Record the worlds that a step could not advance, and give a ``FailedWorld`` warning for each of them.
 
         Args:
-            status: status of the physics, [n]; 0 for a world without failure.
-            from_s: times at which the step began, [n] s.
-            until_s: times at which the step should have ended, [n] s.
+            status: status code of the physics for each world that could not be advanced, 0 for all other worlds, [n].
+            from_s: time at which the step began in each world, [n] s.
+            until_s: time at which the step should have ended in each world, [n] s.
 
         """
         new = FLAG.failure(np.where(status == 0, FLAG.DONE, status), from_s, until_s).worlds
@@ -102,14 +102,14 @@ class Roster:
 class Stream:
     """The training worlds of a seed, one after the other, each advanced to its first decision.
 
-    Until the first decision, learners and scripts with a memory coast. If scripts decide before the first step, the
-    engine therefore advances the worlds from the alert again.
+    In this stream, learners and scripts with a memory coast until the first decision. If a script decides before the
+    first decision of the ``deciders``, the engine advances the worlds once more from the alert.
 
     Args:
         scenario: the scenario from which worlds are drawn.
-        deciders: indices of the vehicles (0 = front); the first decision is at the smallest latency of these vehicles.
+        deciders: indices of vehicles (0 = front). The first decision is at the shortest latency of these vehicles.
         scripts: dictionary from the index of each scripted vehicle to the vehicle's script.
-        seed: seed of the stream.
+        seed: seed from which the worlds of the stream are drawn.
 
     """
 
@@ -123,18 +123,18 @@ class Stream:
         self.restart(seed)
 
     def restart(self, seed: int, position: int = 0) -> None:
-        """Make world number ``position`` of the stream of ``seed`` the next world."""
+        """Continue with world number ``position`` (from 0) of the stream that belongs to ``seed``."""
         self.seed, self._drawn = seed, position
         self._pool: Start | None = None
         self._next = 0
 
     @property
     def position(self) -> int:
-        """Number of the next world in the stream."""
+        """Number of the world that ``take`` returns next, counted from 0 at the beginning of the stream."""
         return self._drawn - (0 if self._pool is None else len(self._pool.clock) - self._next)
 
     def take(self, count: int) -> Start:
-        """Return the next ``count`` worlds at their first decision, and advance the position in the stream."""
+        """Return the next ``count`` worlds of the stream at their first decision, and move on in the stream."""
         if self._pool is None or self._next + count > len(self._pool.clock):
             self._fill(count)
         assert self._pool is not None
@@ -143,10 +143,10 @@ class Stream:
         return taken
 
     def _fill(self, count: int) -> None:
-        """Draw and prepare worlds, so that at least ``count`` worlds can be taken; append them to worlds not taken yet.
+        """Draw further worlds and advance them to their first decision, so that ``take`` can return ``count`` worlds.
 
-        If a world cannot be advanced to its first decision, the next world that can be advanced replaces it, and a
-        ``FailedWorld`` warning is given. The positions of the other worlds in the stream therefore do not change.
+        If a world cannot be advanced to its first decision, the next world that can be advanced takes its place, so
+        all other worlds keep their numbers in the stream. ``_fill`` gives a ``FailedWorld`` warning for such a world.
         """
         first, size = self.position, max(4 * count, SAMPLED_AT_ONCE)
         alert = self._scenario.sample(size, self.seed, first=self._drawn, channel="training").worlds
@@ -187,7 +187,7 @@ class Stream:
 
 
 def check_alert(worlds: Worlds, n: int, vehicles: int) -> None:
-    """Raise ``InvalidInput`` unless there are ``n`` lines of ``vehicles`` vehicles, at t = 0 and without any impact."""
+    """Raise ``InvalidInput`` unless ``worlds`` are ``n`` worlds of ``vehicles`` vehicles at t = 0, without impacts."""
     if (worlds.n, worlds.N) != (n, vehicles):
         raise InvalidInput(
             f"reset: got {count_of(worlds.n, 'world')} of {worlds.N} vehicles; {count_of(n, 'world')} of {vehicles}"
@@ -201,12 +201,12 @@ def check_alert(worlds: Worlds, n: int, vehicles: int) -> None:
 
 
 def moved(alert: Worlds, wanted: Floats, start_s: Floats) -> Packed:
-    """Return worlds advanced from the alert to their first decision, with the harm of this time, as packed arrays.
+    """Return worlds advanced from the alert to their first decision, as packed arrays that include the harm so far.
 
     Args:
         alert: n worlds at t = 0.
-        wanted: constant commands, [n, N] m/s2.
-        start_s: times of the first decisions, [n] s.
+        wanted: constant commands of the vehicles until the first decision, [n, N] m/s2.
+        start_s: time of the first decision in each world, [n] s.
 
     """
     after, impacts = advance(alert, wanted, until_s=start_s)
@@ -214,7 +214,7 @@ def moved(alert: Worlds, wanted: Floats, start_s: Floats) -> Packed:
 
 
 def packed_with(worlds: Worlds, harm: Impacts | Ledger) -> Packed:
-    """Return ``worlds`` as two arrays (layout: ``physics.columns``), with the harm since the alert set to ``harm``."""
+    """Return ``worlds`` packed into two arrays (layout: ``physics.columns``), with ``harm`` as the harm so far."""
     packed = Packed.of(worlds)
     column, pairs = packed.column, worlds.N - 1
     for group, values in enumerate((harm.first_impact_harm, harm.total_harm, harm.count)):

@@ -1,4 +1,4 @@
-"""``Terms``: reward terms that the compiled step does not know, such as measures, shaping and objectives."""
+"""``Terms``: reward terms that the compiled step cannot compute, such as measures, shaping and objectives."""
 
 from __future__ import annotations
 
@@ -20,16 +20,18 @@ from ethbrake_marl.physics.state import Floats, Worlds
 
 
 class Terms:
-    """Reward of a batch of episodes: adds to every step the reward terms that the compiled step does not know.
+    """The reward terms that the compiled step cannot compute; ``add`` adds them to the reward of a step.
 
-    An *objective* says whose harm a vehicle's reward includes; without an objective, this is the harm of the whole
-    line. *Shaping* adds to the reward the change of a function of the state, the *potential*.
+    An *objective* says whose harm a vehicle's reward includes. If neither the reward nor the scenario has an objective,
+    each vehicle's reward includes the harm of the whole line. *Shaping* adds to the reward the change of a function of
+    the state, the *potential*.
 
     Args:
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
         scenario: scenario whose objective is used if the reward has none.
         learners: indices of the vehicles (0 = front) that learn or, in an evaluation, that the evaluated agent drives.
-        vector: components of a vector reward (``game.reward_vector``); None: rewards are numbers.
+        vector: components of the vector reward that ``vector`` returns (``game.reward_vector``); None: there is no
+            vector reward.
 
     """
 
@@ -53,13 +55,13 @@ class Terms:
 
     @property
     def shared_harm(self) -> float:
-        """Weight of the whole line's harm in the compiled step's reward; 0 if each vehicle has its own objective."""
+        """Weight of the whole line's harm in the reward that the compiled step computes; 0 if there are objectives."""
         return 0.0 if self._objectives else self.params.harm
 
     def vector(self, step: Step, before: Ledger, state: State) -> Floats:
         """Return the vector reward of a step, [n, N, K]; 0 for episodes that had ended before the step.
 
-        ``before``: harm before the step. ``state``: state after the step.
+        ``step``: results of the step. ``before``: harm before the step. ``state``: state after the step.
         """
         vector = vector_of(self.components, state.ledger.since(before), self.params.harm_count, step.terms)
         vector[state.ended & ~step.ended] = 0.0
@@ -74,17 +76,18 @@ class Terms:
         impacts_before: EpisodeImpacts | None,
         worlds: Worlds | None,
     ) -> State:
-        """Add the reward terms of this class to the reward of a step, in place; return the state with new potentials.
+        """Add the reward terms of this class to the reward of a step; return the state with its new potentials.
 
         Episodes that had ended before the step get the reward 0.
 
         Args:
-            step: results of the compiled step; ``further`` and ``reward`` are changed.
+            step: results of the compiled step; its fields ``further`` and ``reward`` are changed in place.
             state: state after the step.
-            scenario: the scenario.
-            before: harm before the step; None if there are no objectives.
-            impacts_before: impacts of the episodes before the step; None if no measure needs them.
-            worlds: worlds after the step if the reward is shaped, otherwise None.
+            scenario: the scenario of the episodes.
+            before: harm of each pair before the step; None if there are no objectives.
+            impacts_before: impacts of the episodes before the step; None if no reward term is computed from single
+                impacts.
+            worlds: worlds after the step, from which new potentials are computed; None if the reward is not shaped.
 
         """
         if before is not None and self.params.harm > 0.0:
@@ -109,7 +112,7 @@ class Terms:
         return state
 
     def _outcome(self, step: Step, state: State, time_step_s: float) -> StepOutcome:
-        """Return the quantities of a step from which measures are computed; ``state`` is the state after the step."""
+        """Return the ``StepOutcome`` of a step, from which measures are computed; ``state`` is the state afterwards."""
         motion, params, column = state.motion, state.params, state.packed.column
         return StepOutcome(
             step.first_impact_harm,
@@ -129,7 +132,7 @@ class Terms:
         )
 
     def potentials(self, worlds: Worlds, scenario: Game) -> Floats:
-        """Return the shaping potentials, [n, N]: the potential of every learner, and 0 for other vehicles."""
+        """Return the shaping potential of each vehicle, [n, N]; it is 0 for vehicles that do not learn."""
         potentials = np.zeros(worlds.speeds_mps.shape)
         shared = self.params.potential(worlds, self._learners, scenario.horizon_s)
         potentials[:, self._learner_index] = shared[:, np.newaxis]

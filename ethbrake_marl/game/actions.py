@@ -23,12 +23,12 @@ def checked_action(action: ArrayLike, shape: tuple[int, ...], names: str, count:
     """Return the action as float64 of shape ``shape``; raise ``InvalidInput`` for a wrong shape or invalid values.
 
     Axes of length 1 may be missing or added: a single action may be a number, [1] or [1, 1]. Values outside [-1, 1] are
-    invalid, but a rounding error of one float32 step is accepted and clipped.
+    invalid; only the next float32 number above 1 or below -1 is accepted, and clipped.
 
     Args:
-        action: the actions of the vehicles; with ``count``, indices of discrete actions (``index_to_action``).
+        action: the actions of the vehicles; if ``count`` is given, indices of discrete actions (``index_to_action``).
         shape: required shape.
-        names: names of the vehicles, for error messages.
+        names: names of the vehicles that act, for error messages.
         count: number of discrete actions; None: the actions are continuous.
 
     """
@@ -44,14 +44,14 @@ def checked_action(action: ArrayLike, shape: tuple[int, ...], names: str, count:
 
 
 def own_actions(actions: ArrayLike, names: str, count: int | None = None) -> NDArray[Any]:
-    """Return a copy of the actions as an array; later changes of ``actions`` by the caller do not affect it.
+    """Return a copy of the actions as an array, which stays the same if the caller changes ``actions`` later.
 
-    A NumPy array is copied without checks. Raises ``InvalidInput`` for a list or tensor with values that are not
-    numbers, and, with ``count``, for invalid indices.
+    A NumPy array is copied without checks. Raises ``InvalidInput`` if a list or tensor contains values that are not
+    numbers or, if ``count`` is given, invalid indices.
 
     Args:
-        actions: the actions of the vehicles; with ``count``, indices of discrete actions.
-        names: names of the vehicles, for error messages.
+        actions: the actions of the vehicles; if ``count`` is given, indices of discrete actions.
+        names: names of the vehicles that act, for error messages.
         count: number of discrete actions; None: the actions are continuous.
 
     """
@@ -76,8 +76,8 @@ def action_to_command(action: Floats, vehicles: Vehicles, vehicle: int) -> Float
 
     Args:
         action: action of the vehicle in each world, [n] in [-1, 1].
-        vehicles: parameters of the vehicles in n worlds, which include the capacities.
-        vehicle: index of the vehicle, from 0.
+        vehicles: parameters of the vehicles in n worlds, among them the capacities.
+        vehicle: index of the vehicle (0 = front).
 
     """
     braking, driving = vehicles.braking_capacity_mps2[:, vehicle], vehicles.driving_capacity_mps2[:, vehicle]
@@ -85,12 +85,14 @@ def action_to_command(action: Floats, vehicles: Vehicles, vehicle: int) -> Float
 
 
 def command_to_action(command_mps2: Floats, vehicles: Vehicles, vehicle: int) -> Floats:
-    """Return the action of a vehicle for its command in every world, [n]; clipped to [-1, 1], 0 if the capacity is 0.
+    """Return the action that corresponds to a vehicle's command in each world, [n], clipped to [-1, 1].
+
+    The action is 0 if the capacity for this command is 0.
 
     Args:
         command_mps2: commanded acceleration of the vehicle in each world, [n] m/s2.
-        vehicles: parameters of the vehicles in n worlds, which include the capacities.
-        vehicle: index of the vehicle, from 0.
+        vehicles: parameters of the vehicles in n worlds, among them the capacities.
+        vehicle: index of the vehicle (0 = front).
 
     """
     braking, driving = vehicles.braking_capacity_mps2[:, vehicle], vehicles.driving_capacity_mps2[:, vehicle]
@@ -101,16 +103,16 @@ def command_to_action(command_mps2: Floats, vehicles: Vehicles, vehicle: int) ->
 def command_of(action: float, braking: float, driving: float) -> float:
     """Return the commanded acceleration (m/s2) for an action in [-1, 1].
 
-    ``braking`` and ``driving`` are the largest deceleration and acceleration of the vehicle (m/s2).
+    ``braking`` is the largest deceleration of the vehicle, and ``driving`` its largest forward acceleration (m/s2).
     """
     return action * braking if action < 0.0 else action * driving
 
 
 @compiled
 def action_of(command: float, braking: float, driving: float) -> float:
-    """Return the action for a command (m/s2); it is clipped to [-1, 1], and 0 if the capacity is 0.
+    """Return the action for a command (m/s2), clipped to [-1, 1]; 0 if the capacity for this command is 0.
 
-    ``braking`` and ``driving`` are the largest deceleration and acceleration of the vehicle (m/s2).
+    ``braking`` is the largest deceleration of the vehicle, and ``driving`` its largest forward acceleration (m/s2).
     """
     capacity = braking if command < 0.0 else driving
     return min(max(command / capacity, -1.0), 1.0) if capacity > 0.0 else 0.0
@@ -120,7 +122,8 @@ def action_of(command: float, braking: float, driving: float) -> float:
 def commands_of(action: Floats, braking: Floats, driving: Floats) -> Floats:
     """Return the commanded acceleration of a vehicle for its action in every world, [n] m/s2.
 
-    ``action``: action in [-1, 1], [n]. ``braking``, ``driving``: capacities of the vehicle, [n] m/s2.
+    ``action``: the vehicle's action in each world, from -1 to 1, [n]. ``braking``: the vehicle's largest deceleration,
+    [n] m/s2. ``driving``: the vehicle's largest forward acceleration, [n] m/s2.
     """
     command = np.empty(action.shape[0])
     for k in range(action.shape[0]):

@@ -1,9 +1,9 @@
 """Contact features: a vehicle forecasts its next impacts for its own full braking, coasting and full driving.
 
-A forecast covers only the vehicles that the observer knows. The observer's own command starts after its latency. The
-other vehicles continue with their observed commands, with two exceptions. A vehicle without a command in force is
-assumed to brake fully after its latency. A vehicle that brakes with brakes that build up is also assumed to brake
-fully, because its present deceleration does not show its command.
+A forecast covers only the vehicles that the observer knows. The observer's own command takes effect after its latency.
+In the forecast, the other vehicles keep their present accelerations, with two exceptions. A vehicle without a command
+in force is assumed to brake fully after its latency. A braking vehicle whose brakes build up gradually is also assumed
+to brake fully, because its present deceleration does not show its command.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _FAR = len(CONTACT_SIDES) + _HARMS  # number of contact_far features per command
 
 
 class Contacts(NamedTuple):
-    """Arguments of the kernel that computes contact features: time step, commands and scaling."""
+    """Arguments of ``observe_contacts``, which computes contact features: time step, commands and scaling."""
 
     time_step_s: float  # time between two decisions (s)
     commands: Ints  # commands to forecast, as indices into CONTACT_COMMANDS
@@ -51,15 +51,16 @@ def observe_contacts(
     """Write the contact features of each observer into ``out``, and mark worlds whose forecast failed in ``failed``.
 
     Args:
-        state: state rows of the worlds, [n, S], in the layout of ``physics.columns``.
-        params: parameter rows of the worlds, in the same layout.
-        observers: indices of the observing vehicles.
-        time_step: time between two decisions, s.
-        commands: commands to forecast, as indices into CONTACT_COMMANDS.
-        features: scaling of the features, [3, 30], or [3, 42] with the group contact_far: rows 1 / scale, low and high,
-            one column per feature.
-        out: result, [n, observers, features]; columns of commands that are not forecast are not changed.
-        failed: set to True for each world in which a check of the kernel failed, [n].
+        state: time, motion and harm of the worlds, one row per world, [n, S] (layout: ``physics.columns``).
+        params: parameters of the vehicles, one row per world (layout: ``physics.columns``).
+        observers: indices of the observing vehicles (0 = front).
+        time_step: time between two decisions of a vehicle, s.
+        commands: the observer's own commands for which to forecast, as indices into CONTACT_COMMANDS.
+        features: scaling of the features: three rows (1 / scale, low, high) with one column per feature. There are 30
+            features, or 42 with the group contact_far.
+        out: array that receives the result, [n, observers, features]. Features of commands that are not in ``commands``
+            do not change.
+        failed: mask [n] that is set to True for each world in which a check of the physics failed.
 
     """
     of = columns(state)
@@ -100,18 +101,18 @@ def observe_contacts(
 
 @compiled
 def _place_known(table: Floats, state: Floats, params: Floats, k: int, i: int, at: int) -> tuple[int, int]:
-    """Write the vehicles that vehicle ``i`` knows into ``table``; return the first and last column of a known vehicle.
+    """Write one world into ``table`` as vehicle ``i`` knows it; return the first and last column of a known vehicle.
 
-    A vehicle is placed far away if it is unknown, or if some of its data that a forecast needs are unknown. A known
-    obstacle counts as a known vehicle.
+    A vehicle is placed far away if vehicle ``i`` does not know it, or does not know all of its data that a forecast
+    needs. A known obstacle is treated as a known vehicle.
 
     Args:
-        table: table to fill, in the layout of ``physics.rows``, [rows, N + at].
-        state: state rows of the worlds, [n, S], in the layout of ``physics.columns``.
-        params: parameter rows of the worlds, in the same layout.
+        table: array to fill, one column per vehicle, [rows, N + at] (layout: ``physics.rows``).
+        state: time, motion and harm of the worlds, one row per world, [n, S] (layout: ``physics.columns``).
+        params: parameters of the vehicles, one row per world (layout: ``physics.columns``).
         k: index of the world.
-        i: index of the observing vehicle.
-        at: 1 if the worlds have an obstacle, which then has column 0 of the table; otherwise 0.
+        i: index of the observing vehicle (0 = front).
+        at: 1 if the worlds have an obstacle, which is then in column 0 of ``table``; 0 if not.
 
     """
     of = columns(state)
@@ -158,17 +159,17 @@ def _write_features(
 ) -> None:
     """Compute the contact features of one forecast, before scaling, and write them into ``value``.
 
-    The features of a pair are 0 if the other vehicle is unknown or does not exist. An impact exactly at the end of a
-    decision step belongs to this step, as in the engine.
+    The features of the observer and a neighbour are 0 if the neighbour is unknown or does not exist. An impact exactly
+    at the end of a time step belongs to this time step, as in the engine.
 
     Args:
-        table: one world after the forecast, in the layout of ``physics.rows``.
-        found: next impact of each pair, the result of ``forecast_contacts``.
-        own: column of the observing vehicle.
-        first: first column of a vehicle that the observer knows.
-        last: last column of a vehicle that the observer knows.
-        time_step: time between two decisions, s.
-        value: result, one number per feature.
+        table: one world after the forecast, one column per vehicle (layout: ``physics.rows``).
+        found: forecast next impact of each pair, the result of ``forecast_contacts``.
+        own: column of the observing vehicle in ``table``.
+        first: first column, in ``table``, of a vehicle that the observer knows.
+        last: last column, in ``table``, of a vehicle that the observer knows.
+        time_step: time between two decisions of a vehicle, s.
+        value: array that receives the result, one number per feature.
 
     """
     for side in range(2):

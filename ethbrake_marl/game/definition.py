@@ -14,11 +14,14 @@ class Drawn(Protocol):
 
     @property
     def worlds(self) -> Worlds:
-        """The drawn worlds at the alert (time 0), n of them."""
+        """The n drawn worlds at the alert (t = 0)."""
 
 
 class Game(Protocol):
-    """Definition of a game: vehicles, times, objectives, observations and worlds. A ``Scenario`` is a game."""
+    """What the engine needs to know of a game: vehicles, times, objectives, observations and worlds.
+
+    Every ``Scenario`` is a ``Game``.
+    """
 
     @property
     def name(self) -> str:
@@ -50,11 +53,11 @@ class Game(Protocol):
 
     @property
     def objective(self) -> Declared:
-        """Objective of the vehicles: one name for all or one name per vehicle; a reward may replace it."""
+        """Objective of the vehicles: one name for all vehicles, or one name per vehicle. Rewards may replace it."""
 
     @property
     def observation(self) -> Any:
-        """Features that vehicles observe: one list for all, or lists by vehicle name; None: the default features."""
+        """Features that vehicles observe: one list for all, or a list per vehicle name; None: the default features."""
 
     @property
     def has_obstacle(self) -> bool:
@@ -62,14 +65,17 @@ class Game(Protocol):
 
     @property
     def by_link(self) -> bool:
-        """Whether links have delays and losses of their own; if not, a vehicle knows everything after its latency."""
+        """Whether each link between two vehicles has its own delays and losses.
+
+        If no link has them, a vehicle knows everything after its latency.
+        """
 
     @property
     def builds_up(self) -> bool:
         """Whether the brakes of some vehicle may build up gradually instead of acting at once."""
 
     def sample(self, n: int, seed: int, *, first: int = 0, channel: Literal["list", "training"] = "list") -> Drawn:
-        """Draw worlds ``first`` to ``first + n - 1`` of the endless list of worlds that belongs to ``seed``.
+        """Draw the worlds with the numbers ``first`` to ``first + n - 1`` from the endless list of worlds of ``seed``.
 
-        ``channel``: ``"list"`` (worlds for evaluation) or ``"training"``, two independent lists.
+        ``channel`` selects one of two independent lists: ``"list"`` for evaluation, ``"training"`` for training.
         """

@@ -10,14 +10,14 @@ from ethbrake_marl.physics.state import Floats, Ints, real_numbers
 
 
 def index_to_action(indices: ArrayLike, count: int, names: str = "the learners") -> Floats:
-    """Return the action in [-1, 1] for each index k, float64 of the same shape: (2 k - K + 1) / (K - 1).
+    """Return the action ``(2 k - K + 1) / (K - 1)`` in [-1, 1] for each index k, where K is ``count``.
 
-    K is ``count``, the number of actions. If K is odd, the action in the middle is exactly 0.
+    The result is float64 and has the shape of ``indices``. If K is odd, the action in the middle is exactly 0.
 
     Args:
         indices: whole numbers from 0 (full braking) to ``count - 1`` (full driving), of any shape.
         count: number of actions, at least 2.
-        names: names of the vehicles, for error messages.
+        names: names of the vehicles that act, for error messages.
 
     Raises the same ``InvalidInput`` as ``checked_indices``.
 
@@ -30,10 +30,11 @@ def index_to_action(indices: ArrayLike, count: int, names: str = "the learners")
 
 
 def checked_indices(indices: ArrayLike, count: int, names: str) -> Ints:
-    """Return the indices as int64 of the same shape.
+    """Return the indices of discrete actions as an int64 array of the same shape.
 
     Raises ``InvalidInput`` for a value that is not a whole number from 0 to ``count - 1``. A float such as 1.0 is also
-    invalid, because it is probably meant as a continuous action. ``names``: names of the vehicles, for error messages.
+    invalid, because the caller probably means a continuous action. ``names``: names of the vehicles that act, for error
+    messages.
     """
     right = f"with actions={count}, an action must be an index, a whole number from 0 to {count - 1}"
     try:

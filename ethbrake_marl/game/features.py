@@ -26,7 +26,7 @@ Of = Literal["own", "neighbour"]
 
 @dataclass(frozen=True, slots=True)
 class Feature:
-    """A feature, one number of an observation; the number that is observed is ``clip(value / scale, low, high)``."""
+    """A feature: one number of an observation. A vehicle observes the number ``clip(value / scale, low, high)``."""
 
     name: str  # full name, such as ``own.speed``, or name inside a group, such as ``speed``
     unit: str  # unit of the value
@@ -42,7 +42,7 @@ CONTACT_SIDES = ("front", "rear")  # the vehicle's two pairs; the front pair of 
 
 
 class Groups(NamedTuple):
-    """The built-in features by group. Contact features exist for each of ``CONTACT_COMMANDS``."""
+    """The built-in features by group. Each contact feature exists once for each command in ``CONTACT_COMMANDS``."""
 
     own: tuple[Feature, ...]  # features of the vehicle itself
     role: tuple[Feature, ...]  # place of the vehicle in the line
@@ -172,16 +172,16 @@ class RegisteredFeature:
     def checked(self, worlds: Worlds, vehicle: int, neighbour: int | None, counts: Any, steps: Floats | None) -> Floats:
         """Compute the feature in n worlds and return the scaled and clipped values, [n].
 
-        Raises ``InvalidInput`` naming feature, vehicle and world for a result of wrong shape or a value that is not
-        finite.
+        Raises ``InvalidInput``, which names the feature, if the function returns an array of a wrong shape or a value
+        that is not finite.
 
         Args:
-            worlds: worlds in which to compute the feature, n of them.
-            vehicle: index of the observing vehicle, from 0.
+            worlds: the n worlds in which to compute the feature.
+            vehicle: index of the observing vehicle (0 = front).
             neighbour: index of the neighbour; None for a feature of the vehicle itself.
-            counts: worlds in which the function's value is used, a mask [n] or one truth value; in all other worlds the
-                feature has the value ``unknown``.
-            steps: number of steps so far, [n], for error messages; None: unknown.
+            counts: whether to use the function's value in each world, a mask [n] or one truth value for all worlds.
+                Where ``counts`` is False, the feature has the value ``unknown``.
+            steps: number of steps that each episode has taken, [n], for error messages; None: not known.
 
         """
         name = self.feature.name
@@ -206,39 +206,39 @@ class RegisteredFeature:
 def age(worlds: Worlds, vehicle: int, neighbour: int) -> Floats:
     """Return the age of the newest state that ``vehicle`` has received from ``neighbour``, [n] s.
 
-    The age is 0 if the present state is known. ``vehicle`` and ``neighbour`` are indices from 0.
+    The age is 0 if ``vehicle`` knows the present state of ``neighbour``. Both arguments are indices (0 = front).
     """
     ages = Messages.of(worlds).age_s(worlds.time_s)[:, vehicle, neighbour]
     return np.where(np.isfinite(ages), ages, 0.0)
 
 
 def intent(worlds: Worlds, vehicle: int, neighbour: int) -> Floats:
-    """Return the intent in the neighbour's newest message, [n] m/s2: the command that it chose at its last decision."""
+    """Return the intent in the neighbour's newest message, [n] m/s2: the command of the neighbour's last decision."""
     return Messages.of(worlds).intents(vehicle)[:, neighbour]
 
 
 def build_up_time(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> Floats:
     """Return the time in which the brakes of a vehicle build up from 0 to full, [n] s; 0 for brakes that act at once.
 
-    The vehicle is ``neighbour``, or ``vehicle`` if ``neighbour`` is None (indices from 0).
+    The result is about ``neighbour`` or, if ``neighbour`` is None, about ``vehicle`` (indices, 0 = front).
     """
     i, v = vehicle if neighbour is None else neighbour, worlds.vehicles
     return v.braking_capacity_mps2[:, i] / v.brake_rate_mps3[:, i]
 
 
 def release_time(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> Floats:
-    """Return the time in which fully applied brakes of a vehicle are released, [n] s; 0 for release at once.
+    """Return the time that a vehicle needs to release fully applied brakes, [n] s; 0 if brakes are released at once.
 
-    The vehicle is ``neighbour``, or ``vehicle`` if ``neighbour`` is None (indices from 0).
+    The result is about ``neighbour`` or, if ``neighbour`` is None, about ``vehicle`` (indices, 0 = front).
     """
     i, v = vehicle if neighbour is None else neighbour, worlds.vehicles
     return v.braking_capacity_mps2[:, i] / v.release_rate_mps3[:, i]
 
 
 def harm_weight(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> Floats:
-    """Return the weight of a vehicle's harm in the objective ``preference``, divided by the sum of all weights, [n].
+    """Return the weight of a vehicle's harm in the objective ``preference``, divided by all vehicles' weights, [n].
 
-    The vehicle is ``neighbour``, or ``vehicle`` if ``neighbour`` is None (indices from 0).
+    The result is about ``neighbour`` or, if ``neighbour`` is None, about ``vehicle`` (indices, 0 = front).
     """
     weight = worlds.vehicles.harm_weight
     share: Floats = weight[:, vehicle if neighbour is None else neighbour] / weight.sum(axis=1)
@@ -246,9 +246,9 @@ def harm_weight(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> F
 
 
 def place(worlds: Worlds, vehicle: int) -> Floats:
-    """Return the number of vehicles ahead of ``vehicle`` (index from 0) in the line, [n].
+    """Return the number of vehicles ahead of ``vehicle`` (index, 0 = front) in the line, [n].
 
-    With this feature a policy that several vehicles share can distinguish them.
+    If several vehicles share a policy, this feature shows the policy which vehicle it drives.
     """
     return np.full(worlds.n, float(vehicle))
 
@@ -260,7 +260,7 @@ def _single(
 
 
 def _knows(piece: Piece) -> RegisteredFeature:
-    """Return the feature that is 1 if the vehicle knows this ``piece`` of the neighbour's data, such as its mass."""
+    """Return the feature that is 1 if the observer knows one property of a neighbour, such as ``piece="mass"``."""
     meaning = f"1 if the neighbour's {piece.replace('_', ' ')} is known, from a message or from sensors"
     feature = Feature(f"{piece}_known", "1", 1.0, 0.0, 1.0, meaning)
     return RegisteredFeature(feature, _certain, "neighbour", 0.0, (1.0, 1.0, 1.0), (piece,))
@@ -364,10 +364,11 @@ _BUILT_IN: dict[str, RegisteredFeature] = {
 
 
 def listed_features(listed: object) -> tuple[str, ...]:
-    """Return the full names of the features that a list of groups and single features contains, in its order.
+    """Replace each group in a list of groups and features by the features of this group; return all full names.
 
-    The result for ``["own", "front_1.gap"]`` is ``("own.speed", ..., "front_1.gap")``. Raises ``UnknownName`` with a
-    suggestion for an unknown name, and ``InvalidInput`` if ``listed`` is not a list, is empty, or has a feature twice.
+    For ``["own", "front_1.gap"]`` the result is ``("own.speed", ..., "front_1.gap")``. Raises ``UnknownName`` with a
+    suggestion for an unknown name, and ``InvalidInput`` if ``listed`` is not a list, is empty, or contains a feature
+    twice.
     """
     if isinstance(listed, str) or not isinstance(listed, Sequence) or not listed:
         raise InvalidInput("observation: must be a list of groups and features, for instance [own, front_1, rear_1]")
@@ -379,9 +380,9 @@ def listed_features(listed: object) -> tuple[str, ...]:
 
 
 class _ListSchema:
-    """Pydantic annotation of a list of features: the field's JSON schema has the names of all features.
+    """Pydantic annotation of a field with a list of features: the field's JSON schema lists the names of all features.
 
-    The schema includes features that are registered before it is generated.
+    Features that are registered before the schema is generated are included.
     """
 
     @classmethod
@@ -395,7 +396,7 @@ ListedFeatures = Annotated[tuple[str, ...], Field(strict=False), _ListSchema]
 
 
 def feature_named(name: str) -> Feature:
-    """Return the feature with the full name ``name``, such as ``front_1.gap``; raise ``UnknownName`` for any other."""
+    """Return the feature with the full name ``name``, such as ``front_1.gap``; raise ``UnknownName`` if none has it."""
     group, dot, own = name.partition(".")
     if name in FEATURES and FEATURES[name].of == "own":
         return FEATURES[name].feature
@@ -408,15 +409,15 @@ def feature_named(name: str) -> Feature:
 
 
 def side_of(name: str) -> tuple[str, int] | None:
-    """Return side and number of the neighbour in a full feature name, such as ``("front", 1)``; None without one."""
+    """Return the neighbour in a full feature name: ``("front", 1)`` for ``front_1.gap``; None for ``own.speed``."""
     match = _SIDE.fullmatch(name.partition(".")[0])
     return (match[1], int(match[2])) if match and int(match[2]) <= MOST_NEIGHBOURS else None
 
 
 def registered_in(names: Iterable[str]) -> dict[str, RegisteredFeature]:
-    """Return the registered features among these full names, by their names without neighbour.
+    """Return the features among these full names that have a function of their own, as a dictionary.
 
-    For example, the key of ``front_1.age`` is ``age``.
+    The key is the name without the neighbour: the key of ``front_1.age`` is ``age``.
     """
     own = [name.partition(".")[2] or name for name in names]
     return {name: FEATURES[name] for name in own if name in FEATURES}
@@ -425,7 +426,7 @@ def registered_in(names: Iterable[str]) -> dict[str, RegisteredFeature]:
 def choices(sides: Iterable[str] = ("front_1", "rear_1")) -> list[str]:
     """Return the names that an ``observation:`` list may contain: groups first, then single features.
 
-    ``sides``: neighbours whose features are included, such as ``front_1``.
+    ``sides``: neighbours, such as ``front_1``, whose features the result contains.
     """
     groups = ["own", *sides, "role", "obstacle", "contact", "contact_far"]
     single = [f"{group}.{feature.name}" for group in groups for feature in _group(group)]
@@ -481,32 +482,31 @@ def register_feature(
 ) -> None:
     """Register a feature, so that an ``observation:`` list can contain it.
 
-    The docstring of ``function`` is shown as its meaning.
+    The docstring of ``function`` is shown as the meaning of the feature.
 
     An installed package registers a feature with an entry point of the group ``ethbrake_marl.features``. The entry
-    point names a ``Part``, which contains all arguments but ``name``.
+    point names a ``Part``, which contains all arguments of this function except ``name``.
 
-    The channel does not restrict a feature with ``of="own"``: the function can read data that no message contained.
-    Registering the same feature again changes nothing. Raises ``AlreadyExists`` if the name is in use, and
-    ``InvalidInput`` for invalid arguments, or if the function, called for test worlds, fails or returns a wrong shape
-    or number.
+    A feature with ``of="own"`` can read data that no message contained. Registering the same feature again changes
+    nothing. Raises ``AlreadyExists`` if the name is in use, and ``InvalidInput`` for invalid arguments, or if the
+    function, called for test worlds, fails or returns a wrong shape or number.
 
     Args:
         name: name of the feature, 1 to 64 characters ``a-z``, ``0-9`` and ``_``, beginning with a letter. An
             observation lists a feature of the vehicle itself as ``name``, a feature of a neighbour as ``front_1.name``.
         function: ``function(worlds, vehicle)``, or ``function(worlds, vehicle, neighbour)`` for a feature of a
-            neighbour. The function returns the value of the feature in each world, [n], in ``unit``. Index 0 is the
-            front vehicle. The function must work for any number of vehicles and must not depend on anything but its
-            arguments.
-        unit: unit of the value.
+            neighbour, where ``vehicle`` and ``neighbour`` are indices (0 = front). The function returns the value of
+            the feature in each world, [n], in ``unit``. It must work for any number of vehicles, and its result must
+            depend only on its arguments.
+        unit: unit of the value that the function returns.
         scale: number above 0; the observed number is ``clip(value / scale, low, high)``.
-        low: smallest observed number.
-        high: largest observed number, above ``low``.
-        of: vehicle that the feature describes: ``own``, the observer itself; ``neighbour``, a neighbour. The value for
-            a neighbour is observed only if the vehicle knows the neighbour.
+        low: smallest number that a vehicle can observe.
+        high: largest number that a vehicle can observe, above ``low``.
+        of: ``own``: the feature describes the observing vehicle; ``neighbour``: it describes a neighbour. A vehicle
+            observes the value for a neighbour only if it knows this neighbour.
         unknown: value for an unknown neighbour, in ``unit``; must be 0 if ``of`` is ``own``.
-        reads: data in the neighbour's messages that the function needs (the names in ``v2x: tells``); if the observer
-            does not know all these data, the feature has the value ``unknown``. None: not specified; the feature then
+        reads: data in the neighbour's messages that the function needs (the names in ``v2x: tells``). If the observer
+            does not know all these data, the feature has the value ``unknown``. If ``reads`` is None, the feature
             cannot be used in a scenario whose messages leave out some data.
 
     """

@@ -1,11 +1,11 @@
-"""The harm ledger: the harm that each vehicle bears, by two counts, first-impact harm and total harm.
+"""The harm ledger: a record of the harm of each pair of vehicles, as first-impact harm and as total harm.
 
-The harm of an impact of pair (i, i + 1) with closing speed ``w`` is ``w^2`` (m2/s2). The two vehicles bear it in
-inverse proportion to their masses (the paper's eq. harm): ``H_i = m_{i+1} / (m_i + m_{i+1}) w^2`` and ``H_{i+1} = w^2 -
-H_i``.
+The harm of an impact of pair (i, i + 1) with closing speed ``w`` is ``w^2`` (m2/s2). The two vehicles, with masses
+``m_i`` and ``m_{i+1}``, bear this harm in inverse proportion to their masses (the paper's eq. harm):
+``H_i = w^2 * m_{i+1} / (m_i + m_{i+1})`` and ``H_{i+1} = w^2 - H_i``.
 
-An impact of Vehicle 1 with an immovable obstacle ahead has the harm ``v_1^2``, where ``v_1`` is its speed. Vehicle 1
-bears all of it.
+An impact of Vehicle 1 with an immovable obstacle ahead has the harm ``v_1^2``, where ``v_1`` is the speed of Vehicle 1.
+Vehicle 1 bears all harm of such an impact.
 
 *First-impact harm* counts only the first impact of each pair, as the paper does. *Total harm* counts every impact. An
 agent can exploit first-impact harm: after a light early impact, a harder impact of the same pair costs nothing.
@@ -38,7 +38,7 @@ def check_harm_count(harm_count: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Ledger:
-    """Harm and number of impacts of each pair in ``n`` worlds since the start of the episode."""
+    """Harm and number of impacts of each pair of vehicles since the start of the episode, in ``n`` worlds."""
 
     first_impact_harm: Floats  # [n, P] harm of each pair's first impact (m2/s2)
     total_harm: Floats  # [n, P] harm of all impacts of each pair (m2/s2)
@@ -56,7 +56,7 @@ class Ledger:
         )
 
     def add(self, impacts: Impacts) -> Ledger:
-        """Return the ledger after adding the ``impacts`` of the next interval of time of the same episodes."""
+        """Return the sum of this ledger and ``impacts``, the impacts of the same episodes in the next time interval."""
         return Ledger(
             self.first_impact_harm + impacts.first_impact_harm,
             self.total_harm + impacts.total_harm,
@@ -72,8 +72,8 @@ class Ledger:
     def since(self, before: Ledger) -> Ledger:
         """Return the harm and impacts since ``before``, an earlier ledger of the same episodes.
 
-        Raises ``InvalidInput`` if ``before`` has another shape or more impacts, for example because a new episode has
-        begun in one of the rows.
+        Raises ``InvalidInput`` if ``before`` has another shape or more impacts than this ledger, for example because a
+        new episode has begun in one of the worlds.
         """
         names = [column.name for column in fields(self) if column.name not in ("mass_t", "restitution", "harm_weight")]
         if before.count.shape != self.count.shape or (before.count > self.count).any():
@@ -84,14 +84,14 @@ class Ledger:
         return replace(self, **{name: getattr(self, name) - getattr(before, name) for name in names})
 
     def take(self, rows: Ints | Bools | Sequence[int]) -> Ledger:
-        """Return the ledger of the worlds selected by ``rows`` (indices or a mask [n])."""
+        """Return the ledger of only the worlds that ``rows`` selects (indices, or a mask [n])."""
         return Ledger(*(getattr(self, column.name)[rows] for column in fields(self)))
 
     def pair_harm(self, harm_count: HarmCount) -> Floats:
-        """Return the harm of each pair, [n, P] m2/s2.
+        """Return the harm of each pair of vehicles since the start of the episode, [n, P] m2/s2.
 
-        ``harm_count``: ``"first"``, first-impact harm, or ``"total"``, total harm; raises ``InvalidInput`` for any
-        other value.
+        ``harm_count`` selects the harm: ``"first"`` for first-impact harm, ``"total"`` for total harm. Raises
+        ``InvalidInput`` for any other value.
         """
         check_harm_count(harm_count)
         return self.first_impact_harm if harm_count == "first" else self.total_harm
@@ -99,8 +99,8 @@ class Ledger:
     def obstacle_harm(self, harm_count: HarmCount) -> Floats:
         """Return the harm of impacts of Vehicle 1 with the obstacle ahead, [n] m2/s2.
 
-        ``harm_count``: ``"first"``, first-impact harm, or ``"total"``, total harm; raises ``InvalidInput`` for any
-        other value.
+        ``harm_count`` selects the harm: ``"first"`` for first-impact harm, ``"total"`` for total harm. Raises
+        ``InvalidInput`` for any other value.
         """
         check_harm_count(harm_count)
         return self.obstacle_first_harm if harm_count == "first" else self.obstacle_total_harm
@@ -108,21 +108,21 @@ class Ledger:
     def vehicle_harm(self, harm_count: HarmCount) -> Floats:
         """Return the harm that each vehicle bears, [n, N] m2/s2.
 
-        A vehicle bears its share (``split``) of the harm of impacts with the vehicle in front and with the vehicle
-        behind. Vehicle 1 also bears the harm of impacts with the obstacle. ``harm_count``: ``"first"``, first-impact
-        harm, or ``"total"``.
+        A vehicle bears a part (``split``) of the harm of its impacts with the vehicle in front and with the vehicle
+        behind. Vehicle 1 also bears the harm of impacts with the obstacle. ``harm_count`` selects the harm: ``"first"``
+        for first-impact harm, ``"total"`` for total harm.
         """
         harm = split(self.pair_harm(harm_count), self.mass_t)
         harm[:, 0] += self.obstacle_harm(harm_count)
         return harm
 
     def speed_changes(self, harm_count: HarmCount) -> tuple[Floats, Floats]:
-        """Return the changes of speed of each vehicle by impacts at its front and at its rear, [n, N] m/s each.
+        """Return two arrays: each vehicle's change of speed by impacts at its front, and at its rear, [n, N] m/s each.
 
-        The changes are computed from the harm of the pair, as if a single impact of these two vehicles had caused all
-        of it. The result is exact for a first impact without a third vehicle. If ``"total"`` counts several impacts of
-        a pair, the result is larger than the change of speed in the hardest impact. ``harm_count``: ``"first"``,
-        first-impact harm, or ``"total"``, total harm.
+        The changes of speed are computed from each pair's harm, as if a single impact of the pair had caused all of its
+        harm. The result is exact for a first impact in which no third vehicle takes part. If the harm comes from
+        several impacts of the pair, the result is larger than the change of speed in the hardest of them.
+        ``harm_count`` selects the harm: ``"first"`` for first-impact harm, ``"total"`` for total harm.
         """
         with_obstacle = np.concatenate([self.obstacle_harm(harm_count)[:, np.newaxis], self.pair_harm(harm_count)], 1)
         rebound = (1.0 + self.restitution[:, np.newaxis]) * np.sqrt(with_obstacle)
@@ -135,14 +135,14 @@ class Ledger:
     def world_harm(self, harm_count: HarmCount) -> Floats:
         """Return the harm of each world, summed over all vehicles, [n] m2/s2.
 
-        The order of summation is fixed: obstacle, then pairs front to rear. ``harm_count``: ``"first"``, first-impact
-        harm, or ``"total"``, total harm.
+        The order of summation is fixed: first the obstacle, then the pairs from front to rear. ``harm_count`` selects
+        the harm: ``"first"`` for first-impact harm, ``"total"`` for total harm.
         """
         return line_sum(self.pair_harm(harm_count), self.obstacle_harm(harm_count))
 
     @property
     def impacts(self) -> Ints:
-        """Number of impacts in each world, of all pairs and with the obstacle, [n]."""
+        """Number of impacts in each world, between vehicles and with the obstacle, [n]."""
         number: Ints = self.count.sum(axis=1) + self.obstacle_count
         return number
 
@@ -154,10 +154,10 @@ class Ledger:
 
 @compiled
 def line_sum(pair_values: Floats, obstacle_values: Floats) -> Floats:
-    """Return the sum of the values of obstacle and pairs in each world, [n].
+    """Return the sum of ``obstacle_values`` [n] and all pairs of ``pair_values`` [n, P] in each world, [n].
 
-    The order of summation is fixed, so the result does not depend on the batch: obstacle first, then pairs front to
-    rear. ``pair_values`` has shape [n, P], ``obstacle_values`` has shape [n].
+    The order of summation is fixed: first the obstacle, then the pairs from front to rear. So the sum of a world does
+    not depend on the other worlds, to the last bit.
     """
     n, pairs = pair_values.shape
     total = np.zeros(n)
@@ -169,7 +169,7 @@ def line_sum(pair_values: Floats, obstacle_values: Floats) -> Floats:
 
 
 def empty_ledger(worlds: Worlds) -> Ledger:
-    """Return the ledger of ``worlds`` at the alert (time 0), without harm."""
+    """Return a ledger for ``worlds`` without any harm or impact."""
     shape = worlds.gaps_m.shape
     pairs = np.zeros(shape), np.zeros(shape), np.zeros(shape, np.int64)
     of_worlds = worlds.vehicles.mass_t, worlds.vehicles.restitution, worlds.vehicles.harm_weight
@@ -180,8 +180,8 @@ def empty_ledger(worlds: Worlds) -> Ledger:
 def split(pair_harm: Floats, mass_t: Floats) -> Floats:
     """Divide the harm of each pair between its two vehicles; return the harm that each vehicle bears, [n, N] m2/s2.
 
-    The lighter vehicle bears more. ``pair_harm``: harm of each pair, [n, P] m2/s2. ``mass_t``: mass of each vehicle,
-    [n, N] t.
+    The lighter vehicle of a pair bears more. ``pair_harm``: harm of each pair, [n, P] m2/s2. ``mass_t``: mass of each
+    vehicle, [n, N] t.
     """
     n, vehicles = mass_t.shape
     harm = np.zeros((n, vehicles))
@@ -195,11 +195,12 @@ def split(pair_harm: Floats, mass_t: Floats) -> Floats:
 
 @compiled
 def front_share(harm: float, front_mass: float, rear_mass: float) -> float:
-    """Return the part of a pair's ``harm`` that the front vehicle bears: ``m_rear / (m_front + m_rear) harm``.
+    """Return the part of a pair's ``harm`` that the front vehicle bears.
 
-    The larger of the two parts is computed by this formula, and the smaller part by subtraction, which is exact; so
-    both parts add up to ``harm`` without rounding error. The masses must have the same unit. The result has the unit of
-    ``harm``.
+    This part is ``harm * rear_mass / (front_mass + rear_mass)``. If the rear vehicle bears the larger part, its
+    part is computed by the same kind of formula and subtracted from ``harm``. This subtraction is exact, so the parts
+    of the two vehicles add up to ``harm`` without rounding error. The two masses must have the same unit. The result
+    has the unit of ``harm``.
     """
     if front_mass <= rear_mass:
         return rear_mass / (front_mass + rear_mass) * harm
@@ -208,7 +209,7 @@ def front_share(harm: float, front_mass: float, rear_mass: float) -> float:
 
 @compiled
 def _powers(shares: Floats, exponent: float) -> Floats:
-    """Return ``min(x^exponent, 1)`` for each x >= 0 in ``shares``, [k], with the same bits on every processor."""
+    """Return ``min(x^exponent, 1)`` for each x >= 0 in ``shares``, [k]; every processor computes the same bits."""
     result = np.zeros(len(shares))
     for i in range(len(shares)):
         if shares[i] > 0.0:
@@ -217,7 +218,7 @@ def _powers(shares: Floats, exponent: float) -> Floats:
 
 
 class InjuryCurve(NamedTuple):
-    """Probability of an injury in a rear-end collision, as a function of the vehicle's change of speed dv (m/s)."""
+    """Probability of an injury in a rear-end impact, as a function of the vehicle's change of speed dv (m/s)."""
 
     injury: str  # least severity of the injury, on the abbreviated injury scale
     formula: str  # formula of the probability in terms of dv
@@ -248,14 +249,14 @@ INJURY_CURVES = {
 
 
 def injury_probability(speed_change_mps: Floats, side: Literal["front", "rear"], curve: str = "lr4s") -> Floats:
-    """Return the probability that an occupant of a vehicle is injured in a rear-end impact, [k].
+    """Return the probability that an occupant of a vehicle is injured in a rear-end impact, for k impacts, [k].
 
-    The logistic curves ``lr4s`` and ``gidas`` give a probability above 0 even without a change of speed, so do not use
-    them for a vehicle that was not hit.
+    For the logistic curves ``lr4s`` and ``gidas`` this probability is above 0 even if the change of speed is 0, so do
+    not use them for a vehicle that was not hit.
 
     Args:
-        speed_change_mps: change of the vehicle's speed in the impact, [k] m/s; the sign is ignored.
-        side: side of the vehicle that is hit: ``"front"`` for the striking vehicle, ``"rear"`` for the struck vehicle.
+        speed_change_mps: change of the vehicle's speed in each impact, [k] m/s; the sign is ignored.
+        side: side at which the vehicle is hit: ``"front"`` for the striking vehicle, ``"rear"`` for the struck vehicle.
         curve: name of the curve, a key of ``INJURY_CURVES``.
 
     Raises ``UnknownName`` for an unknown side or curve.

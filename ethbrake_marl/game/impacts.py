@@ -1,4 +1,4 @@
-"""``EpisodeImpacts``: every impact of a batch of episodes, from which measures can be computed."""
+"""``EpisodeImpacts``: every single impact in a batch of episodes, from which measures can be computed."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class EpisodeImpacts:
 
     @classmethod
     def of(cls, worlds: Worlds, parts: Sequence[ImpactRows] = ()) -> EpisodeImpacts:
-        """Return the impacts of the episodes that began with ``worlds``.
+        """Collect the impacts of the episodes that began in ``worlds``.
 
-        ``parts``: impacts of the episodes in consecutive intervals of time.
+        ``parts``: the impacts of these episodes, listed separately for consecutive intervals of time.
         """
         whole = [np.concatenate([getattr(rows, name) for rows in (_NO_ROWS, *parts)]) for name in _OF_ROWS]
         order = np.argsort(whole[0], kind="stable")
@@ -45,7 +45,7 @@ class EpisodeImpacts:
     def largest_speed_change_mps(self) -> Floats:
         """Largest change of speed of each vehicle in a single impact (delta-v), [n, N] m/s; 0 without an impact.
 
-        A push by a vehicle that is already in contact is not an impact, so its change of speed does not count.
+        A push by a vehicle that is already in contact is not an impact, so a change of speed by a push is not included.
         """
         rows, change = self.rows, np.zeros(self.worlds.speeds_mps.shape)
         np.maximum.at(change, (rows.world, rows.pair + 1), np.abs(rows.rear_speed_change_mps))
@@ -54,12 +54,12 @@ class EpisodeImpacts:
         return change
 
     def and_then(self, way: Iterable[tuple[Worlds, Floats, Floats]], some: Bools) -> EpisodeImpacts:
-        """Return these impacts together with the new impacts of some worlds in the next segments of the episodes.
+        """Return these impacts, extended by the impacts in the next segments (time intervals) of the episodes.
 
         Args:
-            way: consecutive segments from ``Engine.segments``: worlds at the start, constant commands [n, N] m/s2, and
-                end of the segment [n] s.
-            some: worlds whose new impacts are added, a mask [n].
+            way: consecutive segments from ``Engine.segments``. Each segment is a tuple: the worlds at its start, the
+                constant commands [n, N] m/s2, and its end [n] s.
+            some: mask [n] of the worlds whose new impacts are added.
 
         """
         parts, blocks = list(way), [self.rows]
@@ -71,15 +71,15 @@ class EpisodeImpacts:
         return EpisodeImpacts.of(self.worlds, blocks)
 
     def renewed(self, rows: Ints, alert: Worlds) -> EpisodeImpacts:
-        """Return the impacts after new episodes, without impacts yet, have begun in some rows.
+        """Return a copy in which new episodes, still without impacts, replace the episodes with the indices ``rows``.
 
-        ``rows``: indices of the new episodes, [k]. ``alert``: worlds of the new episodes at the alert, k of them.
+        ``alert``: the worlds of the new episodes at the alert, one for each index in ``rows``.
         """
         others = ~np.isin(self.rows.world, rows)
         return EpisodeImpacts.of(self.worlds.assign(rows, alert), [_some(self.rows, others)])
 
     def take(self, rows: Ints) -> EpisodeImpacts:
-        """Return the impacts of the episodes with the indices ``rows`` [k]; an index may occur several times."""
+        """Return the impacts of only the episodes with the indices ``rows`` [k]; an index may occur several times."""
         first = np.searchsorted(self.rows.world, rows)
         count = np.searchsorted(self.rows.world, rows, side="right") - first
         at = np.repeat(first - np.cumsum(count) + count, count) + np.arange(count.sum())
@@ -88,23 +88,23 @@ class EpisodeImpacts:
 
     @staticmethod
     def join(parts: Sequence[EpisodeImpacts]) -> EpisodeImpacts:
-        """Join the episodes of all parts into one batch, in the order of the parts."""
+        """Return one object with the episodes of all ``parts``, in the order of ``parts``."""
         before = np.cumsum([0, *(part.worlds.n for part in parts)])
         shifted = [replace(p.rows, world=p.rows.world + n) for p, n in zip(parts, before, strict=False)]
         return EpisodeImpacts.of(Worlds.concatenate([part.worlds for part in parts]), shifted)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return all data as arrays by name, for a snapshot; ``read`` restores the impacts from them."""
+        """Return all data as a dictionary from name to array, for a snapshot; ``read`` converts the arrays back."""
         arrays = {name: getattr(self.worlds, name) for name in _OF_WORLDS}
         arrays |= {name: getattr(self.worlds.vehicles, name) for name in _OF_VEHICLES}
         arrays["rows"] = np.stack([getattr(self.rows, name) for name in _OF_ROWS], axis=1, dtype=np.float64)
         return {f"impacts.{name}": np.array(array, order="C") for name, array in arrays.items()}
 
     def read(self, arrays: Mapping[str, NDArray[Any]]) -> EpisodeImpacts:
-        """Return the impacts from ``arrays``, a result of ``EpisodeImpacts.arrays``.
+        """Return the impacts that ``EpisodeImpacts.arrays`` has converted to ``arrays``.
 
-        The arrays must have the same number of episodes as this object. Raises ``InvalidInput`` if an array is missing
-        or has a wrong shape.
+        The number of episodes must be the same as in this object. Raises ``InvalidInput`` if an array is missing or has
+        a wrong shape.
         """
         for name, own in self.arrays().items():
             have = arrays.get(name)
@@ -123,13 +123,13 @@ def _some(rows: ImpactRows, index: NDArray[Any]) -> ImpactRows:
 
 
 def impacts_within(before: Worlds, command_mps2: Floats, until_s: Floats, rows: Ints) -> ImpactRows:
-    """Return every impact of some worlds during a segment (a time interval of constant commands).
+    """Return every impact in some worlds during a segment (a time interval with constant commands).
 
-    ``ImpactRows.world`` in the result is the index of a world in the whole batch ``before``.
+    In the result, ``ImpactRows.world`` is the index of the impact's world in ``before``.
 
     Args:
         before: n worlds at the start of the segment.
-        command_mps2: constant commands, [n, N] m/s2.
+        command_mps2: the vehicles' commands during the segment, [n, N] m/s2.
         until_s: end of the segment in each world, [n] s.
         rows: indices of the worlds to simulate, [k].
 

@@ -1,4 +1,4 @@
-"""Measures of injury: the expected number of injuries if the same impacts happened in 1,000 lines of vehicles."""
+"""Measures of injury: how many injuries would be expected if the same impacts happened in 1,000 lines of vehicles."""
 
 from __future__ import annotations
 

@@ -2,15 +2,15 @@
 
 A measure is computed either from each step or from all impacts of an episode:
 
-=======  ==================  ==========================================  ===================================
-``by``   computed from       amount that a reward counts in a step       number that an evaluation shows
-=======  ==================  ==========================================  ===================================
+=======  ==================  ==========================================  ====================================
+``by``   computed from       value of the reward term in a step          number that an evaluation shows
+=======  ==================  ==========================================  ====================================
 step     ``StepOutcome``     value of the measure in the step            sum of the values over the episode
-impacts  ``EpisodeImpacts``  change of the value by impacts of the step  value for all impacts
-=======  ==================  ==========================================  ===================================
+impacts  ``EpisodeImpacts``  change of the measure during the step       value for all impacts of the episode
+=======  ==================  ==========================================  ====================================
 
-The amounts that a reward counts in an episode add up to the number that an evaluation shows, minus the value of the
-measure before the first decision.
+The sum of a reward term over an episode equals the number that an evaluation shows, minus the value that the measure
+already had before the first decision.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ MeasureFunction = Callable[[Any], Any]  # maps a ``StepOutcome`` or ``EpisodeImp
 
 @dataclass(frozen=True, slots=True)
 class NamedMeasure:
-    """A measure that evaluations can show, and that rewards can use as a term, under its name."""
+    """A measure, with its name, unit and function. Evaluations can show it, and rewards can use it as a term."""
 
     name: str  # name of the measure, and key of its weight in a reward
     meaning: str  # what it measures, in words
@@ -52,7 +52,7 @@ class NamedMeasure:
     def built_in(self, step: StepOutcome, params: Any) -> Floats:
         """Return the value of a built-in measure in one step, [n] or [n, N].
 
-        ``params``: the reward; its fields named in ``settings`` are passed to the measure's function.
+        ``params`` is the reward. The measure's function gets the fields of ``params`` that ``settings`` names.
         """
         assert self.function is not None
         value: Floats = self.function(step, *(getattr(params, name) for name in self.settings))
@@ -61,13 +61,14 @@ class NamedMeasure:
     def of(self, given: StepOutcome | EpisodeImpacts, counts: Bools | None = None, steps: Ints | None = None) -> Any:
         """Return the value of a registered measure: [n] for one number per world, [n, N] for one number per vehicle.
 
-        Raises ``InvalidInput`` naming the measure, world, vehicle and step if a value is not finite, and for a result
-        of the wrong shape or type.
+        Raises ``InvalidInput``, which names the measure, if a value is not finite or the result has a wrong shape or
+        type.
 
         Args:
-            given: a step, or the impacts of an episode, from which the measure is computed.
-            counts: worlds whose values are used, a mask [n]; the value is 0 in all others. None: all worlds.
-            steps: number of steps that each world has made, [n], for error messages.
+            given: the data from which the measure is computed: a step, or the impacts of an episode.
+            counts: whether to use the value in each world, a mask [n]; the result is 0 where ``counts`` is False. None:
+                use the value in all worlds.
+            steps: number of steps that each episode has taken, [n], for error messages.
 
         """
         if isinstance(given, StepOutcome):
@@ -89,10 +90,10 @@ class NamedMeasure:
         return value
 
     def _numbers(self, given: StepOutcome | EpisodeImpacts, what: str) -> Any:
-        """Call the measure's function and return its result, [n] or [n, N]; raise ``InvalidInput`` if it is unusable.
+        """Call the measure's function; return the result, [n] or [n, N], or raise ``InvalidInput`` if it is unusable.
 
-        Numbers are converted to float64; truth values are not converted if ``by`` is ``"impacts"``. Values per learner
-        are completed with 0 for the other vehicles. ``what``: how error messages name the measure.
+        The result is converted to float64, except truth values of a measure with ``by="impacts"``. If the function
+        returns one number per learner, vehicles that do not learn get the number 0. Error messages begin with ``what``.
         """
         assert self.function is not None
         learners = given.learners if isinstance(given, StepOutcome) else None
@@ -120,10 +121,10 @@ class NamedMeasure:
         return whole
 
     def change(self, before: EpisodeImpacts, after: EpisodeImpacts, steps: Ints) -> Floats:
-        """Return how much the value of this measure (``by="impacts"``) has changed, [n] or [n, N].
+        """Return how much the value of this measure has changed during a step, [n] or [n, N]; ``by`` is ``"impacts"``.
 
-        ``before`` and ``after``: impacts of the same episodes up to an earlier and a later time. ``steps``: number of
-        steps so far, [n], for error messages.
+        ``before``: impacts of the episodes up to the beginning of the step. ``after``: impacts of the same episodes up
+        to the end of the step. ``steps``: number of steps that each episode has taken, [n], for error messages.
         """
         if len(before.rows.world) == len(after.rows.world):
             return np.zeros(after.worlds.speeds_mps.shape[: 2 if self.form.endswith("vehicle") else 1])
@@ -135,22 +136,24 @@ def register_measure(name: str, function: MeasureFunction, *, unit: str = "1", b
 
     An installed package registers a measure with an entry point of the group ``ethbrake_marl.measures``. The entry
     point names the function, a ``Part`` that contains it, or a mapping from names to functions or parts. Evaluations
-    show it only on request.
+    show a measure from an entry point only on request.
 
     Registering the same measure again changes nothing. Raises ``AlreadyExists`` if the name belongs to another measure,
     and ``InvalidInput`` for invalid arguments, or if the function, called for two test worlds, fails or returns a wrong
-    shape or a number that is not finite.
+    shape or number.
 
     Args:
-        name: name of the measure, 1 to 64 characters ``a-z``, ``0-9`` and ``_``, beginning with a letter. It must not
-            end in ``_interval``, ``_low``, ``_high``, or ``_`` and a number. It is the key of the weight in a reward,
-            ``metric_NAME`` in results, and ``reward_NAME`` in the infos of a step.
-        function: function of an ``EpisodeImpacts`` (``by="impacts"``) or a ``StepOutcome`` (``by="step"``). It returns
-            one number per world [n] or per vehicle [n, N]; with ``by="step"`` also one per learner [n, L]. It must work
-            for any number of vehicles. Its docstring describes the measure. If a measure with ``by="impacts"`` returns
-            truth values, evaluations show the share of worlds or vehicles with the value True.
-        unit: unit of the numbers.
-        by: what the measure is computed from: ``impacts`` or ``step``.
+        name: name of the measure, 1 to 64 characters ``a-z``, ``0-9`` and ``_``, beginning with a letter. The name must
+            not end in ``_interval``, ``_low``, ``_high``, or ``_`` and a number. The measure appears under NAME in a
+            reward, as ``metric_NAME`` in results, and as ``reward_NAME`` in the infos of a step.
+        function: function of one argument: an ``EpisodeImpacts`` (``by="impacts"``) or a ``StepOutcome``
+            (``by="step"``). The function returns one number per world, [n], or per vehicle, [n, N]; with ``by="step"``
+            it may also return one number per learner, [n, L]. The function must work for any number of vehicles. The
+            docstring of the function describes the measure. If a function with ``by="impacts"`` returns truth values,
+            evaluations show the share of worlds (or vehicles) with the value True.
+        unit: unit of the numbers that the function returns.
+        by: ``impacts``: the measure is computed from all impacts of an episode; ``step``: it is computed from each
+            step.
 
     """
     _add(name, function, unit=unit, by=by)
@@ -158,7 +161,7 @@ def register_measure(name: str, function: MeasureFunction, *, unit: str = "1", b
 
 
 def _add(name: str, function: MeasureFunction, *, unit: str = "1", by: By = "impacts") -> None:
-    """Add a measure that evaluations show on request only. The arguments are those of ``register_measure``."""
+    """Register a measure that evaluations show only on request; for the arguments, see ``register_measure``."""
     if not isinstance(name, str) or _NAME.fullmatch(name) is None:
         raise InvalidInput(
             f"measure {name!r:.80}: the name must be 1 to 64 characters a-z, 0-9 and _, and must begin with a letter;"
@@ -182,7 +185,7 @@ def _form(value: Any) -> str:
 
 
 def _some_impacts() -> EpisodeImpacts:
-    """Return the impacts of two test worlds of three vehicles; world 0 has an impact of its second pair."""
+    """Return the impacts in two test worlds of three vehicles: one impact, of Vehicles 2 and 3 in world 0."""
     worlds = make_worlds(
         [[8.0, 6.0], [3.0, 21.0]],
         [[20.0, 18.0, 22.0], [9.0, 13.0, 11.0]],
@@ -197,7 +200,7 @@ def _some_impacts() -> EpisodeImpacts:
 
 
 def _a_step() -> StepOutcome:
-    """Return a step of the two test worlds of ``_some_impacts``, in which Vehicles 2 and 3 learn."""
+    """Return the result of a step in the two test worlds of ``_some_impacts``, in which Vehicles 2 and 3 learn."""
     w = _some_impacts().worlds
     v, command = w.vehicles, np.array([[-6.0, 0.0, 1.5], [-6.0, -7.0, -2.5]])
     return StepOutcome(

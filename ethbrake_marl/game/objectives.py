@@ -1,7 +1,7 @@
 """Objectives: the amount that each vehicle should minimise, computed from the harm in a ledger.
 
-In these formulas ``H_i`` is the harm that vehicle i bears (m2/s2), ``H`` the harm of all N vehicles, and ``m_i`` the
-mass of vehicle i. All amounts are in m2/s2, except the injuries:
+In this table, ``H_i`` is the harm that vehicle i bears (m2/s2), ``H`` the harm of all N vehicles, and ``m_i`` the mass
+of vehicle i. The amounts are in m2/s2, except for the objective ``injury``:
 
 ==================  ================================================================================================
 objective           amount for vehicle i
@@ -15,8 +15,8 @@ mass-weighted       ``N sum_j m_j H_j / sum_j m_j``: the harm of a heavy vehicle
 weighted:w1,w2,...  ``N sum_j w_j H_j / sum_j w_j`` with one weight per vehicle (0, or 1e-6 to 1e6), for example its
                     number of occupants
 preference          the formula of ``weighted``, with the weights ``harm_weight`` that the scenario declares
-injury:curve        expected injuries in 1,000 lines; a vehicle's injury risk is the larger one of the risks by impacts
-                    at its front and at its rear (``Ledger.speed_changes``)
+injury:curve        expected injuries in 1,000 lines; a vehicle's injury risk is the risk by impacts at its front or the
+                    risk by impacts at its rear, whichever is larger (``Ledger.speed_changes``)
 ==================  ================================================================================================
 """
 
@@ -46,7 +46,7 @@ Declared = str | tuple[str, ...]  # one objective for all vehicles, or one per v
 
 
 class Objective(NamedTuple):
-    """An objective parsed from a text such as ``social:45``; see ``parse_objective``."""
+    """An objective, parsed by ``parse_objective`` from a text such as ``social:45``."""
 
     kind: str  # name before the colon, such as ``social``
     angle_deg: float = 0.0  # angle phi of the objective ``social`` (degrees)
@@ -55,7 +55,7 @@ class Objective(NamedTuple):
 
 
 class HarmSoFar(NamedTuple):
-    """Read-only input of an objective: harm, masses, changes of speed and weights in n worlds of N vehicles."""
+    """Data from which an objective computes its amount, in n worlds of N vehicles since the start of the episode."""
 
     borne: Floats  # [n, N] harm that each vehicle bears, m2/s2
     whole: Floats  # [n] harm of all vehicles, m2/s2
@@ -66,7 +66,7 @@ class HarmSoFar(NamedTuple):
 
 
 class Weighed(Protocol):
-    """Data on the vehicles of n worlds from which an objective may compute weights: a ``Ledger`` or ``Vehicles``."""
+    """Data from which an objective can compute the weights of the vehicles' harm: a ``Ledger`` or ``Vehicles``."""
 
     @property
     def mass_t(self) -> Floats:
@@ -81,7 +81,7 @@ ObjectiveFunction = Callable[[HarmSoFar, int], Floats]
 
 
 class Kind(NamedTuple):
-    """A kind of objective, built in or registered. The module docstring has a table of the built-in kinds."""
+    """A kind of objective, built in or registered; the docstring of this module lists the built-in kinds."""
 
     form: str  # how a scenario writes the objective, such as ``social:ANGLE``; without ":" it takes no argument
     about: str  # meaning of the objective, in words
@@ -124,7 +124,7 @@ def parse_objective(text: str) -> Objective:
 def check_declared(declared: object) -> None:
     """Raise ``InvalidInput`` unless ``declared`` is the text of an objective, such as ``own``, or a list of such texts.
 
-    The length of the list is not checked.
+    The function does not check whether the list has one text per vehicle.
     """
     each = [declared] if isinstance(declared, str) else declared
     if not isinstance(each, list | tuple) or not all(isinstance(text, str) for text in each):
@@ -139,8 +139,8 @@ def check_declared(declared: object) -> None:
 def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
     """Return the parsed objective of each vehicle, front to rear.
 
-    Raises ``InvalidInput`` for an invalid objective, or a wrong number of objectives or weights. ``declared``: the text
-    of one objective for all vehicles, or one text per vehicle. ``vehicles``: number of vehicles.
+    ``declared``: the text of one objective for all vehicles, or one text per vehicle. ``vehicles``: number of vehicles.
+    Raises ``InvalidInput`` for an invalid objective, or if the number of texts or of weights is not ``vehicles``.
     """
     check_declared(declared)
     each = (declared,) * vehicles if isinstance(declared, str) else tuple(declared)
@@ -158,14 +158,14 @@ def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
 
 
 def objective_harm(ledger: Ledger, harm_count: HarmCount, objectives: Sequence[Objective]) -> Floats:
-    """Return the amount that each vehicle should minimise, for the harm so far, [n, N].
+    """Return the amount that each vehicle should minimise, computed from the harm so far, [n, N].
 
     The unit is m2/s2, or injuries in 1,000 lines for the objective ``injury``.
 
     Args:
         ledger: harm in n worlds since the start of the episode.
-        harm_count: ``"first"``: first-impact harm; ``"total"``: total harm.
-        objectives: objective of each of the N vehicles.
+        harm_count: ``"first"``: use first-impact harm; ``"total"``: use total harm.
+        objectives: objective of each of the N vehicles, front to rear.
 
     """
     harms = ledger.vehicle_harm(harm_count), ledger.world_harm(harm_count)
@@ -178,16 +178,16 @@ def objective_harm(ledger: Ledger, harm_count: HarmCount, objectives: Sequence[O
 
 
 def added_harm(before: Ledger, after: Ledger, harm_count: HarmCount, objectives: Sequence[Objective]) -> Floats:
-    """Return the change during a step of the amount that each vehicle should minimise, [n, N].
+    """Return how much a step changes the amount that each vehicle should minimise, [n, N].
 
-    For an objective that is a weighted sum of the vehicles' harm, the change is the weighted sum of their harm in the
-    step. For any other objective the change is the amount after the step minus the amount before the step.
+    For an objective that is a weighted sum of the vehicles' harms, the change is the weighted sum of the harms in this
+    step. For any other objective, the change is the amount after the step minus the amount before the step.
 
     Args:
-        before: harm before the step.
-        after: harm after the step.
-        harm_count: ``"first"``: first-impact harm; ``"total"``: total harm.
-        objectives: objective of each of the N vehicles.
+        before: harm from the start of the episode to the beginning of the step.
+        after: harm from the start of the episode to the end of the step.
+        harm_count: ``"first"``: use first-impact harm; ``"total"``: use total harm.
+        objectives: objective of each of the N vehicles, front to rear.
 
     """
     sums = [OBJECTIVES[each.kind].weights is not None for each in objectives]
@@ -199,14 +199,16 @@ def added_harm(before: Ledger, after: Ledger, harm_count: HarmCount, objectives:
 
 
 def aim_of(objective: Objective, line: Weighed, vehicle: int) -> tuple[Floats, bool]:
-    """Return the weights of the vehicles' harm in an objective, [n, N], and whether the objective is a maximum.
+    """Return the weight of each vehicle's harm in an objective, [n, N], and how the weighted harms are combined.
+
+    The second result is False if the objective is the sum of the weighted harms, and True if it is the largest of them.
 
     Args:
         objective: the objective.
-        line: ``Vehicles`` or ledger of n worlds of N vehicles.
+        line: masses and weights of the vehicles in n worlds: a ``Vehicles`` or a ``Ledger``.
         vehicle: index of the vehicle that has this objective (0 = front).
 
-    Raises ``InvalidInput`` for an objective that is neither a weighted sum nor a maximum, such as ``injury``.
+    Raises ``InvalidInput`` for an objective that is neither such a sum nor such a maximum, for example ``injury``.
 
     """
     weights = OBJECTIVES[objective.kind].weights
@@ -221,7 +223,7 @@ def aim_of(objective: Objective, line: Weighed, vehicle: int) -> tuple[Floats, b
 
 
 def standard_objectives() -> tuple[str, ...]:
-    """Return the names of the objectives that every scenario can use: built-in ones, and loaded registered ones."""
+    """Return the names of the objectives that every scenario can use, including registered ones that are loaded."""
     return (*STANDARD, *(name for name, kind in OBJECTIVES.loaded.items() if kind.function is not None))
 
 
@@ -231,14 +233,15 @@ def register_objective(name: str, function: ObjectiveFunction) -> None:
     An installed package registers an objective with an entry point of the group ``ethbrake_marl.objectives`` that names
     the function.
 
-    Registering the same function again changes nothing. Raises ``AlreadyExists`` if the name belongs to another
-    objective, and ``InvalidInput`` for an invalid name or a function without a docstring.
+    Registering the same function again under the same name changes nothing. Raises ``AlreadyExists`` if the name
+    belongs to another objective, and ``InvalidInput`` for an invalid name or a function without a docstring.
 
     Args:
-        name: name of the objective, 1 to 64 characters ``a-z``, ``0-9``, ``-``, ``_``; the first is a letter or digit.
-        function: ``function(harm, vehicle)`` returns the amount that this vehicle should minimise, [n] m2/s2. ``harm``
-            is a ``HarmSoFar``; ``vehicle`` is an index, 0 for the front vehicle. The function's docstring describes the
-            objective.
+        name: name of the objective, 1 to 64 characters ``a-z``, ``0-9``, ``-`` and ``_``, beginning with a letter or
+            digit.
+        function: ``function(harm, vehicle)`` returns the amount that vehicle number ``vehicle`` (0 = front) should
+            minimise, [n] m2/s2. ``harm`` is a ``HarmSoFar``. The docstring of ``function`` is shown as the description
+            of the objective.
 
     """
     if not isinstance(name, str) or _NAME.fullmatch(name) is None:
@@ -275,18 +278,18 @@ def register_objective(name: str, function: ObjectiveFunction) -> None:
 
 
 def scored(ledger: Ledger, harm_count: HarmCount, declared: Sequence[Declared] | None = None) -> dict[str, Floats]:
-    """Return the amounts of several objectives for the same harm: ``{"own": [n, N], ...}``, one per vehicle.
+    """Return each vehicle's amount under several objectives, computed from the same harm: ``{"own": [n, N], ...}``.
 
     With this function a policy can be evaluated under objectives for which it was not trained. Amounts are in m2/s2, or
     injuries in 1,000 lines for the objective ``injury``; less is better.
 
     Args:
         ledger: harm in n worlds since the start of the episode.
-        harm_count: ``"first"``: first-impact harm; ``"total"``: total harm.
-        declared: list of objectives; each entry is one text for all vehicles, or a tuple with one text per vehicle.
-            None: ``standard_objectives``.
+        harm_count: ``"first"``: use first-impact harm; ``"total"``: use total harm.
+        declared: list of objectives. Each item is the text of one objective for all vehicles, or a tuple with one text
+            per vehicle. None: the objectives that ``standard_objectives`` returns.
 
-    Raises ``InvalidInput`` for a single name instead of a list.
+    Raises ``InvalidInput`` if ``declared`` is a single text instead of a list.
 
     """
     if isinstance(declared, str):
@@ -310,10 +313,10 @@ def _social(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
 
 @lru_cache
 def _social_weights(angle_deg: float) -> tuple[float, float]:
-    """Return the weights of own harm and of others' harm: cosine and sine of the angle, exactly 0 and 1 at 90 degrees.
+    """Return the weight of own harm, cos(angle), and the weight of the other vehicles' harm, sin(angle).
 
-    The power series are summed in exact fractions and rounded once. Results of the C library would differ between
-    processors in the last bits.
+    At 90 degrees the weights are exactly 0 and 1. The power series of cosine and sine are summed in exact fractions and
+    rounded once, because results of the C library differ between processors in the last bits.
     """
     if angle_deg == 90.0:
         return 0.0, 1.0
@@ -327,9 +330,9 @@ def _social_weights(angle_deg: float) -> tuple[float, float]:
 def _injured(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
     """Return the expected injuries in 1,000 lines, [n], summed over the vehicles; the same for every ``vehicle``.
 
-    For a vehicle that is hit at both sides, the larger of the two risks counts. The risk depends on the side, so the
-    larger change of speed may have the smaller risk. If only the risk of the larger change counted, a further impact
-    could lower the number of injuries.
+    For a vehicle that is hit at its front and at its rear, the larger of the two injury risks is used. The same change
+    of speed has different risks at front and rear. If the risk of the larger change of speed were used instead, a
+    further impact could lower the number of injuries.
     """
     del vehicle
     front, rear = harm.front_change_mps, harm.rear_change_mps
@@ -342,9 +345,9 @@ def _injured(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
 
 
 def weighted_harm(borne: Floats, weights: Floats) -> Floats:
-    """Return ``N sum_j w_j H_j / sum_j w_j``, [n] m2/s2. The order of the sums is fixed: front to rear.
+    """Return ``N (sum_j w_j H_j) / (sum_j w_j)``, [n] m2/s2. Both sums run over the vehicles from front to rear.
 
-    ``borne``: harm H_j that each vehicle bears, [n, N] m2/s2. ``weights``: weight w_j of each vehicle, [n, N].
+    ``borne``: harm H_j that each vehicle j bears, [n, N] m2/s2. ``weights``: weight w_j of each vehicle j, [n, N].
     """
     n, vehicles = borne.shape
     harm, whole = np.zeros(n), np.zeros(n)
@@ -356,7 +359,7 @@ def weighted_harm(borne: Floats, weights: Floats) -> Floats:
 
 
 def _shares(weights: Floats) -> Floats:
-    """Return ``weights`` [n, N] divided by their mean over the vehicles."""
+    """Return ``weights`` [n, N], each divided by the mean weight of the vehicles in the same world."""
     shares: Floats = weights * (weights.shape[1] / weights.sum(axis=1, keepdims=True))
     return shares
 

@@ -46,10 +46,11 @@ from ethbrake_marl.physics.state import Floats, Ints, Worlds
 
 @dataclass(frozen=True, slots=True)
 class ObservationSpec:
-    """The features that a vehicle observes: its own, those of neighbours, and optionally place, obstacle and contacts.
+    """Specification of the features that a vehicle observes.
 
-    If ``chosen`` is given, the observation has exactly these features in this order. Use ``choose_observation`` to make
-    such a specification.
+    A vehicle observes its own features, features of neighbours and, optionally, its place in the line, the obstacle and
+    forecast impacts. If ``chosen`` is not empty, it lists exactly the observed features, in order; to make such a
+    specification, use ``choose_observation``.
 
     >>> import ethbrake_marl as eb
     >>> spec = eb.ObservationSpec(front=2, rear=0)
@@ -91,22 +92,22 @@ class ObservationSpec:
 
     @property
     def sides(self) -> tuple[tuple[str, int], ...]:
-        """Observed neighbours as (prefix, offset): ``("front_1", -1)`` is the next vehicle ahead.
+        """Observed neighbours as pairs (prefix, offset): ``("front_1", -1)`` is the next vehicle ahead.
 
-        Neighbours ahead come before neighbours behind, nearest first. The offset is the neighbour's index in the line
-        minus the observer's index.
+        The offset is the neighbour's index in the line minus the observer's index. Neighbours ahead are listed before
+        neighbours behind, the nearest first.
         """
         fronts = tuple((f"front_{k}", -k) for k in range(1, self.front + 1))
         return fronts + tuple((f"rear_{k}", k) for k in range(1, self.rear + 1))
 
     @property
     def features(self) -> tuple[Feature, ...]:
-        """All features of the observation, in order. No name (``own.speed``, ``front_1.gap``) occurs twice."""
+        """All features of the observation, in order; each has a different name, such as ``front_1.gap``."""
         return tuple(feature_named(name) for name in self.chosen) or self.whole
 
     @property
     def whole(self) -> tuple[Feature, ...]:
-        """All features of every built-in group from which the observation has at least one feature, in order."""
+        """All features of the built-in groups from which the features of the observation are selected, in order."""
         groups = [("own", GROUPS.own), *((prefix, GROUPS.neighbour) for prefix, _ in self.sides)]
         groups += [("role", GROUPS.role)] if self.role else []
         groups += [("obstacle", GROUPS.obstacle)] if self.obstacle else []
@@ -116,25 +117,25 @@ class ObservationSpec:
 
     @property
     def far(self) -> bool:
-        """Whether the observation has features of GROUPS.contact_far (forecast impacts that are late or hard)."""
+        """Whether the observation has features of ``GROUPS.contact_far``: forecasts of late or hard impacts."""
         return any(name.startswith("contact_far.") for name in self.chosen)
 
     @property
     def size(self) -> int:
-        """Number of features, F."""
+        """Number of features of the observation, F."""
         return len(self.features)
 
     @property
     def plan(self) -> Plan:
-        """The ``Plan`` that computes this observation from worlds.
+        """The ``Plan`` object that computes this observation from worlds.
 
-        The plan is cached and must not be changed. Raises ``InvalidInput`` for contact features if ``time_step_s`` is
-        None.
+        The object is cached, so do not change it. Raises ``InvalidInput`` if the observation has contact features and
+        ``time_step_s`` is None.
         """
         return _plan(self, tuple(registered_in(self.chosen).items()) if self.chosen else ())
 
     def at_steps_of(self, time_step_s: float) -> ObservationSpec:
-        """Return the specification with this ``time_step_s`` (s) if it has contact features and no time step yet."""
+        """Return a copy with this ``time_step_s`` (s), if the specification needs a time step and has none so far."""
         return replace(self, time_step_s=time_step_s) if self.contact and self.time_step_s is None else self
 
 
@@ -143,11 +144,12 @@ Observation = ObservationSpec | Sequence[str] | Mapping[str, Any]
 
 
 def choose_observation(listed: Observation, time_step_s: float | None = None) -> ObservationSpec:
-    """Return the observation for a list of groups and features, such as ``["own", "front_1", "rear_1.gap"]``.
+    """Return the specification of an observation with the listed features.
 
-    ``listed`` may also be a mapping with the fields of an ``ObservationSpec``, or an ``ObservationSpec``.
-    ``time_step_s``: time between two decisions (s), needed only for contact features outside an environment. Raises
-    ``UnknownName`` with a suggestion for an unknown name, and ``InvalidInput`` for an invalid list.
+    ``listed`` is a list of groups and features, such as ``["own", "front_1", "rear_1.gap"]``, a mapping with the fields
+    of an ``ObservationSpec``, or an ``ObservationSpec``. ``time_step_s`` is the time between two decisions (s); give it
+    if you use contact features outside an environment. Raises ``UnknownName`` with a suggestion for an unknown name,
+    and ``InvalidInput`` for an invalid list.
     """
     if isinstance(listed, ObservationSpec):
         spec = listed
@@ -170,7 +172,7 @@ def choose_observation(listed: Observation, time_step_s: float | None = None) ->
 
 
 def _reach(names: Sequence[str]) -> tuple[int, int, bool, bool, bool]:
-    """Return the fields (front, rear, role, obstacle, contact) of a specification that has the features ``names``."""
+    """Return the fields front, rear, role, obstacle and contact that fit an observation of the features ``names``."""
     sides = [side for name in names if (side := side_of(name)) is not None]
     front, rear = (max((k for at, k in sides if at == wanted), default=0) for wanted in ("front", "rear"))
     groups = {name.partition(".")[0] for name in names}
@@ -185,9 +187,9 @@ _ROLE, _OBSTACLE = len(GROUPS.role), len(GROUPS.obstacle)
 
 
 def observe(worlds: Worlds, vehicle: int, spec: ObservationSpec) -> Observations:
-    """Return the observation of ``vehicle`` (0 = front) in every world, a new array [n, F] float32.
+    """Return the observation of ``vehicle`` (index, 0 = front) in every world, a new array [n, F] float32.
 
-    ``spec``: the F features to observe. Raises ``InvalidInput`` if no vehicle has this index.
+    ``spec`` specifies the F features to observe. Raises ``InvalidInput`` if no vehicle has the index ``vehicle``.
     """
     if not 0 <= vehicle < worlds.N:
         raise InvalidInput(f"observe: vehicle = {vehicle}: must be an index from 0 to {worlds.N - 1}")
@@ -196,7 +198,7 @@ def observe(worlds: Worlds, vehicle: int, spec: ObservationSpec) -> Observations
 
 
 class Scaling(NamedTuple):
-    """Arguments of the kernel that computes all groups of features except the contact features."""
+    """Arguments of ``_observe_rows``, which computes all built-in groups of features except the contact features."""
 
     offsets: Ints  # index of each observed neighbour minus index of the observer; -1 is the next vehicle ahead
     role: bool  # whether the place in the line is observed
@@ -205,7 +207,7 @@ class Scaling(NamedTuple):
 
 
 class Extra(NamedTuple):
-    """A registered feature in an observation, computed by its own function."""
+    """A feature of an observation that is computed by its own function, and not with a built-in group of features."""
 
     column: int  # column of the feature in the observation
     entry: RegisteredFeature  # the feature and its function
@@ -213,9 +215,9 @@ class Extra(NamedTuple):
     known: int  # column of the neighbour's feature ``known`` among the built-in features
 
     def known_in(self, worlds: Worlds, vehicle: int, neighbour: int) -> NDArray[np.bool_]:
-        """Return whether ``vehicle`` knows all data of the neighbour that the feature reads, in each world, [n].
+        """Return whether ``vehicle`` knows all data of ``neighbour`` that the feature reads, in each world, [n].
 
-        Raises ``InvalidInput`` if messages lack some data and the feature was registered without ``reads``.
+        Raises ``InvalidInput`` if messages leave out some data and the feature was registered without ``reads``.
         """
         messages, reads = Messages.of(worlds), self.entry.reads
         if not messages.says_contents:
@@ -233,7 +235,7 @@ class Extra(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """Everything needed to compute an observation: arguments of the kernels, and the registered features."""
+    """All data needed to compute an observation: arguments of compiled functions, and the registered features."""
 
     scaling: Scaling  # arguments for the built-in features except the contact features
     contacts: Contacts | None  # arguments for the contact features, which follow all other groups; None: none observed
@@ -243,14 +245,14 @@ class Plan(NamedTuple):
     def observe(self, state: Floats, params: Floats, vehicles: Ints, steps: Floats | None = None) -> Observations:
         """Return the observations of several vehicles, [n, len(vehicles), F] float32.
 
-        With periodic messages, a vehicle observes its own estimate of the worlds (``physics.estimates``). Raises
-        ``PhysicsError`` with the worlds in which a forecast of contacts failed.
+        If vehicles send periodic messages, a vehicle observes its own estimate of each world (``physics.estimates``).
+        Raises ``PhysicsError``, which lists the worlds in which a forecast of impacts failed.
 
         Args:
-            state: state rows of the worlds, [n, S], in the layout of ``physics.columns``.
-            params: parameter rows of the worlds, in the same layout.
-            vehicles: indices of the observing vehicles, from 0.
-            steps: number of steps so far, [n], for error messages.
+            state: time, motion and harm of the worlds, one row per world, [n, S] (layout: ``physics.columns``).
+            params: parameters of the vehicles, one row per world (layout: ``physics.columns``).
+            vehicles: indices of the observing vehicles (0 = front).
+            steps: number of steps that each episode has taken, [n], for error messages.
 
         """
         packed = Packed(state, params)
@@ -269,7 +271,7 @@ class Plan(NamedTuple):
     def _observe_present(
         self, state: Floats, params: Floats, vehicles: Ints, steps: Floats | None, *, says: bool = False
     ) -> Observations:
-        """Return the observations, [n, len(vehicles), F], for a channel that makes present states known.
+        """Return the observations, [n, len(vehicles), F], of vehicles that know the present states in ``state``.
 
         ``says``: whether the scenario restricts what messages contain (``v2x: tells``).
         """
@@ -335,7 +337,7 @@ def _plan(spec: ObservationSpec, registered: tuple[tuple[str, RegisteredFeature]
 
 
 def _scales(features: Sequence[Feature]) -> Floats:
-    """Return the scaling of features, [3, F]: rows 1 / scale, low and high, one column per feature."""
+    """Return the scaling of the features, [3, F]: the rows 1 / scale, low and high, with one column per feature."""
     return np.array([[1.0 / f.scale for f in features], [f.low for f in features], [f.high for f in features]])
 
 
@@ -344,19 +346,19 @@ def _observe_rows(
     state: Floats, params: Floats, observers: Ints, offsets: Ints, role: bool, with_obstacle: bool, features: Floats,
     out: Observations,
 ) -> None:  # fmt: skip
-    """Write the features of each observer into ``out``, in the order of ``GROUPS``.
+    """Write the features that each observer observes into ``out``, group by group.
 
-    This is one long loop because smaller functions that receive these arrays made it four times slower.
+    The function is one long loop, because it was four times slower when the loop called smaller functions.
 
     Args:
-        state: state rows of the worlds, [n, S], in the layout of ``physics.columns``.
-        params: parameter rows of the worlds, in the same layout.
-        observers: indices of the observing vehicles.
+        state: time, motion and harm of the worlds, one row per world, [n, S] (layout: ``physics.columns``).
+        params: parameters of the vehicles, one row per world (layout: ``physics.columns``).
+        observers: indices of the observing vehicles (0 = front).
         offsets: index of each observed neighbour minus index of the observer; -1 is the next vehicle ahead.
-        role: whether the observer's place in the line is observed.
-        with_obstacle: whether the obstacle ahead is observed.
-        features: scaling of the features, [3, F]: rows 1 / scale, low and high, one column per feature.
-        out: result, [n, observers, F].
+        role: whether vehicles observe their own place in the line (``GROUPS.role``).
+        with_obstacle: whether vehicles observe the obstacle ahead (``GROUPS.obstacle``).
+        features: scaling of the features, [3, F]: the rows 1 / scale, low and high, with one column per feature.
+        out: array that receives the result, [n, observers, F].
 
     """
     of = columns(state)
@@ -430,10 +432,10 @@ def _observe_rows(
 def _hide_untold(
     state: Floats, params: Floats, observers: Ints, offsets: Ints, role: bool, with_obstacle: bool, out: Observations
 ) -> None:
-    """Set those features in ``out`` to 0 that need data of a neighbour which the observer does not know.
+    """Set the features in ``out`` to 0 for which the observer lacks data that messages do not contain.
 
     If the observer knows no data of a neighbour, all features of this neighbour become 0. An observer knows the
-    obstacle if it knows the place of Vehicle 1.
+    obstacle only if it knows the place of Vehicle 1.
     """
     of = columns(state)
     N, knows = of.vehicles, np.zeros(len(PIECES), np.bool_)
@@ -460,15 +462,16 @@ def _hide_untold(
 
 @compiled
 def _fitting_deceleration(speed: float, latency_left: float, room: float) -> float:
-    """Return the constant deceleration (m/s2) with which a vehicle stops in a distance: ``v^2 / (2 (room - v tau))``.
+    """Return the deceleration (m/s2) with which a vehicle stops after the distance ``room``: ``v^2 / (2 b)``.
 
-    A braking distance ``room - v tau`` below 1 mm counts as 1 mm. The result is then at least 20 m/s2, the upper bound
-    of the feature, for speeds of 0.2 m/s and more; at rest it is 0.
+    Here ``b = room - v tau`` is the distance that is left when the vehicle begins to brake. If b is below 1 mm, 1 mm is
+    used instead. In this case the result is at least 20 m/s2, the largest value that is observed, unless the speed is
+    below 0.2 m/s. For a vehicle at rest the result is 0.
 
     Args:
         speed: present speed v of the vehicle, m/s.
         latency_left: time tau until the vehicle's brakes act, s.
-        room: distance in which the vehicle must stop, m.
+        room: distance after which the vehicle must stop, m.
 
     """
     speed = max(speed, 0.0)

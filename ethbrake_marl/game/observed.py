@@ -12,9 +12,9 @@ from ethbrake_marl.game.observations import Observation, ObservationSpec, choose
 def observation_for(scenario: Game, vehicle: str | None = None) -> ObservationSpec:
     """Return the observation that the scenario declares for ``vehicle``, such as ``"vehicle_2"``.
 
-    If ``vehicle`` is None, return the observation that all learners share, or raise ``InvalidInput`` naming two
-    learners whose observations differ. If the scenario declares no observation, a vehicle observes one neighbour on
-    each side, and, in a scenario with an obstacle, also its own place in the line and the obstacle.
+    If ``vehicle`` is None, return the observation that all learners share, or raise ``InvalidInput`` if learners
+    observe different features. If the scenario declares no observation, a vehicle observes itself and one neighbour on
+    each side; in a scenario with an obstacle, it also observes its own place in the line and the obstacle.
     """
     observations = observations_of(scenario)
     if vehicle is None:
@@ -30,9 +30,9 @@ def observations_of(scenario: Game, given: Observation | None = None) -> tuple[O
     Raises ``UnknownName`` for an unknown vehicle, and the same errors as ``choose_observation``.
 
     Args:
-        scenario: the game, which declares observations.
-        given: observation that replaces the scenario's: one for all vehicles, or a mapping for some vehicles, such as
-            ``{"vehicle_2": ["own", "front_1"]}``; None: use the scenario's observations.
+        scenario: the scenario, which may declare observations.
+        given: observations that replace the observations of the scenario: one observation for all vehicles, or a
+            mapping for some vehicles, such as ``{"vehicle_2": ["own", "front_1"]}``. None: nothing is replaced.
 
     """
     names, step_s, said = scenario.vehicle_names, scenario.time_step_s, scenario.observation
@@ -53,10 +53,10 @@ def observations_of(scenario: Game, given: Observation | None = None) -> tuple[O
 
 
 def common_observation(observations: tuple[ObservationSpec, ...], scenario: Game) -> ObservationSpec:
-    """Return the observation that all learners share, or, if there are no learners, that all vehicles share.
+    """Return the observation that all learners share; if there are no learners, the one that all vehicles share.
 
-    Raises ``InvalidInput`` naming two vehicles whose observations differ. ``observations``: observation of each
-    vehicle, front to rear.
+    Raises ``InvalidInput``, which names two vehicles, if their observations differ. ``observations``: observation of
+    each vehicle, front to rear.
     """
     first, *others = scenario.learners or range(scenario.vehicles)
     for other in others:

@@ -1,6 +1,6 @@
 """Vector rewards: a reward has several named components, such as the harm of each vehicle, instead of one number.
 
-The components can be chosen from this table, which shows the value of each component in one step:
+You can choose from these components. The table shows the value of each component in one step:
 
 ==========  ========================================================================================
 component   value
@@ -8,10 +8,10 @@ component   value
 harm_K      minus the harm that vehicle_K bears, m2/s2
 pair_J_K    minus the harm of the pair of vehicle_J and vehicle_K behind it, m2/s2
 obstacle    minus the harm of impacts of Vehicle 1 with an obstacle ahead, m2/s2
-term name   value, before weighting, of a term with a weight in the reward, for instance ``jerk``
+term name   value of a term of the reward before weighting, for instance ``jerk``
 ==========  ========================================================================================
 
-The setting ``harm_count`` of the reward selects first-impact harm or total harm.
+The reward's setting ``harm_count`` selects whether these harms are first-impact harm or total harm.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ def components_of(vector: RewardVector, params: RewardParams, vehicles: int) -> 
     """Return the names of the components of a vector reward.
 
     Args:
-        vector: ``vehicles``, or a list of different names of components.
-        params: the reward, whose terms may be components.
+        vector: ``vehicles`` (the harm of each vehicle), or a list of different names of components.
+        params: the reward, whose terms with a weight can be components.
         vehicles: number of vehicles in the line.
 
     Raises ``InvalidInput`` for an empty list or a repeated name, and ``UnknownName`` for an unknown name.
@@ -63,8 +63,8 @@ def vector_of(names: Sequence[str], harm: Ledger, harm_count: HarmCount, terms: 
     Args:
         names: names of the K components.
         harm: harm of the step in n worlds of N vehicles.
-        harm_count: ``"first"``: first-impact harm; ``"total"``: total harm.
-        terms: values of the reward's terms before weighting, by name, [n] or [n, N].
+        harm_count: ``"first"``: use first-impact harm; ``"total"``: use total harm.
+        terms: dictionary from the name of a reward term to its values before weighting, [n] or [n, N].
 
     """
     borne, pairs = harm.vehicle_harm(harm_count), harm.pair_harm(harm_count)

@@ -1,7 +1,7 @@
 """Rewards: a reward is a weighted sum of terms, each of which is a measure (``game.measures``).
 
-The built-in terms have these values for a vehicle in one step. The terms ``collision``, ``risk``, ``jerk`` and
-``terminal`` are those of the paper, with misprints corrected:
+The table shows the value of each built-in term for a vehicle in one step. The terms ``collision``, ``risk``, ``jerk``
+and ``terminal`` come from the paper, with misprints corrected:
 
 =========  =======================================================================================================
 term       value
@@ -9,13 +9,14 @@ term       value
 harm       minus the harm of the whole line in this step (``harm_count``: first-impact or total harm); with an
            ``objective``, minus the change in this step of the amount that the vehicle should minimise
 collision  minus ``sum k_energy w^2`` over every impact of the step, where w is the closing speed
-risk       sum of ``-sigma(-TTC / tau) - sigma(k_d (d_target - d))`` over the vehicle's pairs, with gap d and time to
-           collision ``TTC = max(d - d_safe, 0) / closing speed``; the first part is 0 if a pair does not approach
+risk       sum of ``-sigma(-TTC / tau) - sigma(k_d (d_target - d))`` over the vehicle's pairs, with logistic function
+           sigma, gap d and time to collision ``TTC = max(d - d_safe, 0) / closing speed``; the first part is 0 if the
+           vehicles of a pair do not approach each other
 jerk       minus the squared rate of change of the vehicle's acceleration
 terminal   1 in the last step of an episode without any collision, otherwise 0
-shaping    for learners: ``discount Phi(after) - Phi(before)``, where Phi is minus the least harm that simple braking
-           can reach (``potential``). This term does not change the optimal policy if ``shaping_discount`` equals the
-           learner's own discount (Ng, Harada and Russell 1999)
+shaping    for learners: ``discount Phi(after) - Phi(before)``, where Phi is minus the least harm that the learners can
+           reach by constant braking (``potential``). The term does not change the optimal policy if
+           ``shaping_discount`` equals the learner's own discount (Ng, Harada and Russell 1999)
 =========  =======================================================================================================
 """
 
@@ -43,7 +44,7 @@ class WithoutEffect(UserWarning):
 
 
 def own_terms() -> list[str]:
-    """Return the names of the registered measures, without the built-in ones. No package is loaded."""
+    """Return the names of the registered measures, without the built-in ones and without loading any package."""
     return [name for name in MEASURES if name not in RewardParams.model_fields]
 
 
@@ -65,17 +66,19 @@ class RewardParams(FileModel):
 
     Args:
         harm, collision, risk, jerk, terminal, shaping: weights of the built-in terms, at least 0. The docstring of the
-            module ``game.rewards`` has their formulas. If another weight is given, the weight of harm must be given,
-            too.
-        harm_count: ``first``: the term harm counts first-impact harm; ``total``: it counts total harm.
-        objective: objective of all vehicles, or a list with one per vehicle; None: the objective of the scenario.
+            module ``game.rewards`` shows the formula of each term. If you give another weight, you must also give the
+            weight of harm.
+        harm_count: ``first``: the term harm uses first-impact harm; ``total``: the term harm uses total harm.
+        objective: objective of all vehicles, or a list with one objective per vehicle; None: the objective of the
+            scenario.
         shaping_discount: discount in the shaping term, in (0, 1]; it should equal the learner's own discount.
         k_energy: factor of the squared closing speed in the collision term.
-        ttc_scale_s: scale tau of the time to collision in the risk term, s.
+        ttc_scale_s: time tau by which the risk term divides the time to collision, s.
         safety_buffer_m: distance d_safe that is subtracted from the gap in the risk term, m.
         target_gap_m: gap d_target below which the second part of the risk term exceeds 1/2, m.
         distance_slope_per_m: steepness k_d of the second part of the risk term, 1/m.
-        terms: weights of registered measures by name; use a negative weight for a measure that should be small.
+        terms: dictionary from the name of a registered measure to its weight; use a negative weight for a measure that
+            should become small.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.EthBrakeEnv("paper-random", reward=eb.RewardParams(harm=0.05, terminal=1.0))
@@ -102,7 +105,7 @@ class RewardParams(FileModel):
     @model_validator(mode="before")
     @classmethod
     def _own_terms(cls, value: Any) -> Any:
-        """Move weights of registered measures that are written next to the other settings into ``terms``."""
+        """Move the weights of registered measures into ``terms``, if they are written next to the other settings."""
         if not isinstance(value, dict):
             return value
         beside = {name: weight for name, weight in value.items() if name in own_terms()}
@@ -137,9 +140,11 @@ class RewardParams(FileModel):
 
     @model_validator(mode="after")
     def _harm_is_meant(self) -> Self:
-        """Raise an error if other terms are given without ``harm``, or an objective although harm has weight 0.
+        """Raise an error if weights are given without the weight of harm, or if an objective is given although
+        harm has weight 0.
 
-        The default weight 1 of harm would otherwise be added to the given terms without notice.
+        If the weight of harm is not given, it is 1; without this error, harm would be added to the given terms without
+        notice.
         """
         names = {*self.model_fields_set, *(self.terms if "terms" in self.model_fields_set else ())}
         beside = [name for name, weight in self.weights.items() if weight != 0.0 and name in names]
@@ -159,22 +164,23 @@ class RewardParams(FileModel):
 
     @property
     def weights(self) -> dict[str, float]:
-        """Weight of every built-in term, and of the registered measures in ``terms``, by name."""
+        """Dictionary from name to weight, for every built-in term and every registered measure in ``terms``."""
         return {name: self.weight(name) for name in (*BUILT_IN, *self.terms)}
 
     @property
     def counted(self) -> tuple[str, ...]:
-        """Names of the terms with a weight other than 0: built-in terms in order, then registered measures."""
+        """Names of the terms whose weight is not 0: first the built-in terms, then the registered measures."""
         return tuple(name for name, weight in self.weights.items() if weight != 0.0)
 
     def shared(self, harm: Value, safe_end: Value) -> dict[str, Value]:
-        """Return the terms ``harm`` and ``terminal`` by name if they have a weight and are equal for all vehicles.
+        """Return the terms whose values all vehicles of a world share, by name: ``harm`` and ``terminal``.
 
-        If an objective is given, the term harm differs between vehicles and is not included.
+        A term with weight 0 is left out. The term harm is also left out if there is an objective, because its values
+        then differ between vehicles.
 
         Args:
-            harm: harm of the step in m2/s2, for many worlds [n] or as one number for a single world.
-            safe_end: 1 if the episode ended in this step without any collision, else 0; in the shape of ``harm``.
+            harm: harm of the step in m2/s2, for n worlds [n] or as one number for a single world.
+            safe_end: 1 if the episode ended in this step without any collision, else 0; of the same shape as ``harm``.
 
         """
         terms = {}
@@ -185,9 +191,10 @@ class RewardParams(FileModel):
         return terms
 
     def weighted_sum(self, terms: Mapping[str, Floats], shape: tuple[int, ...]) -> Floats:
-        """Return the reward of every vehicle, [n, N]: the sum of weight times value over the terms.
+        """Return the reward of every vehicle, [n, N]: the sum of weight times value over all ``terms``.
 
-        ``terms``: values of the terms by name, [n] or [n, N]. ``shape``: shape (n, N) of the result.
+        ``terms``: dictionary from the name of a term to its values, [n] or [n, N]. ``shape``: shape (n, N) of the
+        result.
         """
         total = np.zeros(shape)
         for name, term in terms.items():
@@ -195,17 +202,18 @@ class RewardParams(FileModel):
         return total
 
     def settled(self, of_scenario: Declared, vehicles: int) -> tuple[RewardParams, tuple[Objective, ...]]:
-        """Return this reward with its field ``objective`` filled in, and the parsed objective of each vehicle.
+        """Return a copy of this reward with the objective that applies, and the parsed objective of each vehicle.
 
         The objective comes from the reward or, if the reward has none, from the scenario. If all vehicles have the
-        objective ``total``, or if harm has weight 0, the field is None and the tuple of parsed objectives is empty. If
-        harm has weight 0, a warning (``WithoutEffect``) says that an objective other than ``total`` has no effect.
+        objective ``total``, or if harm has weight 0, ``objective`` becomes None and the tuple of parsed objectives is
+        empty. If harm has weight 0 and the scenario has another objective than ``total``, a warning (``WithoutEffect``)
+        says that this objective has no effect.
 
         Args:
             of_scenario: objective that the scenario declares.
             vehicles: number of vehicles in the line.
 
-        Raises ``InvalidInput`` for an objective that does not fit the number of vehicles.
+        Raises ``InvalidInput`` if the reward's objective is not made for this number of vehicles.
 
         """
         declared = of_scenario if self.objective is None else self.objective
@@ -224,17 +232,17 @@ class RewardParams(FileModel):
         return self.model_copy(update={"objective": declared}), objectives
 
     def potential(self, worlds: Worlds, learners: Sequence[int], horizon_s: float) -> Floats:
-        """Return the potential of the shaping term, [n] m2/s2: minus the least harm that simple braking can reach.
+        """Return the potential of the shaping term, [n] m2/s2: minus the least harm by constant braking from now on.
 
-        Each learner brakes with a constant deceleration from now on, and all other vehicles brake fully. The
-        deceleration is a fraction of the learner's braking capacity: one of nine values from 0 to 1. A single learner
-        uses the fraction with the least harm. Several learners begin with full braking and choose their fractions one
+        In this calculation, each learner brakes with a constant deceleration, and all other vehicles brake fully. Nine
+        decelerations are tried, from 0 to the learner's braking capacity in equal steps. A single learner takes the
+        deceleration with the least harm. Several learners begin with full braking and choose their decelerations one
         after the other, front to rear, in two rounds; they all get the same potential.
 
         Args:
             worlds: n worlds of N vehicles.
-            learners: indices of the learners, from 0.
-            horizon_s: end of the episode, s; only harm up to this time is included.
+            learners: indices of the learners (0 = front).
+            horizon_s: time after the alert at which the episode ends, s; harm after this time is not included.
 
         """
         braking = worlds.vehicles.braking_capacity_mps2
@@ -259,7 +267,7 @@ Reward = str | RewardParams | Mapping[str, Any]  # a name, or settings
 
 
 def reward_params(reward: Reward) -> RewardParams:
-    """Return the ``RewardParams`` for a name in ``REWARDS``, a mapping of settings, or ``RewardParams`` (unchanged).
+    """Convert a name in ``REWARDS`` or a mapping of settings to ``RewardParams``; return ``RewardParams`` unchanged.
 
     Raises ``UnknownName`` for an unknown name or setting, and ``InvalidInput`` for an invalid value.
     """
@@ -287,5 +295,5 @@ def reward_params(reward: Reward) -> RewardParams:
 
 
 def setting_names() -> list[str]:
-    """Return the keys that a reward may have: fields of ``RewardParams``, then registered measures."""
+    """Return the keys that a mapping of reward settings may have: fields of ``RewardParams``, registered measures."""
     return [*RewardParams.model_fields, *own_terms()]

@@ -14,7 +14,8 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints
 class StepOutcome:
     """Result of one step in n worlds of N vehicles (P pairs), from which measures can be computed.
 
-    Do not change the arrays. Column 0 of an array belongs to the front vehicle or front pair.
+    Do not change the arrays of this object. In arrays [n, N], column 0 belongs to the front vehicle. In arrays [n, P],
+    column 0 belongs to the front vehicle and the vehicle behind it.
     """
 
     first_impact_harm: Floats  # [n] first-impact harm of the line in this step, m2/s2
@@ -45,7 +46,7 @@ def collision(step: StepOutcome, k_energy: float) -> Floats:
 
 
 def jerk(step: StepOutcome) -> Floats:
-    """Return the jerk term of a reward, [n, N] m2/s6: minus the squared rate of change of each acceleration."""
+    """Return the jerk term of a reward, [n, N] m2/s6: minus the squared rate of change of a vehicle's acceleration."""
     rate = (step.command_mps2 - step.previous_mps2) / step.time_step_s
     return -rate * rate
 
@@ -56,15 +57,15 @@ def risk(
     """Return the risk term of a reward, [n, N]: minus the sum of the collision risks of each vehicle's pairs.
 
     The risk of a pair is ``sigma(-TTC / tau) + sigma(k_d (d_target - d))``, where sigma is the logistic function, d the
-    gap and TTC the time to collision. ``TTC = max(d - d_safe, 0) / closing speed``; for a pair that does not approach,
-    the first summand is 0.
+    gap and TTC the time to collision: ``TTC = max(d - d_safe, 0) / closing speed``. If the vehicles of the pair do not
+    approach each other, the first summand of the risk is 0.
 
     Args:
         step: result of the step.
-        ttc_scale_s: scale tau of the time to collision, s.
-        safety_buffer_m: distance d_safe that is subtracted from the gap, m.
-        target_gap_m: gap d_target at which the second summand is 1/2, m.
-        distance_slope_per_m: steepness k_d of the second summand, 1/m.
+        ttc_scale_s: time tau by which the time to collision is divided, s.
+        safety_buffer_m: distance d_safe that is subtracted from the gap d, m.
+        target_gap_m: gap d_target at which the second summand of the risk is 1/2, m.
+        distance_slope_per_m: steepness k_d of the second summand of the risk, 1/m.
 
     """
     closing = step.speeds_mps[:, 1:] - step.speeds_mps[:, :-1]
