@@ -70,8 +70,8 @@ def optimise_coupled(
         vehicle: index of the controlled vehicle, from 0.
         harm_count: harm to minimise: ``first`` (harm of each pair's first impact) or ``total`` (harm of all impacts).
         horizon_s: time at the end of the simulations, s since the alert.
-        others_mps2: constant commands of the other
-            vehicles, [n, N] m/s2; the controlled vehicle's column is ignored. None: all other vehicles brake fully.
+        others_mps2: constant commands of the other vehicles, [n, N] m/s2; the controlled vehicle's column is ignored.
+            None: all other vehicles brake fully.
 
     Raises ``InvalidInput`` for an unknown ``vehicle`` or ``harm_count``, and for commands beyond a vehicle's capacity.
     Raises ``PhysicsError``, which names the worlds, if a deceleration could not be simulated.
