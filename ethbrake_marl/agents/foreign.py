@@ -411,7 +411,7 @@ class PolicyAgent:
         return to_array(action), checked_memory(state, len(rows))
 
     def _find_failing(self, seen: Observations, state: State) -> int | None:
-        """Find, by bisection, one world for which the policy fails when called for this world only; None if there is none.
+        """Find, by bisection, a world for which the policy fails even if called only for this world; None without one.
 
         ``seen`` [n, F] are the observations in all n worlds; ``state`` is the policy's memory for all n worlds.
         """

@@ -135,7 +135,8 @@ def _was_normalised(model: Any) -> bool:
 def _layers(env: Any) -> Iterator[Any]:
     """Yield ``env``, then all wrappers and environments inside it, from the outside in.
 
-    If there are several copies of an environment, all of them are yielded. Nothing inside an environment of this package is yielded.
+    If there are several copies of an environment, all of them are yielded. Nothing inside an environment of this
+    package is yielded.
     """
     yield env
     for name in [] if _is_ours(env) else _INSIDE:

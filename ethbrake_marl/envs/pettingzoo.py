@@ -138,17 +138,21 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
     Args:
         scenario: name of a shipped scenario, path of a YAML file, content of such a file as a mapping, or a
             ``Scenario``.
-        render_mode: ``human``, ``rgb_array``, ``rgb_array_list``, ``ansi``, or None (docs/environments.md).
+        render_mode: ``human``, ``rgb_array``, ``rgb_array_list`` or ``ansi`` (see docs/environments.md); None: no
+            pictures.
         learners: vehicles that learn, by name (``vehicle_2``) or index (0 = front); None: the learners of the scenario.
-        reward: reward of a step (``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``).
-        observation: features that every vehicle observes, or a mapping from a vehicle's name to its features; None: the
-            observation of the scenario.
+        reward: reward of a step: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams``
+            object.
+        observation: features that every vehicle observes, or a mapping from each vehicle's name to its features; None:
+            the features that belong to the scenario.
         agents: vehicles that are agents, ``all`` or ``learners``. Use ``learners`` for trainers that train all agents.
         max_cycles: number of steps after which an episode is truncated; None: it is truncated at the horizon only.
-        actions: None: an action is a number in [-1, 1]. A whole number K of at least 2: an action is the index of one
-            of K evenly spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
-        reward_vector: None: a reward is a number. ``vehicles``: a reward is an array [N], minus the harm that each
-            vehicle bears in the step. A list: a reward is an array with the named components (docs/environments.md).
+        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete, and an action is
+            an index from 0 to K - 1. The indices stand for K evenly spaced numbers from -1 (full braking capacity) to 1
+            (full driving capacity).
+        reward_vector: None: a reward is a number. ``vehicles``: a reward is an array [N] with minus the harm that each
+            vehicle bears in the step. A list of components: a reward is an array with these components (see
+            docs/environments.md).
 
     >>> import ethbrake_marl as eb
     >>> env = eb.parallel_env(scenario="paper-random")
@@ -230,9 +234,9 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
         """Start an episode, and return observations and infos by the agent's name.
 
         Args:
-            seed: start the first world of this seed; None: start the next world of the current seed.
-            options: choose the world with ``{"initial_state": ...}``, or with
-                ``{"listed_world": {"seed": 7, "number": 3}}`` (docs/environments.md).
+            seed: start the first world of this seed; None: continue with the next world of the current seed.
+            options: to choose the world, ``{"initial_state": ...}`` or ``{"listed_world": {"seed": 7, "number": 3}}``
+                (see docs/environments.md).
 
         """
         self._restart(seed, options)

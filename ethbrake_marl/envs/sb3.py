@@ -58,8 +58,10 @@ def make_sb3_vec_env(
         n_envs: number of worlds that are simulated together, at least 1.
         seed: seed of the stream of worlds; None: a random seed.
         learners: vehicles that learn, by name (``vehicle_2``) or index (0 = front); None: the learners of the scenario.
-        reward: reward of a step (``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``).
-        observation: features that the learners observe; None: the observation of the scenario (``observation_for``).
+        reward: reward of a step: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams``
+            object.
+        observation: features that the learners observe; None: the features that belong to the scenario
+            (``observation_for``).
         horizon_is_end: True: report no truncation at the horizon, so that the algorithm does not add an estimated value
             of the time after the horizon. Such an estimate can grow without limit, because harm after the horizon is
             not counted (docs/train.md). False: ``TimeLimit.truncated`` is true for episodes that ended at the horizon.
@@ -69,8 +71,9 @@ def make_sb3_vec_env(
         step_infos: True: fill the infos in every step, as the other environments do; False: only at the end of an
             episode. This is slower.
         render_mode: ``rgb_array`` or None. ``render`` and ``VecVideoRecorder`` show all worlds side by side.
-        actions: None: an action is a number in [-1, 1]. A whole number K of at least 2: an action is the index of one
-            of K evenly spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
+        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete, and an action is
+            an index from 0 to K - 1. The indices stand for K evenly spaced numbers from -1 (full braking capacity) to 1
+            (full driving capacity).
 
     >>> import ethbrake_marl as eb
     >>> eb.make_sb3_vec_env("paper-random", 4, seed=7).reset().shape
