@@ -36,7 +36,7 @@ from ethbrake_marl.scenario.schema import Scenario
 class Specified:
     """Mixin for environments of ``gymnasium.make``, whose ``spec`` stores all settings as plain data for JSON.
 
-    For instance, a scenario object becomes a mapping, and a path becomes a text.
+    For instance, ``spec`` stores a scenario object as a mapping, and a path as a text.
     """
 
     engine: Engine  # engine that moves the worlds, set by the environment
@@ -45,7 +45,7 @@ class Specified:
 
     @property
     def spec(self) -> EnvSpec | None:
-        """Gymnasium's record of how the environment was made; None if ``gymnasium.make`` did not make it.
+        """Gymnasium's record of how ``gymnasium.make`` made the environment; None if it was made in another way.
 
         ``spec.max_episode_steps`` is an upper bound of the number of steps of an episode.
         """

@@ -35,7 +35,7 @@ from ethbrake_marl.physics.state import Ints
 
 
 class SeededInside:
-    """Mixin for wrappers, whose ``np_random`` and ``np_random_seed`` belong to the innermost environment."""
+    """Mixin for wrappers. It reads and sets ``np_random`` and ``np_random_seed`` in the innermost environment."""
 
     unwrapped: Any  # the innermost environment
 
@@ -57,7 +57,7 @@ class SeededInside:
 
 
 class Ordered(SeededInside, OrderEnforcingWrapper):  # type: ignore[misc]  # PettingZoo is untyped
-    """PettingZoo's ``OrderEnforcingWrapper``, with the random generator of the wrapped environment."""
+    """PettingZoo's ``OrderEnforcingWrapper`` with the ``np_random`` of the environment inside the wrapper."""
 
     def __str__(self) -> str:
         return str(self.env)
@@ -71,17 +71,18 @@ class InTurns(SeededInside, parallel_to_aec_wrapper):  # type: ignore[misc]  # P
 
     @classmethod
     def around(cls, env: ParallelEnv[str, Observations, NDArray[Any]]) -> AECEnv[str, Observations, NDArray[Any]]:
-        """Return an AEC environment around a parallel environment of this package, which may have wrappers.
+        """Return an AEC environment around ``env``, a parallel environment of this package with or without wrappers.
 
-        Its methods raise an error if they are called before ``reset`` (PettingZoo's ``OrderEnforcingWrapper``).
+        The methods of the AEC environment raise an error if they are called before ``reset`` (PettingZoo's
+        ``OrderEnforcingWrapper``).
         """
         return Ordered(cls(env))
 
     def step(self, action: Any) -> None:
-        """Take the action [1] of the agent whose turn it is (``agent_selection``).
+        """Store the action [1] of the agent whose turn it is (``agent_selection``).
 
-        After the action of the last agent, all vehicles advance by one time step. Raises ``InvalidInput`` for an
-        invalid action of a learner, and for an action other than None after the end of the agent's episode.
+        When the last agent has acted, all vehicles advance by one time step. Raises ``InvalidInput`` for an invalid
+        action of a learner, and for any action except None after the end of the agent's episode.
         """
         agent, engine, count = self.agent_selection, self.env.unwrapped.engine, self.env.unwrapped.actions
         assert isinstance(engine, Engine)
@@ -93,7 +94,7 @@ class InTurns(SeededInside, parallel_to_aec_wrapper):  # type: ignore[misc]  # P
         super().step(action)
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
-        """Start an episode; ``seed`` and ``options`` are as in ``EthBrakeParallelEnv.reset``."""
+        """Start an episode; ``seed`` and ``options`` have the same meaning as in ``EthBrakeParallelEnv.reset``."""
         super().reset(seed, options)
         self._clear_rewards()
         self._cumulative_rewards = {agent: self._no_reward() for agent in self.agents}
@@ -104,7 +105,7 @@ class InTurns(SeededInside, parallel_to_aec_wrapper):  # type: ignore[misc]  # P
 
     @property
     def reward_spaces(self) -> dict[str, Any]:
-        """Spaces of the vector rewards by the agent's name, for MOMAland."""
+        """Mapping from the name of each agent to the space of its vector rewards, for the library MOMAland."""
         spaces: dict[str, Any] = self.unwrapped.reward_spaces
         return spaces
 
@@ -126,14 +127,14 @@ WhoIsAgent = Literal["all", "learners"]
 class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]):  # type: ignore[misc]  # PettingZoo is untyped
     """Environment in which the vehicles of a line, ``vehicle_1`` (front) to ``vehicle_N``, are agents.
 
-    - Action: in each step, each learner needs an array [1] in [-1, 1]. -1 brakes with full capacity, 0
-      coasts, +1 drives with full capacity. Other actions are ignored; ``infos[agent]`` contains the
-      commands of their scripts.
+    - Action: in each step, each learner needs an array [1] in [-1, 1]. -1 brakes with full capacity, 0 coasts, +1
+      drives with full capacity. Actions of agents that follow scripts are ignored; ``infos[agent]`` contains the
+      commands of these scripts.
     - End: the episodes of all agents end together, *terminated* when all vehicles are at rest and no command would move
       one, or *truncated* at the horizon.
     - ``state()`` returns the full state of the line, for central critics.
 
-    Observations, rewards, infos and ``reset`` are as in ``EthBrakeEnv``.
+    Observations, rewards, infos and ``reset`` of each agent are as in ``EthBrakeEnv``.
 
     Args:
         scenario: name of a shipped scenario, path of a YAML file, content of such a file as a mapping, or a
@@ -145,7 +146,8 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
             object.
         observation: features that every vehicle observes, or a mapping from each vehicle's name to its features; None:
             the features that belong to the scenario.
-        agents: vehicles that are agents, ``all`` or ``learners``. Use ``learners`` for trainers that train all agents.
+        agents: which vehicles are agents: ``all`` vehicles or only the ``learners``. Choose ``learners`` for training
+            libraries that train every agent.
         max_cycles: number of steps after which an episode is truncated; None: it is truncated at the horizon only.
         actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete, and an action is
             an index from 0 to K - 1. The indices stand for K evenly spaced numbers from -1 (full braking capacity) to 1
@@ -210,11 +212,11 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
             self.reward_spaces = {agent: reward_box(self.engine) for agent in self.possible_agents}
 
     def observation_space(self, agent: str) -> Any:
-        """Return the observation space of ``agent``, a float32 box [F]; always the same object."""
+        """Return the observation space of ``agent``, a float32 box [F]. Every call returns the same object."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> Any:
-        """Return the action space of ``agent``; always the same object.
+        """Return the action space of ``agent``. Every call returns the same object.
 
         The space is a float32 box [1] or, for a learner with discrete actions, ``Discrete(actions)``.
         """
@@ -231,7 +233,7 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observations], Infos]:
-        """Start an episode, and return observations and infos by the agent's name.
+        """Start an episode, and return two mappings: from each agent's name to its observation, and to its infos.
 
         Args:
             seed: start the first world of this seed; None: continue with the next world of the current seed.
@@ -247,10 +249,11 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
     def step(
         self, actions: Mapping[str, Any]
     ) -> tuple[dict[str, Observations], dict[str, Any], dict[str, bool], dict[str, bool], Infos]:
-        """Advance by one time step; return observations, rewards, terminations, truncations and infos by agent.
+        """Advance by one time step; return observations, rewards, terminations, truncations and infos of all agents.
 
-        ``actions`` maps the name of an agent to its action [1] in [-1, 1]. Raises ``InvalidInput`` if the action of a
-        learner is missing or invalid; the message names the learner.
+        ``actions`` is a mapping from the names of agents to their actions, each [1] in [-1, 1]. The results are
+        mappings from the names of agents as well. Raises ``InvalidInput``, which names the learner, if the action of a
+        learner is missing or invalid.
         """
         if not self.agents:
             raise InvalidInput("step: no episode is running; call reset first")
@@ -286,13 +289,13 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
         )
 
     def state(self) -> Observations:
-        """Return the full state of the line, float32 [S], an element of ``state_space``."""
+        """Return the full state of the line, a float32 array [S] in the space ``state_space``."""
         self._check_started("state")
         state: Observations = full_state(self.engine.worlds, self.engine.scenario)[0].copy()
         return state
 
     def _warn_of_ignored(self, actions: Mapping[str, Any]) -> None:
-        """Warn, once per environment, about actions that are ignored because their vehicles follow scripts."""
+        """Warn, only once in each environment, if actions are ignored because the vehicles follow scripts."""
         ignored = [agent for agent in self._scripted if actions.get(agent) is not None]
         if not ignored:
             return
@@ -335,7 +338,7 @@ parallel_env = EthBrakeParallelEnv
 def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
     """Return the environment in which agents act one after another, from front to rear (AEC).
 
-    ``scenario`` and ``settings`` are the arguments of ``parallel_env``.
+    ``scenario`` and ``settings`` have the same meaning as in ``parallel_env``.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.raw_env("paper-random")
@@ -350,7 +353,7 @@ def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[s
 def env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
     """Return the environment in which agents act one after another (AEC), the same as ``raw_env``.
 
-    ``scenario`` and ``settings`` are the arguments of ``parallel_env``. An invalid action raises ``InvalidInput``. The
-    episode goes on, and the same agent can act again.
+    ``scenario`` and ``settings`` have the same meaning as in ``parallel_env``. An invalid action raises
+    ``InvalidInput``. After this error the episode goes on, and it is the same agent's turn again.
     """
     return raw_env(scenario, **settings)

@@ -86,9 +86,8 @@ class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArra
 class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
     """Many worlds like the one of ``EthBrakeEnv`` (``gymnasium.make_vec("EthBrake-v1", num_envs=4096)``).
 
-    All arrays have one row per world. After ``reset(seed=s)``, row k is world k of seed s. Whenever an episode has
-    ended, a new episode starts in the same row with the next world of seed s. Later steps do not change the arrays that
-    a step has returned.
+    All arrays have one row per world. After ``reset(seed=s)``, row k is world k of seed s. Each later episode, in any
+    row, takes the next world of seed s. Later steps do not change the arrays that a step has returned.
 
     Args:
         num_envs: number of worlds that are simulated together, at least 1.
@@ -249,7 +248,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         return np.array(mask)
 
     def _renew(self, rows: Bools, seed: int | None, options: Mapping[str, Any]) -> None:
-        """Start new episodes in the rows of the mask ``rows`` [n], while the other rows continue.
+        """Start new episodes in the rows for which the mask ``rows`` [n] is true; all other episodes continue.
 
         Raises ``InvalidInput`` if ``seed`` or an option chooses the worlds, because a reset with chosen worlds must
         include all rows.
@@ -265,7 +264,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         self.engine.renew(np.flatnonzero(rows))
 
     def _final_infos(self, step: Step) -> dict[str, Any]:
-        """Return the infos ``final_obs`` and ``final_info``, with their masks, of episodes that ended in this step."""
+        """Return the infos ``final_obs`` and ``final_info`` of the episodes that ended in this step, with masks."""
         ended = step.ended
         observations = self.engine.observe(self.learner)
         final = np.full(self.num_envs, None, dtype=object)
