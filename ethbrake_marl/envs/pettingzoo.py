@@ -1,4 +1,4 @@
-"""Environments for PettingZoo: the vehicles of a world are agents that act in parallel, or one after another (AEC)."""
+"""Environments for PettingZoo: the agents are vehicles, which act in parallel or one after another (AEC)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from ethbrake_marl.physics.state import Ints
 
 
 class SeededInside:
-    """Mixin for wrappers. It reads and sets ``np_random`` and ``np_random_seed`` in the innermost environment."""
+    """Mixin for wrappers: ``np_random`` and ``np_random_seed`` are those of the innermost environment."""
 
     unwrapped: Any  # the innermost environment
 
@@ -66,7 +66,7 @@ class Ordered(SeededInside, OrderEnforcingWrapper):  # type: ignore[misc]  # Pet
 class InTurns(SeededInside, parallel_to_aec_wrapper):  # type: ignore[misc]  # PettingZoo is untyped
     """PettingZoo's wrapper from parallel to AEC, which also checks the action of an agent when it is the agent's turn.
 
-    After an invalid action the same agent can act again.
+    If an action is invalid, the same agent must act again.
     """
 
     @classmethod

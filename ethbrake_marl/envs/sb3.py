@@ -1,4 +1,4 @@
-"""Environment for Stable-Baselines3: a ``VecEnv`` whose rows are learners. Importing this module imports torch."""
+"""Environment for Stable-Baselines3: a ``VecEnv`` with one row per learner. Importing this module imports torch."""
 
 from __future__ import annotations
 
@@ -236,10 +236,9 @@ class EthBrakeVecEnv(Begun, VecEnv):
         return arrays | {"return": self._return.copy(), "steps": self._steps.copy(), "begun": self._begun.copy()}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Restore the state ``arrays`` from ``snapshot``; a reset is not needed.
+        """Restore the state ``arrays``, which ``snapshot`` has returned; a reset is not needed.
 
-        The snapshot must be of an environment with the same scenario and number of worlds; otherwise ``InvalidInput``
-        is raised.
+        Raises ``InvalidInput`` if the snapshot is from an environment with another scenario or number of worlds.
         """
         prefix = "engine."
         self.engine.restore({n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)})
