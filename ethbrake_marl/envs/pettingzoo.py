@@ -128,13 +128,13 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
     """Environment in which the vehicles of a line, ``vehicle_1`` (front) to ``vehicle_N``, are agents.
 
     - Action: in each step, each learner needs an array [1] in [-1, 1]. -1 brakes with full capacity, 0 coasts, +1
-      drives with full capacity. Actions of agents that follow scripts are ignored; ``infos[agent]`` contains the
-      commands of these scripts.
+      drives with full capacity. Actions for scripted agents are ignored; ``infos[agent]`` contains the script's
+      commands.
     - End: the episodes of all agents end together, *terminated* when all vehicles are at rest and no command would move
       one, or *truncated* at the horizon.
     - ``state()`` returns the full state of the line, for central critics.
 
-    Observations, rewards, infos and ``reset`` of each agent are as in ``EthBrakeEnv``.
+    Observations, rewards, infos and ``reset`` are as in ``EthBrakeEnv``.
 
     Args:
         scenario: name of a shipped scenario, path of a YAML file, content of such a file as a mapping, or a

@@ -97,11 +97,10 @@ def make_sb3_vec_env(
 class EthBrakeVecEnv(Begun, VecEnv):
     """``VecEnv`` with one row per learner and world: row ``k * L + l`` is learner l of L (front to rear) in world k.
 
-    The rows of one world belong to the same episode, so they end together. All new episodes take the next world of the
-    same stream. In the last step of an episode, the infos of its rows contain ``TimeLimit.truncated``,
-    ``terminal_observation``, ``episode`` (return ``r``, number of steps ``l``, and ``t``, which is always 0), and all
-    infos of the other environments. In all other steps they contain only the infos of a shield, unless ``step_infos``
-    is true. ``get_attr`` and ``env_method`` use this object, not separate environments.
+    The rows of one world share one episode. Each new episode takes the next world of the stream. In the last step of an
+    episode, the infos contain ``TimeLimit.truncated``, ``terminal_observation``, ``episode`` (return ``r``, number of
+    steps ``l``, and ``t``, which is always 0), and all infos of the other environments. In other steps, the infos
+    contain only those of a shield, unless ``step_infos`` is true. ``get_attr`` and ``env_method`` use this object.
 
     Args:
         engine: the engine that simulates the worlds; ``make_sb3_vec_env`` makes it.
