@@ -68,7 +68,7 @@ def shield_columns(engine: Engine, rows: Ints | None = None) -> Columns:
 def plain_rows(columns: Columns, vehicles: Ints, count: int) -> list[dict[str, Any]]:
     """Return one dictionary of plain values for each world and vehicle, such as ``{"time_s": 0.5, "collided": 0.0}``.
 
-    The list contains all vehicles of the first world, then of the second world, and so on.
+    The list begins with the dictionaries for the vehicles of the first world.
 
     Args:
         columns: mapping from the name of an info to its values, [n, N].
@@ -133,8 +133,8 @@ class Report(NamedTuple):
     def plain_infos(self, vehicles: Ints) -> list[dict[str, Any]]:
         """Return one dictionary of infos for each world and each vehicle in ``vehicles`` (indices).
 
-        The list contains all these vehicles of the first world, then of the second world, and so on. The values are
-        plain numbers, except the arrays ``chosen_action`` [1], ``known_from_s`` [N] and ``age_s`` [N].
+        The list begins with the dictionaries for the first world. The values are plain numbers, except the arrays
+        ``chosen_action`` [1], ``known_from_s`` [N] and ``age_s`` [N].
         """
         worlds: list[list[list[Any]]] = self.values.take(vehicles, axis=1).tolist()
         numbers, costs = self.world.tolist(), self.cost.tolist()
@@ -182,8 +182,8 @@ class Report(NamedTuple):
         Args:
             vehicle: index of the vehicle (0 = front).
             rows: mask of the worlds whose infos have values, [n].
-            stepped: mask of the worlds that the last step has moved, [n]. In all other worlds ``cost`` and the reward
-                terms are 0.
+            stepped: mask of the worlds whose running episode includes the last step, [n]. In all other worlds ``cost``
+                and the reward terms are 0.
 
         """
         columns: dict[str, NDArray[Any]] = {name: info[:, vehicle] for name, info in self.columns().items()}
@@ -267,7 +267,7 @@ class Begun:
 
     @property
     def np_random(self) -> np.random.Generator:
-        """Random generator that wrappers may use. The worlds depend on ``np_random_seed``, not on its state.
+        """Random generator that wrappers may use. The worlds depend on ``np_random_seed`` only.
 
         If you set another generator, each ``reset`` without a seed draws a new seed from the generator that you set.
         This ends with the first ``reset`` with a seed.

@@ -219,7 +219,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         return tuple(self.viewer.render())
 
     def _fill_ignored(self, actions: NDArray[Any], before: Bools) -> NDArray[Any]:
-        """Return a copy of ``actions`` with the action 0 in each world whose action is ignored.
+        """Return ``actions`` with the action 0 in each world whose action is ignored.
 
         In the autoreset mode ``NextStep``, the action of a world is ignored if its episode had ended before the step.
         The mask ``before`` [n] is true for these worlds.
