@@ -1,4 +1,4 @@
-"""Run agents through whole episodes: the loop behind evaluations and rollouts."""
+"""Let agents drive through whole episodes. Evaluations and rollouts use this loop."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ class Episodes:
     def of(
         cls, engine: Engine, worlds: Worlds, watched_by: Sequence[Watch] = (), summed: Sequence[str] = ()
     ) -> Episodes:
-        """Run an engine from the first decision to the end of every episode.
+        """Let an engine run from the first decision until the episodes in all worlds have ended.
 
         Args:
             engine: an engine made by ``episode_engine``, before its first step.
-            worlds: worlds of the engine at the alert; the first call of each observer gets them as ``before``.
-            watched_by: observers that are called after every step.
-            summed: names of reward terms to sum over the episodes.
+            worlds: the engine's worlds at the alert; the first call of each observer gets these worlds as ``before``.
+            watched_by: observers (``Watch``), whose method ``see`` is called after every step.
+            summed: names of reward terms to sum over each episode.
 
-        Raises ``PhysicsError`` naming the worlds in which the physics failed.
+        Raises ``PhysicsError``, which names the worlds, if the physics failed in some worlds.
 
         """
         at_rest = np.zeros(worlds.n, np.bool_)
@@ -66,30 +66,31 @@ class Episodes:
 
 
 class Watch(Protocol):
-    """Observer of every step of a batch of episodes."""
+    """Observer, whose method ``see`` is called after every step of a batch of episodes."""
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Receive one step of all n worlds, without changing the arguments.
+        """Receive the motion of all n worlds in one step. The method must not change the arguments.
 
-        The first step is from the alert to the first decision. If a script decides within a step, this method is called
-        once for each interval between decisions.
+        The first step lasts from the alert to the first decision. If a script decides in the middle of a step, the step
+        consists of several intervals, and this method is called once for each interval.
 
         Args:
             before: the worlds at the start of the interval.
             command_mps2: command of every vehicle during the interval, [n, N] m/s2.
-            until_s: time of each world at the end of the interval, [n] s. The time of a world whose episode has ended
-                does not change.
+            until_s: time of each world at the end of the interval, [n] s since the alert. After the end of an episode,
+                the time of its world does not change.
 
         """
         ...
 
 
 def script_agents(scenario: Scenario, *, except_for: int | Collection[int] | None = None) -> dict[int, Agent]:
-    """Return the agent of each scripted vehicle of a scenario: vehicle index (0 = front) -> agent.
+    """Return a mapping from the index of each scripted vehicle of a scenario (0 = front) to its agent.
 
     Args:
         scenario: the scenario.
-        except_for: index or indices of vehicles to leave out; None: leave out no vehicle.
+        except_for: index or indices of vehicles that the result must not contain; None: the result contains all
+            scripted vehicles.
 
     """
     left_out = (except_for,) if isinstance(except_for, int) else except_for or ()
@@ -101,19 +102,19 @@ def episode_engine(
 ) -> Engine:
     """Return an engine in which agents drive whole episodes; call ``engine.step({})`` until all episodes have ended.
 
-    The agents decide for the first time when the latency of any controlled vehicle has elapsed, and then at every time
-    step, like learners. Their commands are applied without rounding. Behind a shield the agents only propose commands,
-    and the engine treats the controlled vehicles as learners. An agent that looks ahead knows the scripts, and assumes
-    that other controlled vehicles brake fully.
+    The agents decide for the first time as soon as the latency of one controlled vehicle has elapsed, and then at every
+    time step, like learners. The agents' commands are applied without rounding. If the team has a shield, the agents
+    only propose commands, and the engine treats the controlled vehicles as learners. An agent that looks ahead knows
+    the scripts, and assumes that other controlled vehicles brake fully.
 
     Args:
         worlds: n worlds at the alert.
-        agent: an agent that drives ``vehicle``, or a team, which has its own vehicles.
+        agent: an agent that drives ``vehicle``, or a team, which states itself which vehicles it drives.
         scenario: scenario whose scripts drive the other vehicles.
-        vehicle: index of the agent's vehicle (0 = front); None for a team.
-        reward: reward whose terms the engine computes.
+        vehicle: index of the vehicle that the agent drives (0 = front); None for a team.
+        reward: reward whose terms the engine computes in every step.
 
-    Raises ``InvalidInput`` if a learner of the scenario has no agent.
+    Raises ``InvalidInput`` if ``agent`` does not drive every learner of the scenario.
 
     """
     team = agent if isinstance(agent, Team) else Team.of(agent, () if vehicle is None else (vehicle,))
@@ -151,13 +152,14 @@ def drive(
 
     Args:
         worlds: n worlds at the alert.
-        agent: an agent that drives ``vehicle``, or a team, which has its own vehicles.
+        agent: an agent that drives ``vehicle``, or a team, which states itself which vehicles it drives.
         scenario: scenario whose scripts drive the other vehicles.
-        vehicle: index of the agent's vehicle (0 = front); None for a team.
-        watched_by: observers that are called after every step.
-        summed: names of reward terms to sum over the episodes, with the default settings of ``RewardParams``.
+        vehicle: index of the vehicle that the agent drives (0 = front); None for a team.
+        watched_by: observers (``Watch``), whose method ``see`` is called after every step.
+        summed: names of reward terms to sum over each episode; the terms have the default settings of ``RewardParams``.
 
-    Raises ``PhysicsError`` naming all worlds in which the physics failed; leave these worlds out to drive the others.
+    Raises ``PhysicsError``, which names the worlds, if the physics failed in some worlds; without these worlds, a new
+    call succeeds.
 
     """
     reward: Reward = {"harm": 1.0} | dict.fromkeys(summed, 1.0) if summed else "harm"
@@ -169,9 +171,9 @@ def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_m
     """Pass the engine's last step to the observers; return the worlds after the step.
 
     Args:
-        watched_by: the observers; if there are none, ``before`` is returned.
+        watched_by: the observers; without observers, the function does nothing and returns ``before``.
         before: the worlds at the start of the step.
-        engine: the engine, after the step.
+        engine: the engine after the step.
         command_mps2: command of every vehicle during the step, [n, N] m/s2.
 
     """
@@ -185,10 +187,10 @@ def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_m
 
 
 def record_commands(agent: Driver, worlds: Worlds, scenario: Scenario, vehicle: int, steps: int) -> Floats:
-    """Return the first ``steps`` commands that ``agent`` gives ``vehicle`` (index, 0 = front), [n, steps] m/s2.
+    """Return the commands of ``agent`` for ``vehicle`` (index, 0 = front) in the first steps, [n, steps] m/s2.
 
-    ``worlds`` are n worlds at the alert. After the end of an episode, its last command is repeated. Raises
-    ``PhysicsError`` naming the worlds in which the physics failed.
+    ``worlds`` are n worlds at the alert. If an episode ends earlier, its last command fills the remaining steps. Raises
+    ``PhysicsError``, which names the worlds, if the physics failed in some worlds.
     """
     engine = episode_engine(worlds, agent, scenario, vehicle)
     commands = write_down(engine, steps, lambda: engine.wanted_mps2[:, [vehicle]])[:, :, 0]
@@ -198,15 +200,15 @@ def record_commands(agent: Driver, worlds: Worlds, scenario: Scenario, vehicle: 
 
 
 def write_down(engine: Engine, steps: int, column: Callable[[], Floats]) -> Floats:
-    """Run an engine to the end of all episodes, and record K numbers per world after each of the first ``steps`` steps.
+    """Let an engine run to the end of all episodes; record K numbers per world after each of the first ``steps`` steps.
 
     Args:
         engine: an engine made by ``episode_engine``.
         steps: number of steps to record.
-        column: function that returns the K numbers to record for each of the engine's n worlds, [n, K].
+        column: function without arguments that returns the K numbers to record for each of n worlds, [n, K].
 
-    Returns the recorded numbers, [n, steps, K]; they are NaN after the end of an episode. Raises ``PhysicsError``
-    naming the worlds in which the physics failed.
+    Returns the recorded numbers, [n, steps, K]. The numbers after the end of an episode are NaN. Raises
+    ``PhysicsError``, which names the worlds, if the physics failed in some worlds.
 
     """
     columns = np.full((steps, *column().shape), np.nan)

@@ -1,4 +1,4 @@
-"""Agents for policies of other libraries, as functions ``(observations, state) -> (actions, state)``."""
+"""Agents that drive with policies of other libraries."""
 
 from __future__ import annotations
 
@@ -38,16 +38,18 @@ _KINDS = (
 
 
 def adapt_policy(policy: Any, name: str, features: int, initial_state: Begin | None) -> tuple[Infer, Begin | None]:
-    """Return two functions for a policy: ``(observations, state) -> (actions, state)``, and ``n -> initial state``.
+    """Return two functions that call the policy: one returns actions and new memory, one returns the initial memory.
 
     Args:
         policy: a policy of a kind that ``policy_agent`` accepts.
         name: name of the agent in error messages.
-        features: number F of features in an observation.
-        initial_state: function that returns the memory at the start of n episodes, for a function or torch module with
-            a memory; None: no memory.
+        features: number of features in one observation.
+        initial_state: for a function or torch module with a memory: function that returns the memory at the start of n
+            episodes; None: ``policy`` has no memory, or is a model with ``predict``.
 
-    The second function is None for a policy without a memory. Raises ``InvalidInput`` if ``policy`` is not a policy.
+    The first function is ``(observations, state) -> (actions, new state)``. The second function is ``n -> initial
+    state``, for n episodes; it is None for a policy without a memory. Raises ``InvalidInput`` if ``policy`` is of
+    another kind.
 
     """
     if isinstance(policy, str | os.PathLike):
@@ -77,15 +79,15 @@ def _without_memory(action: Any) -> Any:
 
 
 def _ask_model(model: Any, name: str, features: int) -> tuple[Infer, Begin | None]:
-    """Return the same functions as ``adapt_policy``, for a model with a method ``predict`` (Stable-Baselines3).
+    """Do the same as ``adapt_policy``, for a model with a method ``predict``, such as a Stable-Baselines3 model.
 
-    A recurrent model returns its memory. Predictions for two and for three worlds show which axis of each array in the
-    memory has one entry per world.
+    If ``predict`` also returns a memory, the function calls it for two and for three worlds. The shapes of the returned
+    arrays show which axis has one entry per world.
 
     Args:
         model: the model.
         name: name of the agent in error messages.
-        features: number of features in an observation.
+        features: number of features in one observation.
 
     """
 
@@ -172,10 +174,10 @@ def _open_onnx(path: Path, name: str) -> Any:
 
 
 def weights_sha256(policy: Any) -> str | None:
-    """Return the SHA-256 of an .onnx file (given by its path), or of the present weights of a torch or SB3 model.
+    """Return the SHA-256 hash of an .onnx file (given by its path), or of the present weights of a torch or SB3 model.
 
-    The hash of an SB3 model includes the statistics of its ``VecNormalize``. Returns None for other policies, because
-    their weights cannot be read.
+    The hash of an SB3 model also covers the statistics with which its ``VecNormalize`` normalises observations. Returns
+    None for all other policies, because their weights cannot be read.
     """
     if isinstance(policy, str | os.PathLike):
         return hashlib.sha256(Path(policy).read_bytes()).hexdigest() if Path(policy).is_file() else None
@@ -213,38 +215,41 @@ def policy_agent(
     ignore_wrappers: bool = False,
     actions: int | None = None,
 ) -> PolicyAgent:
-    """Return an agent for a policy of any library: observations [n, F] float32 -> actions [n, 1], or indices [n].
+    """Return an agent that drives with a policy of any library.
 
-    A policy with a memory is a function ``(observation, state) -> (action, state)`` with an ``initial_state``, or a
-    model whose ``predict`` returns a state.
+    The policy maps observations, float32 [n, F], to actions [n, 1] or to indices of discrete actions [n]. A policy with
+    a memory is a function ``(observation, state) -> (action, state)`` for which you pass ``initial_state``, or a model
+    whose ``predict`` also returns a state.
 
     Args:
-        policy: one of the following objects, which all copies of the agent share.
+        policy: one of the following objects. Copies of the agent use the same object.
 
-            - a function of observations;
-            - a model with ``predict``. A Stable-Baselines3 model is called deterministically, with the statistics of
-              its ``VecNormalize`` and a separate memory for each world;
+            - a function that maps observations to actions;
+            - a model with a method ``predict``. A Stable-Baselines3 model is called with ``deterministic=True``, with
+              the statistics of its ``VecNormalize``, and with a separate memory for each world;
             - a torch module, called without gradients;
             - an ONNX session, or the path of an ``.onnx`` file.
         name: name of the agent in tables and messages; None: the name of the function or class.
-        scenario: scenario, or its name, in which the policy was trained; it defines the observation. None: unknown.
-        observation: the observation that the policy takes, in place of the scenario's (see ``choose_observation``).
-            None: the scenario's observation. Without a scenario, None means the observation of the policy or of the
-            Stable-Baselines3 model's environment, or the default observation.
-        initial_state: function that returns the memory at the start of n episodes: an array with one row per world, or
-            tuples and mappings of such arrays. None: the policy is a function without memory, or a model.
-        clip: whether actions are clipped to [-1, 1], and indices to the valid range. If False, a value outside its
-            range is an error.
-        appended: features that were appended to each observation in training, as for ``make_sb3_vec_env``: ``number``
-            (the learner's number) or ``state`` (the true state of the line). This argument needs ``scenario``. None:
-            the same as in the model's training environment, or no features.
-        ignore_wrappers: whether to accept a model whose training wrappers may have changed observations or actions,
-            whose actions have other bounds, or whose ``VecNormalize`` statistics are missing.
-        actions: number of discrete actions, if the policy returns the index of one. None: the same as in the model's
-            environment, or actions in [-1, 1].
+        scenario: scenario (or its name) in which the policy was trained; it determines what the policy observes. None:
+            unknown.
+        observation: features that the policy observes, instead of the scenario's observation (see
+            ``choose_observation``). None: the scenario's observation. If ``scenario`` is None as well: the observation
+            of the model's training environment or of the policy, if known; otherwise the default observation.
+        initial_state: function that returns the policy's memory at the start of n episodes: an array with one row per
+            world, or tuples and mappings of such arrays. None: the policy has no memory, or is a model with
+            ``predict``.
+        clip: True: an action is clipped to [-1, 1], and an index of a discrete action to the valid range. False: an
+            action or index outside its range is an error.
+        appended: features that were appended to each observation in training, as in ``make_sb3_vec_env``: ``number``
+            (the learner's number) or ``state`` (the true state of the line). If you pass ``appended``, also pass
+            ``scenario``. None: the features of the model's training environment, if known; otherwise no features.
+        ignore_wrappers: whether to accept a model if wrappers of its training environment may have changed observations
+            or actions, if its actions have other bounds, or if its ``VecNormalize`` statistics are missing.
+        actions: number of discrete actions, for a policy that returns the index of an action. None: the number in the
+            model's training environment, if known; otherwise the policy returns actions in [-1, 1].
 
-    Raises ``InvalidInput`` if ``policy`` is none of these objects, if the policy takes another number of features, and
-    if the policy was trained under wrappers that may change observations or actions.
+    Raises ``InvalidInput`` if ``policy`` is none of these objects, if it takes another number of features than the
+    observation has, and if wrappers of its training environment may have changed observations or actions.
 
     >>> import ethbrake_marl as eb
     >>> agent = eb.policy_agent(lambda observation: -observation[:, :1].clip(0, 1), name="mine")
@@ -291,7 +296,7 @@ def policy_agent(
 
 
 def _check_action_space(policy: Any, name: str, actions: int | None) -> None:
-    """Raise ``InvalidInput`` if the policy has another action space than an environment with these ``actions``."""
+    """Raise ``InvalidInput`` unless the policy's action space is that of an environment with these ``actions``."""
     space = getattr(policy, "action_space", None)
     low, high = (np.asarray(getattr(space, end, np.nan)).tolist() for end in ("low", "high"))
     count, least = getattr(space, "n", None), getattr(space, "start", None)
@@ -306,10 +311,10 @@ def _check_action_space(policy: Any, name: str, actions: int | None) -> None:
 
 
 def _appending(appended: Appended, scenario: Scenario) -> Callable[[Worlds, int], Observations]:
-    """Return a function ``(worlds, vehicle)`` that computes the K features appended to a vehicle's observation, [n, K].
+    """Return a function ``(worlds, vehicle)`` that returns the features to append to the vehicle's observation, [n, K].
 
-    ``appended`` is ``number`` (the vehicle's position among the scenario's learners, from 0) or ``state`` (the true
-    state of the whole line).
+    For ``appended = "number"`` the feature is the number of the vehicle among the scenario's learners, from 0. For
+    ``appended = "state"`` the features are the true state of the whole line.
     """
 
     def number(worlds: Worlds, vehicle: int) -> Observations:
@@ -333,7 +338,7 @@ def _observation_of(policy: Any, scenario: Scenario | None, given: Observation |
 
 
 class PolicyAgent:
-    """Agent that drives one vehicle by a policy of any library; made by ``policy_agent``."""
+    """Agent that drives one vehicle with a policy of any library. The function ``policy_agent`` makes such agents."""
 
     knows = Source.MESSAGES
 
@@ -356,16 +361,16 @@ class PolicyAgent:
         self._actions = actions  # number of discrete actions, if the policy returns an index; None: no index
 
     def policy_sha256(self) -> str | None:
-        """Return the hash of the policy's present weights; None if they cannot be read."""
+        """Return the SHA-256 hash of the policy's present weights; None if the weights cannot be read."""
         return self.weights_sha256()
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Return the agent's memory before the first decision, with the policy's initial state.
+        """Return the agent's memory before the first decision, which contains the policy's initial memory.
 
         Args:
             alert: n worlds at the alert.
             vehicle: index of the controlled vehicle (0 = front).
-            scripts: the scripts of the line; not used.
+            scripts: the scripts of the line; the agent does not use them.
 
         """
         n, state = alert.n, None
@@ -377,10 +382,10 @@ class PolicyAgent:
         return {"steps": np.zeros(n, np.int64), "state": state}
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """Return the commanded acceleration of ``vehicle``, [n] m/s2, and the agent's new memory.
+        """Return the acceleration that the agent commands for ``vehicle``, [n] m/s2, and the agent's new memory.
 
-        Raises ``AgentFailed`` naming world and step if the policy raises an error, or returns a wrong shape, a value
-        that is not a number, or a value outside [-1, 1].
+        Raises ``AgentFailed``, which names world and step, if the policy raises an error, or returns an array of a
+        wrong shape, a value that is not a number, or an action outside its range.
         """
         seen = observe(worlds, vehicle, self.observation).astype(np.float32, copy=False)
         if self._more is not None:
@@ -402,9 +407,9 @@ class PolicyAgent:
             raise AgentFailed(self.name, k, reason) from error
 
     def _answer(self, seen: Observations, state: State, rows: Ints) -> tuple[NDArray[Any], State]:
-        """Return the policy's raw actions in the worlds with the indices ``rows``, and its new memory there.
+        """Return the policy's unchecked actions, and its new memory, for the worlds with the indices ``rows``.
 
-        ``seen`` [n, F] are the observations in all worlds, ``state`` is the policy's memory of all worlds.
+        ``seen`` [n, F] are the observations in all n worlds; ``state`` is the policy's memory for all n worlds.
         """
         if self._initial_state is None:
             return to_array(self._infer(seen[rows], None)[0]), None
@@ -412,9 +417,9 @@ class PolicyAgent:
         return to_array(action), checked_memory(state, len(rows))
 
     def _find_failing(self, seen: Observations, state: State) -> int | None:
-        """Find, by bisection, a world for which the policy fails when called for it alone; None if there is none.
+        """Find, by bisection, a world for which the policy fails even if called only for this world; None without one.
 
-        ``seen`` [n, F] are the observations in all worlds, ``state`` is the policy's memory of all worlds.
+        ``seen`` [n, F] are the observations in all n worlds; ``state`` is the policy's memory for all n worlds.
         """
 
         def fails(rows: Ints) -> bool:
@@ -434,9 +439,10 @@ class PolicyAgent:
         return int(rows[0])
 
     def _checked(self, action: NDArray[Any], seen: Observations, worlds: Worlds, steps: Ints) -> Floats:
-        """Return a policy's raw actions as [n] in [-1, 1]; raise ``AgentFailed`` for wrong shapes or values.
+        """Check the policy's output ``action``, and return the actions as an array [n] in [-1, 1].
 
-        ``seen``, ``worlds`` and ``steps`` [n] (number of steps so far) are for the error message only.
+        Raises ``AgentFailed`` for a wrong shape or value. ``seen``, ``worlds`` and ``steps`` [n] (number of steps so
+        far) are used only in the error message.
         """
         n, what = worlds.n, f"returned {action.dtype} of shape {action.shape} for observations of shape {seen.shape}"
         if self._actions is not None:
@@ -458,7 +464,7 @@ class PolicyAgent:
         return values.clip(-1.0, 1.0)
 
     def _checked_indices(self, indices: NDArray[Any], count: int, what: str, worlds: Worlds, steps: Ints) -> Floats:
-        """Check the indices of discrete actions and return the actions as [n] in [-1, 1]."""
+        """Check the indices of discrete actions, and return the actions that they select, [n] in [-1, 1]."""
         n, last = worlds.n, count - 1
         right = f"must be a whole number from 0 to {last} per world with actions={count}, shape ({n},) or ({n}, 1)"
         if indices.shape not in ((n,), (n, 1)) or indices.dtype.kind not in "iu":

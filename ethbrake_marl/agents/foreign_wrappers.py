@@ -1,7 +1,8 @@
 """Find wrappers in a Stable-Baselines3 model's training environment that may change observations or actions.
 
-An agent calls the model without these wrappers, so the model would get other observations than in training, or its
-actions would have other effects. The checks need neither Stable-Baselines3 nor the wrappers' libraries.
+The agent made from the model does not apply these wrappers. Therefore the model would get other observations than in
+training, or its actions would have other effects. The checks run without importing Stable-Baselines3 or the libraries
+of the wrappers.
 """
 
 from __future__ import annotations
@@ -40,9 +41,10 @@ _INSIDE = ("venv", "envs", "vec_envs", "par_env", "aec_env", "env")  # attribute
 
 
 def changes(layer: type[Any]) -> bool:
-    """Return whether a class of wrappers or environments may change observations or actions.
+    """Return whether ``layer``, a class of wrappers or environments, may change observations or actions.
 
-    The result is False if a class in ``HARMLESS``, or a class of this package, defines each method in ``_METHODS``.
+    The result is False if each method in ``_METHODS`` is defined by a class in ``HARMLESS`` or by a class of this
+    package.
     """
     for method in _METHODS:
         definer = next((each for each in layer.__mro__ if method in vars(each)), object)
@@ -58,22 +60,23 @@ class _WhatChanges(type):
 
 
 class _Changing(metaclass=_WhatChanges):
-    """Class for ``env_is_wrapped``: its instances are all objects whose class may change observations or actions.
+    """Class for the argument of ``env_is_wrapped``: ``isinstance(x, _Changing)`` is ``changes(type(x))``.
 
     ``env_is_wrapped`` also works for environments in other processes, where ``changes`` cannot be called directly.
     """
 
 
 def training_environment(model: Any, name: str, *, ignore_wrappers: bool = False) -> Any:
-    """Return this package's environment inside the training environment of a Stable-Baselines3 model.
+    """Return the environment of this package in which a Stable-Baselines3 model was trained, without its wrappers.
 
     Args:
-        model: any policy; the result is None for a policy without an environment of this package.
+        model: any policy. The result is None if it was not trained in an environment of this package.
         name: name of the agent in error messages.
-        ignore_wrappers: whether to skip all checks.
+        ignore_wrappers: whether to return the environment without checking its wrappers.
 
-    Raises ``InvalidInput`` if a wrapper in any parallel copy of the environment may change observations or actions, if
-    the copies observe different features, and if the statistics of ``VecNormalize`` are missing.
+    A model may be trained in several copies of an environment at the same time. Raises ``InvalidInput`` if a wrapper of
+    any copy may change observations or actions, if the copies differ in their features or number of actions, and if the
+    statistics of ``VecNormalize`` are missing.
 
     """
     statistics = normalisation(model)
@@ -111,15 +114,15 @@ def training_environment(model: Any, name: str, *, ignore_wrappers: bool = False
 
 
 def normalisation(model: Any) -> Any:
-    """Return the ``VecNormalize`` under which the model is trained, with its present statistics; None without one."""
+    """Return the model's ``VecNormalize`` wrapper, with its present statistics; None if there is no such wrapper."""
     return getattr(model, "get_vec_normalize_env", lambda: None)()
 
 
 def _was_normalised(model: Any) -> bool:
-    """Return whether the saved training data of a Stable-Baselines3 model show that its observations were normalised.
+    """Return whether the data saved with a Stable-Baselines3 model show that training normalised the observations.
 
-    This is so if the last observation lies outside the observation space, or if the model also saved the observation
-    before normalisation. Off-policy algorithms always save the observation before normalisation, so for them only the
+    The result is True if the last saved observation lies outside the observation space, or if the model also saved this
+    observation as it was before normalisation. Off-policy algorithms save the latter in any case; for them only the
     observation space is checked.
     """
     if getattr(model, "_last_original_obs", None) is not None and not hasattr(model, "replay_buffer"):
@@ -130,9 +133,10 @@ def _was_normalised(model: Any) -> bool:
 
 
 def _layers(env: Any) -> Iterator[Any]:
-    """Yield an environment, then all wrappers and environments inside it, including all parallel copies.
+    """Yield ``env``, then all wrappers and environments inside it, from the outside in.
 
-    The order is from the outside in. Nothing inside an environment of this package is yielded.
+    If there are several copies of an environment, all of them are yielded. Nothing inside an environment of this
+    package is yielded.
     """
     yield env
     for name in [] if _is_ours(env) else _INSIDE:
@@ -142,14 +146,14 @@ def _layers(env: Any) -> Iterator[Any]:
 
 
 def _look(layer: Any, name: str) -> tuple[str | None, list[Any]]:
-    """Check one layer for changes of observations or actions, and for environments of this package.
+    """Return which class in a layer may change observations or actions, and which environments of this package it has.
 
     Args:
         layer: a wrapper or environment, from ``_layers``.
         name: name of the agent in error messages.
 
-    Returns the name of the class that may change observations or actions, or None; and the environments of this
-    package: the layer itself, or environments that the layer runs in other processes.
+    Returns two values. The first is the name of a class that may change observations or actions, or None. The second is
+    a list of environments of this package: the layer itself, or environments that it runs in other processes.
 
     """
     if changes(type(layer)):
@@ -174,5 +178,5 @@ def _is_ours(env: Any) -> bool:
 
 
 def _own(layer: Any) -> dict[str, Any]:
-    """Return the attributes of a wrapper itself, without attributes that it forwards from the environment inside."""
+    """Return the wrapper's own attributes, without attributes of the environment inside that the wrapper forwards."""
     return getattr(layer, "__dict__", {})

@@ -1,4 +1,4 @@
-"""An agent that drives by a trained policy, without randomness."""
+"""An agent that drives with a trained policy and always applies the policy's deterministic action."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ class LearnedPolicy(Protocol):
 
     @property
     def observation(self) -> ObservationSpec:
-        """The observation that the policy takes: features in their order."""
+        """The features that the policy observes, in the order of its inputs."""
         ...
 
     def __call__(self, observation: Observations, /) -> Observations:
-        """Return the action for each observation: [n, F] -> [n, 1] in [-1, 1]; each row is computed independently."""
+        """Return one action for each observation: [n, F] -> [n, 1] in [-1, 1]; each depends on its observation only."""
         ...
 
 
 class LearnedAgent(ByPolicy):
-    """Agent that drives one vehicle by the deterministic action of a ``policy``, without a memory.
+    """Agent that drives one vehicle with the deterministic actions of ``policy``. The agent has no memory.
 
     ``name`` is the name of the agent in tables and error messages.
 
@@ -48,7 +48,7 @@ class LearnedAgent(ByPolicy):
         self.name = name
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        """Return the commanded acceleration of ``vehicle`` (index, 0 = front) in each of n worlds, [n] m/s2."""
+        """Return the acceleration that the agent commands for ``vehicle`` (index, 0 = front) in n worlds, [n] m/s2."""
         action = self.policy(observe(worlds, vehicle, self.policy.observation)).astype(np.float64)
         if action.shape != (worlds.n, 1):
             raise InvalidInput(

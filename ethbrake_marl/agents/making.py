@@ -1,4 +1,4 @@
-"""Make agents from their names: ``make_agent`` for a driver, ``make_role`` for a vehicle of a scenario."""
+"""Make agents from specifications: ``make_agent`` makes any agent, ``make_role`` the script of a vehicle."""
 
 from __future__ import annotations
 
@@ -31,23 +31,26 @@ def make_agent(
     uncertainty: object = None,
     time_step_s: float | None = None,
 ) -> Driver:
-    """Make a new agent, which drives one vehicle, or a team of agents from one training run.
+    """Make a new agent, which drives one vehicle, or the team of agents that one training run has trained.
 
     Args:
         spec: ``name[:argument][@policy]``, followed by wrappers, for example ``constant:3.5``, ``planner:64`` or
             ``ppo+search+step``. ``ethbrake agent list`` lists all agents and wrappers. ``my_file.py:make_agent`` runs
-            ``my_file.py`` with all your rights, and calls ``make_agent`` with the arguments of a factory (see
-            ``register_agent``), or without arguments if the function has no parameters.
+            ``my_file.py`` with all your rights, and calls its function ``make_agent`` with the arguments of a factory
+            (see ``register_agent``), or without arguments if the function has no parameters.
         scenario: scenario, its name, or the path of its file; teams and wrappers need it.
-        harm_count: impacts whose harm an optimising agent minimises: ``first`` (each pair's first) or ``total`` (all).
+        harm_count: harm that an optimising agent minimises: ``first`` (each pair's first impact) or ``total`` (all
+            impacts).
         horizon_s: time after the alert until which an agent looks ahead, s; None: the scenario's horizon, or 8 s.
-        most_candidates: upper limit for the candidates of a search, to try an agent out quickly.
-        uncertainty: uncertainty of the worlds, for a shield that takes it into account, for example ``"gaps_m=0.5"``.
+        most_candidates: a search tries at most this number of plans; a small number makes a quick trial possible. None:
+            no limit.
+        uncertainty: how far gaps, speeds and so on may differ from their stated values, for a shield that takes this
+            into account, for example ``"gaps_m=0.5"``.
         time_step_s: time between two decisions of agents that search or follow a control law, s; None: the scenario's
             time step, or 0.1 s.
 
-    Raises ``UnknownName`` with a suggestion for an unknown name; ``InvalidInput`` for an invalid argument, harm count
-    or horizon, and for a missing scenario.
+    Raises ``UnknownName`` for an unknown name, with a similar name as a suggestion. Raises ``InvalidInput`` for an
+    invalid argument, harm count or horizon, and if the agent needs a scenario and none is passed.
 
     >>> import ethbrake_marl as eb
     >>> eb.make_agent("ppo+step", scenario="paper-random").name
@@ -85,11 +88,11 @@ def _make_driver(written: AgentSpec, settings: AgentSettings) -> Driver:
 
 
 def make_role(scenario: Scenario, vehicle: int, *, most_candidates: int | None = None) -> Agent:
-    """Make the agent that the scenario assigns to ``vehicle`` (index, 0 = front) as its script.
+    """Make the script of ``vehicle`` (index, 0 = front) in ``scenario``.
 
-    An optimising agent minimises first-impact harm. ``most_candidates`` is the upper limit for the candidates of a
-    search; None: no limit. Raises the same errors as ``make_agent``. Raises ``InvalidInput`` for a script with a shield
-    or search around it, and for a team that does not include this vehicle.
+    A script that optimises harm minimises first-impact harm. A script that searches tries at most ``most_candidates``
+    plans; None: no limit. Raises the same errors as ``make_agent``. Also raises ``InvalidInput`` for a script with a
+    shield or search around it, and for a team that does not drive exactly this vehicle.
     """
     spec = scenario.scripts[vehicle]
     name, _, argument = spec.partition(":")
@@ -110,8 +113,9 @@ def make_role(scenario: Scenario, vehicle: int, *, most_candidates: int | None =
 def find_entry(spec: AgentSpec | str) -> Entry:
     """Return the registry entry of an agent.
 
-    ``spec`` is a specification such as ``planner:64`` or ``ppo``, as a text or parsed. Raises ``UnknownName`` with a
-    suggestion for an unknown agent, and ``InvalidInput`` for an argument or a policy that the agent does not take.
+    ``spec`` is a specification such as ``planner:64`` or ``ppo``, either the text or an ``AgentSpec``. Raises
+    ``UnknownName`` for an unknown agent, with a similar name as a suggestion. Raises ``InvalidInput`` for an argument
+    or policy that the agent does not accept.
     """
     written = parse_spec(spec) if isinstance(spec, str) else spec
     if written.file is not None:
@@ -138,13 +142,13 @@ def find_entry(spec: AgentSpec | str) -> Entry:
 def _make(entry: Entry, argument: str | None, settings: AgentSettings, *inside: Driver) -> Driver:
     """Make an agent or a team from its registry entry, and check the result.
 
-    An error in a factory outside this package becomes an ``InvalidInput``.
+    If a factory from outside this package raises an error, the function raises ``InvalidInput`` instead.
 
     Args:
         entry: the registry entry.
         argument: text after the colon in the specification; None if there is no colon.
-        settings: settings for the factory.
-        inside: the agent or team to wrap, if the entry is a shield or a search; otherwise empty.
+        settings: settings, which are passed to the factory.
+        inside: for a shield or a search: the agent or team to wrap; for an agent: nothing.
 
     """
     try:
@@ -161,9 +165,9 @@ def _make(entry: Entry, argument: str | None, settings: AgentSettings, *inside: 
 def make_from_file(argument: str | None, settings: AgentSettings) -> Driver:
     """Call the function in a Python file that ``settings.spec`` names (``FILE.py:FUNCTION``), and return its result.
 
-    The function is called with ``argument`` (the text after the second colon, or None) and ``settings``. If it has no
-    parameters, it is called without arguments; an argument or a policy in the specification is then an error. Raises
-    ``InvalidInput`` for this error, and if the file cannot be loaded.
+    The function is called with ``argument`` (the text after the second colon, or None) and ``settings``. A function
+    without parameters is called without arguments. Raises ``InvalidInput`` if the file cannot be loaded, and if the
+    function has no parameters but the specification contains an argument or a policy.
     """
     named = parse_spec(settings.spec).file
     assert named is not None

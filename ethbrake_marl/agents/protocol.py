@@ -1,8 +1,8 @@
-"""The interfaces of agents, teams and shielded drivers, and the names of their sources of knowledge.
+"""The interfaces of agents, teams and shields around agents, and the names of their sources of knowledge.
 
-The attribute ``knows`` of an agent states its sources of knowledge: one ``Source`` or its text, or several of these,
-for example for a policy behind a shield. A lossy or slow channel (``v2x``) limits only agents that use the first three
-sources.
+The attribute ``knows`` of an agent states its sources of knowledge: one ``Source`` (or its text), or several, for
+example for a policy behind a shield. Lost or late messages (``v2x``) affect only agents whose sources are ``SENSORS``,
+``MESSAGES`` or ``ESTIMATES``.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ethbrake_marl.physics.state import Floats, Worlds
 
 
 class Source(StrEnum):
-    """Sources of an agent's knowledge, in increasing order; each source includes the sources before it."""
+    """Sources of an agent's knowledge, from little to much knowledge. Each source includes the sources before it."""
 
     SENSORS = "own sensors"  # the own vehicle, and the neighbours that its sensors see
     MESSAGES = "messages"  # also the messages that the vehicle has received
@@ -33,17 +33,17 @@ class Source(StrEnum):
 
 
 class Knowledge(tuple[Source, ...]):
-    """Sources of knowledge of one or several agents: a tuple of different ``Source`` values in increasing order."""
+    """Sources of knowledge of one or several agents: different ``Source`` values, in the order of ``Source``."""
 
     @classmethod
     def of(cls, *agents: object, also: Source | None = None) -> Knowledge:
         """Return the combined knowledge of several agents or teams.
 
         Args:
-            agents: agents or teams; the knowledge of an agent without an attribute ``knows`` is ``UNSTATED``.
-            also: knowledge that a shield or search around the agents adds; None: no further knowledge.
+            agents: agents or teams; for an agent without an attribute ``knows``, the source is ``UNSTATED``.
+            also: source of knowledge that a shield or search around the agents adds; None: no further source.
 
-        Raises ``InvalidInput`` for an unknown source.
+        Raises ``InvalidInput`` if ``knows`` of an agent contains an unknown source.
 
         """
         known = set() if also is None else {also}
@@ -62,21 +62,21 @@ class Knowledge(tuple[Source, ...]):
 
     @property
     def text(self) -> str:
-        """All sources as one text, such as ``messages + true model``; a dash if there are no sources."""
+        """All sources as one text, such as ``messages + true model``, or a dash if there are no sources."""
         return " + ".join(self) or "–"
 
     @property
     def sees_through(self) -> bool:
-        """Whether the agent is omniscient: it knows the true state or the true model, which no message delivers."""
+        """Whether the agent is omniscient: it knows the true state or the true model, which no message contains."""
         return Source.STATE in self or Source.MODEL in self
 
 
 @runtime_checkable
 class Agent(Script, Protocol):
-    """Interface of an agent: a ``Script`` with a name, which drives one vehicle in every world of a batch of n worlds.
+    """Interface of an agent: a ``Script`` with a name, which drives one vehicle in each of n worlds at the same time.
 
-    The attribute ``knows`` may state the agent's sources of knowledge (``Source``); without it tables show "not
-    stated". An agent without a memory has one method, ``act(worlds, vehicle)``:
+    The attribute ``knows`` may state the agent's sources of knowledge (``Source``). For an agent without this
+    attribute, tables show "not stated". An agent without a memory has one method, ``act(worlds, vehicle)``:
 
     >>> import ethbrake_marl as eb
     >>> class HalfBrake:
@@ -111,7 +111,7 @@ def check_agent(agent: object, where: str, *, alone: bool = True) -> None:
     Args:
         agent: any object.
         where: beginning of the error message, for example ``agent 'mine'``.
-        alone: whether only an agent for one vehicle is accepted. If False, a team and a driver behind a shield are
+        alone: True: only an agent for one vehicle is accepted. False: a team, and an agent behind a shield, are
             accepted as well.
 
     """
@@ -136,18 +136,20 @@ def fixed_commands(
     is_fixed: Callable[[Script], bool] = is_state_free,
     advice: str = ADVICE,
 ) -> Floats:
-    """Return every vehicle's constant command from the alert on, [n, N] m/s2, for an agent that looks ahead.
+    """Return the constant command that each vehicle has from the alert on, [n, N] m/s2, for an agent that looks ahead.
 
     Args:
-        scripts: index of each scripted vehicle -> its script; vehicles without a script brake fully.
+        scripts: mapping from the index of each scripted vehicle to its script; vehicles without a script brake fully.
         worlds: n worlds at the alert.
-        who: name of the agent that looks ahead, with which error messages begin.
-        vehicle: index of the vehicle that this agent drives, whose script is ignored; None: no script is ignored.
+        who: name of the agent that looks ahead; error messages begin with this name.
+        vehicle: index of the vehicle that the agent drives; a script of this vehicle is ignored. None: no script is
+            ignored.
         is_fixed: function that returns whether the command of a script is fixed at the alert.
-        advice: end of the error message.
+        advice: end of the error message about a script whose command is not fixed at the alert.
 
-    Raises ``InvalidInput`` for a script whose command is not fixed at the alert, for worlds whose braking profiles
-    differ from the scripts' profiles, and if the messages lack a quantity that the agent needs to look ahead.
+    Raises ``InvalidInput`` for a script whose command is not fixed at the alert, if the braking profiles in ``worlds``
+    differ from the profiles of the scripts, and if the messages do not contain a quantity that the agent needs to look
+    ahead.
 
     """
     if vehicle is not None:
@@ -172,25 +174,25 @@ def fixed_commands(
 
 
 class ByPolicy:
-    """Base class of agents with an attribute ``policy``: a trained policy, or another agent that the agent wraps.
+    """Base class of agents whose attribute ``policy`` is a trained policy, or another agent that they wrap.
 
-    A subclass sets ``policy``; the hash and the manifest are read from ``policy``.
+    A subclass sets ``policy``. The base class reads hash and manifest from ``policy``.
     """
 
     policy: Any  # the trained policy, or the wrapped agent
 
     def policy_sha256(self) -> str | None:
-        """Return the SHA-256 of the policy; None if there is no policy, or if the policy has no hash."""
+        """Return the SHA-256 hash of the policy; None if there is no policy, or if the policy has no hash."""
         return policy_sha256(self.policy)
 
     @property
     def manifest(self) -> Any:
-        """Manifest of the policy's bundle (origin, network and hashes); None for a policy without a bundle."""
+        """Manifest (origin, network and hashes) of the policy bundle; None if the policy is not from a bundle."""
         return getattr(self.policy, "manifest", None)
 
 
 def policy_sha256(agent: object) -> str | None:
-    """Return the SHA-256 of the policy that an agent uses, also inside shields and searches; None without a policy.
+    """Return the SHA-256 hash of an agent's policy, also inside a shield or search; None if there is no policy.
 
     The hash of a policy bundle is the hash in its manifest, which covers names, network and weights. The hash of a
     policy of another library covers its weights.
@@ -200,11 +202,11 @@ def policy_sha256(agent: object) -> str | None:
 
 
 class AgentAround(ByPolicy):
-    """Base class of agents that wrap another agent, called ``policy``.
+    """Base class of agents that wrap another agent, which is the attribute ``policy``.
 
-    By default ``begin`` and ``act`` call the wrapped agent. A subclass overrides ``begin``, ``act`` or both. The class
-    attribute ``adds`` is knowledge that the subclass uses in addition to the wrapped agent's, for example
-    ``Source.MODEL``, or None.
+    By default ``begin`` and ``act`` call the wrapped agent; a subclass overrides one or both of them. The class
+    attribute ``adds`` is a source of knowledge that the subclass uses in addition to the wrapped agent's sources, for
+    example ``Source.MODEL``; None: no further source.
 
     Args:
         policy: the agent to wrap.
@@ -220,12 +222,12 @@ class AgentAround(ByPolicy):
 
     @property
     def knows(self) -> Knowledge:
-        """Knowledge of the wrapped agent, plus ``adds``."""
+        """Sources of knowledge of the wrapped agent, and the source ``adds``."""
         return Knowledge.of(self.policy, also=self.adds)
 
     @property
     def time_step_s(self) -> float | None:
-        """Time between two decisions that the wrapped agent requires, s; None: any time."""
+        """Time between two decisions that the wrapped agent requires (s); None: the wrapped agent accepts any time."""
         return getattr(self.policy, "time_step_s", None)
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
@@ -234,45 +236,45 @@ class AgentAround(ByPolicy):
         Args:
             alert: n worlds at the alert.
             vehicle: index of the controlled vehicle (0 = front).
-            scripts: index of each scripted vehicle -> its script.
+            scripts: mapping from the index of each scripted vehicle to its script.
 
         """
         return begin_script(self.policy, alert, vehicle, scripts)
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """Return the wrapped agent's command for ``vehicle``, [n] m/s2, and its new memory."""
+        """Return the wrapped agent's command for ``vehicle``, [n] m/s2, and the wrapped agent's new memory."""
         return ask_script(self.policy, worlds, memory, vehicle)
 
 
 @runtime_checkable
 class Shielding(Protocol):
-    """Interface of an agent or team behind a shield, before its vehicles are chosen."""
+    """Interface of an agent or team behind a shield. The method ``on`` chooses the vehicles that it drives."""
 
     name: str  # name of the agent or team in tables and messages
 
     @property
     def knows(self) -> Knowledge:
-        """Combined knowledge of the agents and the shield."""
+        """Sources of knowledge of the agents and of the shield together."""
 
     def on(self, vehicles: Collection[int]) -> Team:
         """Return a team behind this shield that drives ``vehicles`` (indices, 0 = front)."""
 
     def guard(self, engine: Engine, policies: Mapping[int, Agent]) -> Guard:
-        """Return the guard, the object with which the shield checks commands in ``engine``.
+        """Return the guard: the object that checks commands in ``engine`` for the shield.
 
         ``policies`` maps the index of each learner to the agent that proposes its commands.
         """
 
 
 class Team:
-    """Agents that drive several vehicles together. Each agent decides from the knowledge of its own vehicle.
+    """Agents that drive several vehicles of one line. Each agent uses only the knowledge of the vehicle that it drives.
 
     The same agent may drive several vehicles, with a separate memory for each.
 
     Args:
-        drivers: index of each controlled vehicle (0 = front) -> its agent.
+        drivers: mapping from the index of each controlled vehicle (0 = front) to its agent.
         name: name of the team in tables and messages.
-        shield: shield that decides on the commands, so that the agents only propose them; None: no shield.
+        shield: shield that checks the agents' commands and may replace them; None: no shield.
 
     Raises ``InvalidInput`` for an invalid agent or index.
 
@@ -297,14 +299,15 @@ class Team:
 
     @property
     def knows(self) -> Knowledge:
-        """Combined knowledge of the agents and the shield; empty for a team without agents."""
+        """Sources of knowledge of the agents and of the shield together; empty for a team without agents and shield."""
         return Knowledge.of(*self.drivers.values(), *(() if self.shield is None else (self.shield,)))
 
     @staticmethod
     def of(driver: Driver, vehicles: Collection[int]) -> Team:
         """Return the team in which ``driver`` drives the vehicles with the indices ``vehicles`` (0 = front).
 
-        A single agent drives all these vehicles. Raises ``InvalidInput`` for a team that drives other vehicles.
+        If ``driver`` is a single agent, it drives all these vehicles. Raises ``InvalidInput`` if ``driver`` is a team
+        that drives other vehicles.
         """
         if isinstance(driver, Shielding):
             return driver.on(vehicles)

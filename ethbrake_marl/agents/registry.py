@@ -1,7 +1,7 @@
-"""Registries of agents, of shields and searches, of variants, and of groups of agents.
+"""Four registries: agents; shields and searches; variants of agents and shields; and groups of agents.
 
-Names are entry points (``pyproject.toml``), which are loaded on first use (``ethbrake_marl.registry``). This module
-therefore need not import policies, searches and shields, which depend on it.
+The registered names are entry points (``pyproject.toml``), which are loaded on first use (``ethbrake_marl.registry``).
+Therefore this module need not import policies, searches and shields, which import this module.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from ethbrake_marl.scenario.roles import ScriptSpec
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """Registry entry of an agent, or of a wrapper: a shield or a search that wraps an agent.
+    """Registry entry of an agent or of a wrapper. A wrapper is a shield or a search around an agent.
 
-    A wrapper is written after a ``+``: ``ppo+step`` is the agent ``ppo`` behind the shield ``step``.
+    In an agent specification, a wrapper stands after a ``+``: ``ppo+step`` is the agent ``ppo`` behind the shield
+    ``step``.
     """
 
     name: str  # plain name, without argument
@@ -37,7 +38,7 @@ class Entry:
 
     @property
     def is_ours(self) -> bool:
-        """Whether the agent belongs to this package. Errors in other agents are reported with the agent's name."""
+        """Whether the agent is part of this package. For errors in other agents, the message names the agent."""
         is_from_file = ":" in self.name
         return str(getattr(self.make, "__module__", "")).startswith("ethbrake_marl.") and not is_from_file
 
@@ -45,13 +46,14 @@ class Entry:
     def whole_form(self) -> str:
         """``form`` followed by each registered variant in brackets, for example ``e_v2x_bm[:pairwise][:estimated]``.
 
-        A variant is a last word that selects another function to make the agent or wrapper.
+        A variant, such as ``:estimated``, is the last word of a specification. It selects another function that makes
+        the agent or wrapper.
         """
         return self.form + "".join(f"[:{variant}]" for variant in variants_of(self.name))
 
     @property
     def words(self) -> tuple[str, ...]:
-        """Every text of a wrapper after the ``+`` of a specification, for example ``("step", "step:estimated")``.
+        """All texts that can follow ``+`` to select this wrapper, for example ``("step", "step:estimated")``.
 
         The tuple is complete only if ``form`` lists all arguments of the wrapper.
         """
@@ -62,7 +64,7 @@ class Entry:
         return tuple(words)
 
     def takes(self, argument: str) -> bool:
-        """Return whether a wrapper takes ``argument``, the text after the colon; "" means no argument."""
+        """Return whether the wrapper accepts ``argument``, the text after the colon; "" means no argument."""
         name = self.words[0]
         return "[:ARGUMENT]" in self.form or (f"{name}:{argument}" if argument else name) in self.words
 
@@ -70,10 +72,10 @@ class Entry:
         """Make the agent or wrapper.
 
         Args:
-            argument: text after the first colon, such as ``pairwise``; None: no argument. If the last word is a
-                registered variant (``pairwise:estimated``), the variant's function is called.
+            argument: text after the first colon, such as ``pairwise``; None: no argument. If the last word of
+                this text is a registered variant (``pairwise:estimated``), the variant's function is called.
             settings: settings for the function that makes the agent or wrapper.
-            inside: the agent or team to wrap, if this is the entry of a wrapper; otherwise empty.
+            inside: for a wrapper: the agent or team to wrap; for an agent: nothing.
 
         """
         make: Any = self.make
@@ -85,7 +87,7 @@ class Entry:
 
 
 def around_entry(each: str) -> Entry:
-    """Return the entry of a shield or search, given the text after the ``+``, such as ``episode:pairwise``."""
+    """Return the registry entry of the shield or search whose text after the ``+`` is ``each``."""
     return SHIELDS[each.partition(":")[0]]
 
 
@@ -95,16 +97,16 @@ def agent_names() -> tuple[str, ...]:
 
 
 def agent_entries() -> tuple[Entry, ...]:
-    """Return the loadable registry entries of all agents, then of all shields and searches.
+    """Return the registry entries of all agents, then of all shields and searches.
 
-    The form and description of an entry include its variants.
+    Entries that fail to load are left out. The form and description of each entry include its variants.
     """
     agents = [entry for name, entry in AGENTS.usable().items() if name != PROFILE]
     return tuple(_with_variants(entry) for entry in (*agents, *SHIELDS.usable().values()))
 
 
 def _with_variants(entry: Entry) -> Entry:
-    """Return ``entry`` with its loadable variants in ``form`` and ``about``.
+    """Return ``entry`` with its variants added to ``form`` and ``about``, without variants that fail to load.
 
     For example, the form ``e_v2x_bm`` becomes ``e_v2x_bm[:estimated]``, and the description of the variant is added.
     """
@@ -116,23 +118,24 @@ def _with_variants(entry: Entry) -> Entry:
 
 
 def agents_refused() -> list[str]:
-    """Return one sentence with the reason for each registered agent, shield or variant that cannot be loaded."""
+    """Return, for each registered agent, shield or variant that cannot be loaded, one sentence with the reason."""
     reasons = [each.why_not(name) for each in (AGENTS, SHIELDS, VARIANTS) for name in each]
     return [reason for reason in reasons if reason is not None]
 
 
 def around_forms() -> tuple[str, ...]:
-    """Return the text of every shield and search after the ``+`` of a specification.
+    """Return all texts that can follow the ``+`` of a specification to select a shield or search.
 
-    Each argument and variant has a text of its own, for example ``("search", "episode", "episode:pairwise")``.
+    A shield with different arguments or variants appears several times, as in ``("search", "episode",
+    "episode:pairwise")``.
     """
     return tuple(word for entry in SHIELDS.usable().values() for word in entry.words)
 
 
 def shield_forms() -> tuple[str, ...]:
-    """Return the text of every shield after the ``+`` of a specification: ``("episode", "robust:interior", ...)``.
+    """Return all texts after ``+`` that select a shield without a variant: ``("episode", "robust:interior", ...)``.
 
-    Each argument has a text of its own. Variants and searches are not included.
+    A shield with different arguments appears several times.
     """
     return tuple(each for each in around_forms() if not (around_entry(each).inner or is_variant(each)))
 
@@ -144,20 +147,20 @@ def around_one_vehicle() -> list[str]:
 
 
 def shield_settings(name: object) -> Any:
-    """Return the settings class of the shield called ``name``; None if it cannot wrap environments or is unknown."""
+    """Return the settings class of the shield ``name``; None if the shield is unknown or cannot wrap environments."""
     return SHIELDS[name].options if isinstance(name, str) and name in SHIELDS else None
 
 
 def shield_modes() -> dict[str, Any]:
-    """Return name -> settings class of every loadable shield that can also wrap environments."""
+    """Return a mapping from the name of each shield that can also wrap environments to its settings class."""
     return {name: entry.options for name, entry in SHIELDS.usable().items() if entry.options is not None}
 
 
 def variants_of(name: str) -> tuple[str, ...]:
     """Return the variants of the agent or shield called ``name``, for example ``("estimated",)``.
 
-    A variant is written as the last word, as in ``episode:pairwise:estimated``. If a variant is written, another
-    function makes the agent or shield.
+    In a specification the variant is the last word, as in ``episode:pairwise:estimated``. It selects another function
+    that makes the agent or shield.
     """
     keys = (key.rpartition(".") for key in VARIANTS)
     return tuple(variant for of, _, variant in keys if of == name)
@@ -166,16 +169,16 @@ def variants_of(name: str) -> tuple[str, ...]:
 def is_variant(form: str) -> bool:
     """Return whether the last word of ``form`` is a registered variant, as in ``step:estimated``.
 
-    ``form`` is the text of an agent or shield with its argument, without ``+``.
+    ``form`` is the name of an agent or shield with its argument and variant, but without a ``+``.
     """
     return form.rpartition(":")[2] in variants_of(form.partition(":")[0])
 
 
 def settings_needed(shield: str | None) -> Mapping[str, object]:
-    """Return the settings that a shield requires: name -> example, such as ``{"uncertainty": "gaps_m=0.5"}``.
+    """Return the names of the settings that a shield requires, with examples: ``{"uncertainty": "gaps_m=0.5"}``.
 
-    ``shield`` is the text of a shield with its argument, such as ``robust`` or ``episode:pairwise``. The result is
-    empty for None and for a variant, such as ``robust:estimated``.
+    ``shield`` is a shield with its argument, such as ``robust`` or ``episode:pairwise``, or None. The result is empty
+    if ``shield`` is None or has a variant, such as ``robust:estimated``.
     """
     return {} if shield is None or is_variant(shield) else around_entry(shield).needs
 
@@ -186,15 +189,16 @@ def shields_with(setting: str) -> tuple[str, ...]:
 
 
 def group_names() -> tuple[str, ...]:
-    """Return the names of groups of agents, such as ``ladder``, which the command option ``--agents`` accepts."""
+    """Return the names of all groups of agents, such as ``ladder``. The option ``--agents`` accepts these names."""
     return tuple(dict.fromkeys(name.partition(".")[0] for name in GROUPS))
 
 
 def agents_of_group(group: str) -> tuple[str, ...]:
     """Return the specifications of all agents in ``group``, a name from ``group_names``.
 
-    A group can be extended: agents registered under ``ladder.search``, or another ``ladder.WORD``, follow the agents
-    registered under ``ladder``, in alphabetical order of these names.
+    Extensions can add agents to a group. For example, agents that are registered under a name ``ladder.WORD`` belong to
+    the group ``ladder``. They follow the agents that are registered under ``ladder``, in alphabetical order of the
+    names.
     """
     return tuple(spec for name in sorted(GROUPS) if name.partition(".")[0] == group for spec in GROUPS[name])
 
@@ -210,21 +214,22 @@ def register_agent(
 ) -> None:
     """Register an agent, so that ``make_agent`` and every command accept ``name`` and ``name:argument``.
 
-    An installed package registers an agent with an entry point of the group ``ethbrake_marl.agents``: its factory, or
-    ``Part(factory, about=...)`` with arguments of this function.
+    An installed package registers an agent with an entry point of the group ``ethbrake_marl.agents``. The entry point
+    is the factory, or ``Part(factory, about=...)`` with further arguments of ``register_agent``.
 
     Args:
-        name: plain name without argument.
-        factory: ``factory(argument, settings)`` makes the agent; ``argument`` is the text after the colon, or None, and
-            ``settings`` an ``AgentSettings``.
-        about: description in one line, for ``ethbrake agent list``.
-        knows: sources of the agent's knowledge while it drives, for ``ethbrake agent list``.
-        form: syntax of the agent, for ``ethbrake agent list``; None: ``name[:ARGUMENT]``. If this text has no ``:``,
-            the agent takes no argument; if it has no ``@``, the agent takes no policy.
-        takes_policy: whether ``name@policy`` is allowed; ``AgentSettings.policy`` is then the policy.
+        name: name of the agent or wrapper in specifications, without an argument.
+        factory: function ``factory(argument, settings)`` that makes the agent. ``argument`` is the text after the colon
+            of the specification, or None; ``settings`` is an ``AgentSettings``.
+        about: description in one line, which ``ethbrake agent list`` shows.
+        knows: sources of the agent's knowledge while it drives, which ``ethbrake agent list`` shows.
+        form: syntax of the agent's specification, which ``ethbrake agent list`` shows; None: ``name[:ARGUMENT]``. If
+            ``form`` has no ``:``, an argument is an error. If ``form`` has no ``@``, a policy is an error.
+        takes_policy: whether the specification ``name@policy`` is allowed; the factory finds the policy in
+            ``AgentSettings.policy``.
 
     Registering the same factory again has no effect. Raises ``AlreadyExists`` if the name belongs to another factory,
-    and ``InvalidInput`` for a name that is not plain.
+    and ``InvalidInput`` for an invalid name.
 
     """
     if ScriptSpec.parse(name) != ScriptSpec(name, None) or "@" in name:
@@ -247,26 +252,29 @@ def register_shield(
     needs: Mapping[str, object] | None = None,
     options: type | None = None,
 ) -> None:
-    """Register a shield or another wrapper, so that ``+name`` may follow every agent.
+    """Register a shield or search, so that ``+name`` may follow every agent in a specification.
 
-    An installed package registers a shield with an entry point of the group ``ethbrake_marl.shields``: its wrapper, or
-    ``Part(wrapper, about=...)`` with arguments of this function.
+    An installed package registers a shield with an entry point of the group ``ethbrake_marl.shields``. The entry point
+    is the wrapper, or ``Part(wrapper, about=...)`` with further arguments of ``register_shield``.
 
     Args:
-        name: plain name without argument.
-        wrapper: ``wrapper(agent, argument, settings)`` returns an agent that wraps ``agent``; ``argument`` is the text
-            after the colon, or None, and ``settings`` an ``AgentSettings``.
-        about: description in one line, for ``ethbrake agent list``.
-        knows: sources of knowledge that the wrapper adds to the agent's.
-        form: syntax of the wrapper, ``+name[:WORD]`` with every argument that it takes; None: any argument is allowed.
-        inner: whether the wrapper is a search, which wraps the agent itself and is written before any shield.
+        name: name of the agent or wrapper in specifications, without an argument.
+        wrapper: function ``wrapper(agent, argument, settings)`` that returns an agent around ``agent``. ``argument`` is
+            the text after the colon, or None; ``settings`` is an ``AgentSettings``.
+        about: description in one line, which ``ethbrake agent list`` shows.
+        knows: sources of knowledge that the wrapper uses in addition to the sources of the agent inside.
+        form: syntax of the wrapper, ``+name[:WORD]``, with each argument ``WORD`` that is allowed; None: all arguments
+            are allowed.
+        inner: whether the wrapper is a search. A search stands directly after the agent, before a shield:
+            ``ppo+search+step``.
         teams: whether the wrapper can also wrap a team.
-        needs: name of each required setting of ``AgentSettings`` -> example of its value; None: no required settings.
-        options: settings class of a shield (``shields.options.ShieldOptions`` or a subclass), which makes it available
-            as ``eb.shield(env, mode=name)``; None: the wrapper cannot wrap environments.
+        needs: mapping from the name of each required setting of ``AgentSettings`` to an example of its value; None: no
+            setting is required.
+        options: settings class (``shields.options.ShieldOptions`` or a subclass) of a shield that ``eb.shield(env,
+            mode=name)`` can put around environments; None: the wrapper cannot wrap environments.
 
     Registering the same wrapper again has no effect. Raises ``AlreadyExists`` if the name belongs to another wrapper,
-    and ``InvalidInput`` for a name that is not plain.
+    and ``InvalidInput`` for an invalid name.
 
     """
     if not isinstance(name, str) or not _PLAIN.fullmatch(name):
@@ -279,17 +287,17 @@ def register_shield(
 
 
 def register_variant(key: str, make: Factory | Wrapper, *, about: str = "a variant of your own") -> None:
-    """Register a variant of an agent or a shield: ``name:variant`` and ``name:argument:variant``.
+    """Register a variant of an agent or shield, for the specifications ``name:variant`` and ``name:argument:variant``.
 
     An installed package registers a variant with an entry point of the group ``ethbrake_marl.variants``.
 
     Args:
         key: ``name.variant``; for example, ``step.mine`` registers ``step:mine``, a variant of the shield ``step``.
-        make: function that replaces the factory or wrapper called ``name``, with the same arguments. The ``argument``
-            that this function gets does not contain the name of the variant.
-        about: description in one line, for ``ethbrake agent list``.
+        make: function that is called in place of the factory or wrapper ``name``, with the same arguments. Its
+            ``argument`` does not contain the name of the variant.
+        about: description in one line, which ``ethbrake agent list`` shows.
 
-    Raises ``AlreadyExists`` if the key belongs to another variant.
+    Raises ``AlreadyExists`` if another variant is registered under ``key``.
 
     """
     VARIANTS.add(key, Variant(make, about), lambda variant: variant.make is make)

@@ -1,4 +1,4 @@
-"""Scripts (full braking, coasting, a constant command, a profile), and registry entries of scripts and E-V2X-BM."""
+"""Scripts (full braking, coasting, a constant command, a profile), and the registry entries of scripts and E-V2X-BM."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from ethbrake_marl.scenario.roles import ScriptSpec
 class StateFree:
     """Agent with a fixed command: ``full_brake``, ``coast``, ``constant:a`` (deceleration in m/s2) or a ``profile``.
 
-    ``spec`` is one of these texts. A profile is a sequence of intervals with constant commands: this agent commands the
-    first interval, and the engine applies the later ones (``Worlds.play_pieces``). In the paper's non-ethical strategy
-    every vehicle follows ``full_brake``. Raises ``InvalidInput`` for any other text, and for a constant beyond the
-    vehicle's capacity.
+    ``spec`` is one of these four texts. A profile is a sequence of intervals with constant commands. For a profile,
+    this agent gives the command of the first interval, and the engine applies the commands of the later intervals
+    (``Worlds.play_pieces``). In the paper's non-ethical strategy every vehicle follows ``full_brake``. Raises
+    ``InvalidInput`` for any other ``spec``. ``act`` raises ``InvalidInput`` for a constant command beyond the vehicle's
+    capacity.
     """
 
     state_free = True
@@ -29,7 +30,7 @@ class StateFree:
         self.name, self.braking_pieces = spec, ScriptSpec.parse(spec).pieces
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        """Return the constant command of ``vehicle`` (index, 0 = front) in each of n worlds, [n] m/s2."""
+        """Return the fixed command for ``vehicle`` (index, 0 = front) in each of n worlds, [n] m/s2."""
         vehicles = worlds.vehicles
         command = ScriptSpec.parse(self.name).command(
             vehicles.braking_capacity_mps2[:, vehicle], vehicles.driving_capacity_mps2[:, vehicle]
@@ -39,7 +40,7 @@ class StateFree:
 
 
 def make_script(argument: str | None, settings: AgentSettings) -> Agent:
-    """Return the script that ``settings.spec`` names, such as ``constant:3.5``; ``argument`` is ignored."""
+    """Return the script with the specification ``settings.spec``, such as ``constant:3.5``; ``argument`` is ignored."""
     return StateFree(settings.spec)
 
 

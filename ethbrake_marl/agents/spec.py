@@ -1,10 +1,11 @@
 """The grammar of agent specifications: ``name[:argument][:variant][@policy]``, followed by wrappers.
 
 The wrappers are at most one search (``+search``), then at most one shield, for example ``+episode:pairwise`` or
-``+step``. A shield may have a variant as well. In place of ``name``, a function in a Python file makes the agent:
-``my_file.py:make_agent``.
+``+step``. A shield may also have a variant, as in ``+step:estimated``. ``name`` may be a function in a Python file that
+makes the agent: ``my_file.py:make_agent``.
 
-A path may contain the separators ``, + @ :``. If the path exists, it is not split at them.
+The path of a file or folder may contain the characters ``, + @ :``, which otherwise separate the words of a
+specification. An existing path is not split at these characters.
 """
 
 from __future__ import annotations
@@ -41,13 +42,13 @@ class AgentSpec:
 
     @property
     def file(self) -> tuple[str, str] | None:
-        """Path of the Python file and name of the function in it that makes the agent; None for any other agent."""
+        """For an agent from a Python file: path of the file and name of the function in it; None for other agents."""
         file, _, function = self.name.rpartition(":")
         return (file, function) if file else None
 
     @property
     def shield(self) -> str | None:
-        """Text of the shield after the ``+``, for example ``episode:pairwise``; None without a shield."""
+        """The shield as it stands after the ``+``, for example ``episode:pairwise``; None without a shield."""
         return self.around[-1] if self.around and not around_entry(self.around[-1]).inner else None
 
     def __str__(self) -> str:
@@ -55,12 +56,12 @@ class AgentSpec:
 
 
 def parse_spec(spec: str) -> AgentSpec:
-    """Parse an agent specification, such as ``ppo+step``. A path in it may contain any character.
+    """Parse an agent specification, such as ``ppo+step``. Paths in a specification may contain any character.
 
     ``ppo@c+step`` means the policy in the folder ``c+step`` if this folder exists, otherwise the policy in ``c`` behind
     a shield. ``ppo@c/+step`` always means the policy in ``c`` behind a shield. Raises ``InvalidInput`` for invalid
-    syntax, for two shields, and for a shield before a search. Raises ``UnknownName`` for an unknown wrapper and for the
-    old spelling ``X@shipped``.
+    syntax, for two shields, and for a shield before a search. Raises ``UnknownName`` for an unknown shield or search,
+    and for the old syntax ``X@shipped``.
     """
     core, around = _split_around(spec)
     if file := _python_file(core):
@@ -82,9 +83,9 @@ def parse_spec(spec: str) -> AgentSpec:
 def split_names(text: str, is_one: Callable[[str], bool] = os.path.lexists) -> list[str]:
     """Split a comma-separated list of names, some of which may contain commas.
 
-    ``is_one`` tests whether a text with commas is a single name; by default, whether a file or folder of this name
-    exists. The longest text for which ``is_one`` is true becomes a name; if there is none, the name ends at the next
-    comma.
+    ``is_one`` is a function that returns whether a text with commas is a single name. The default is that a file or
+    folder with this name exists. Each name is the longest text for which ``is_one`` returns True; if there is no such
+    text, the name ends at the next comma.
     """
     parts, names = text.split(","), list[str]()
     while parts:
@@ -96,7 +97,7 @@ def split_names(text: str, is_one: Callable[[str], bool] = os.path.lexists) -> l
 
 
 def split_specs(text: str) -> list[str]:
-    """Split a comma-separated list of agent specifications, such as ``coast,ppo``; existing paths are not split."""
+    """Split a comma-separated list of agent specifications, such as ``coast,ppo``, but not existing paths."""
     return split_names(text, _is_one_spec)
 
 
@@ -107,13 +108,13 @@ def _is_one_spec(text: str) -> bool:
 
 
 def _existing_file(core: str) -> str:
-    """Return the longest path of an existing Python file at the beginning of ``core``, or "" without one."""
+    """Return the longest path of an existing Python file with which ``core`` begins, or "" if there is none."""
     ends = (match.start() for match in re.finditer(r"(?<=\.py):", core))
     return max((core[:end] for end in ends if os.path.isfile(core[:end])), key=len, default="")
 
 
 def _python_file(core: str) -> str:
-    """Return the path of a Python file, existing or not, at the beginning of ``core``, or "" without one."""
+    """Return the path of the Python file with which ``core`` begins, even if it does not exist; "" if there is none."""
     return _existing_file(core) or (core.partition(":")[0] if _BEGINS_WITH_FILE.fullmatch(core) else "")
 
 
@@ -124,7 +125,7 @@ def _policy_path(core: str) -> str:
 def _strip_around(spec: str) -> tuple[str, list[str]]:
     """Split a specification into the agent and the list of its searches and shields.
 
-    The path of an existing policy is not split at a ``+``.
+    If the path of a policy exists, the path is not split at a ``+``.
     """
     core, around = spec, list[str]()
     while True:
@@ -157,11 +158,11 @@ def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
 def _is_meant_around(before: str, core: str, last: str) -> bool:
     """Return whether an unknown word after a ``+`` is probably a misspelt search or shield.
 
-    Otherwise the word is part of an argument or a path.
+    If the result is False, the word is part of an argument or a path.
 
     Args:
-        before: text of the specification before the ``+``.
-        core: text of the specification up to the end of the unknown word.
+        before: the specification up to the ``+``, without the ``+``.
+        core: the specification up to and including the unknown word.
         last: the unknown word.
 
     """

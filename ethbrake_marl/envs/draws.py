@@ -1,6 +1,6 @@
-"""Random draws of an environment's worlds: initial states, vehicle types and scenarios, as columns.
+"""Columns that describe what was drawn at random for each world: initial states, vehicle types and scenarios.
 
-A world is a function of scenario, seed and number. It is therefore drawn again on request, instead of being stored.
+Scenario, seed and number determine a world completely. Therefore a world is not stored but drawn again on request.
 """
 
 from __future__ import annotations
@@ -23,15 +23,16 @@ Columns = dict[str, NDArray[Any]]
 
 
 def describe_worlds(engine: Engine) -> Columns:
-    """Return the random draw of each running world, as columns such as ``{"gap_1_m": [n], "mass_2_t": [n]}``.
+    """Return what was drawn for each running world, as columns such as ``{"gap_1_m": [n], "mass_2_t": [n]}``.
 
     There is one column for each quantity of a world at the alert, with the same name as in a table of initial states.
-    For worlds that were drawn, a mixture adds the column ``scenario``, and vehicle types add ``vehicle_2_type`` and so
-    on. The columns ``world_seed`` and ``world`` contain the same numbers as the infos of these names.
+    If the scenario is a mixture, the column ``scenario`` names the drawn scenario; if it has vehicle types, columns
+    such as ``vehicle_2_type`` name the drawn types. The columns ``world_seed`` and ``world`` are the same as the infos
+    with these names.
 
-    Raises ``InvalidInput`` in two cases: the caller had passed the worlds, and the environment was then restored from a
-    snapshot, which does not contain them; or the physics failed before the first decision of a world, so that another
-    world replaced it.
+    Raises ``InvalidInput`` in two cases: if the caller passed the worlds, and the environment was later restored from a
+    snapshot, which does not contain these worlds; and if the physics failed in a world before its first decision, so
+    that another world replaced it.
     """
     numbers, placed = engine.roster.numbers, engine.roster.given
     named = {"world_seed": np.full(engine.n, engine.roster.seed), "world": numbers.copy()}
@@ -55,10 +56,10 @@ def describe_worlds(engine: Engine) -> Columns:
 
 
 def _drawn_again(engine: Engine, numbers: Ints) -> Sample:
-    """Draw the worlds of the training stream with these ``numbers`` again, and return them in the order of ``numbers``.
+    """Draw the worlds with these ``numbers`` in the training stream again; return them in the order of ``numbers``.
 
-    Raises ``InvalidInput`` if a drawn world differs from the running world, because the physics failed in the drawn
-    world before its first decision.
+    If the physics failed in a world before its first decision, another world replaced it. Raises ``InvalidInput`` if a
+    drawn world therefore differs from the running world.
     """
     ordered, places = np.unique(numbers, return_inverse=True)
     breaks = np.flatnonzero(np.diff(ordered) > _MOST_APART) + 1

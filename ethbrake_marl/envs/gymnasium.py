@@ -36,7 +36,7 @@ from ethbrake_marl.scenario.schema import Scenario
 class Specified:
     """Mixin for environments of ``gymnasium.make``, whose ``spec`` stores all settings as plain data for JSON.
 
-    For instance, a scenario object becomes a mapping, and a path becomes a text.
+    For instance, ``spec`` stores a scenario object as a mapping, and a path as a text.
     """
 
     engine: Engine  # engine that moves the worlds, set by the environment
@@ -45,9 +45,9 @@ class Specified:
 
     @property
     def spec(self) -> EnvSpec | None:
-        """Gymnasium's record of how the environment was made; None if ``gymnasium.make`` did not make it.
+        """Gymnasium's record of how ``gymnasium.make`` made the environment; None if it was made in another way.
 
-        Its ``max_episode_steps`` is an upper bound of the length of an episode.
+        ``spec.max_episode_steps`` is an upper bound of the number of steps of an episode.
         """
         return self._spec
 
@@ -64,7 +64,7 @@ class Specified:
 
 
 def _plain(setting: Any) -> Any:
-    """Return a setting of an environment as plain data for JSON."""
+    """Convert a setting of an environment to plain data for JSON."""
     if isinstance(setting, Scenario):
         return setting.declared()
     if isinstance(setting, RewardParams):
@@ -87,23 +87,28 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
 
     - Observation: the features of ``ObservationSpec``, float32 [F].
     - Action: an array [1] in [-1, 1]. -1 brakes with full capacity, 0 coasts, +1 drives with full capacity.
-    - End: an episode is *terminated* when all vehicles are at rest and no command would move one, *truncated* at the
-      horizon.
-    - Infos and options of ``reset``: docs/environments.md.
+    - End: an episode is *terminated* when all vehicles are at rest and no command would move one. If this does not
+      happen before the horizon, the episode is *truncated* at the horizon.
+    - Infos and options of ``reset``: see docs/environments.md.
 
     Args:
         scenario: name of a shipped scenario, path of a YAML file, or a ``Scenario``.
-        render_mode: ``human``, ``rgb_array``, ``rgb_array_list``, ``ansi``, or None (docs/environments.md).
-        learners: the vehicle that learns, by name (``vehicle_2``) or index (0 = front), in a list; None: the learner
-            of the scenario.
-        reward: reward of a step (``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``).
-        observation: features that the learner observes; None: the observation of the scenario (``observation_for``).
-        actions: None: an action is a number in [-1, 1]. A whole number K of at least 2: an action is the index of one
-            of K evenly spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
-        reward_vector: None: a reward is a number. ``vehicles``: a reward is an array [N], minus the harm that each
-            vehicle bears in the step. A list: a reward is an array with the named components (docs/environments.md).
+        render_mode: ``human``, ``rgb_array``, ``rgb_array_list`` or ``ansi`` (see docs/environments.md); None: no
+            pictures.
+        learners: a list with the one vehicle that learns, by name (``vehicle_2``) or index (0 = front); None: the
+            learner of the scenario.
+        reward: reward of a step: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams``
+            object.
+        observation: features that the learner observes; None: the features that belong to the scenario
+            (``observation_for``).
+        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete, and an action is
+            an index from 0 to K - 1. The indices stand for K evenly spaced numbers from -1 (full braking capacity) to 1
+            (full driving capacity).
+        reward_vector: None: a reward is a number. ``vehicles``: a reward is an array [N] with minus the harm that each
+            vehicle bears in the step. A list of components: a reward is an array with these components (see
+            docs/environments.md).
 
-    Raises ``InvalidInput`` unless there is exactly one learner.
+    Raises ``InvalidInput`` if the number of learners is not one.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.EthBrakeEnv("paper-random")
@@ -149,9 +154,9 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
         """Start an episode, and return observation and info.
 
         Args:
-            seed: start the first world of this seed; None: start the next world of the current seed.
-            options: choose the world with ``{"initial_state": ...}``, or with
-                ``{"listed_world": {"seed": 7, "number": 3}}`` (docs/environments.md).
+            seed: start the first world of this seed; None: continue with the next world of the current seed.
+            options: to choose the world, ``{"initial_state": ...}`` or ``{"listed_world": {"seed": 7, "number": 3}}``
+                (see docs/environments.md).
 
         """
         self._restart(seed, options)

@@ -1,20 +1,20 @@
-"""Infos of all environments: the entries of ``info``, with the same keys after a reset and after a step.
+"""Infos of all environments. The dictionary ``info`` has the same keys after a reset and after a step:
 
 - ``time_s``: time since the alert (s).
-- ``command_in_force_mps2``: command that the vehicle executes (m/s2); 0 until its latency has elapsed.
-- ``chosen_command_mps2``, ``chosen_action``: command (m/s2) and action that policy, caller or script chose; 0 before a
-  learner's first step.
+- ``command_in_force_mps2``: command that the vehicle executes (m/s2); 0 until the vehicle's latency has elapsed.
+- ``chosen_command_mps2``, ``chosen_action``: command (m/s2) and action that the vehicle's policy, the caller or the
+  vehicle's script has chosen last; 0 before a learner's first step.
 - ``first_impact_harm``, ``total_harm``: harm that the vehicle has borne so far (m2/s2).
 - ``world_first_impact_harm``, ``world_total_harm``: harm of the whole line so far (m2/s2).
 - ``collided``: whether an impact has happened in this world.
-- ``cost``: harm that the last step added to the line (m2/s2), first-impact or total harm as in the reward; 0 after a
-  reset.
-- ``reward_NAME``: value of each term of the last step's reward before weighting; 0 after a reset.
-- ``world_seed``, ``world``: seed and number of the world; the number is -1 for a world that the caller passed.
-- ``known_from_s`` [N], with a ``v2x`` channel: time from which the vehicle acts on news of each vehicle (s; infinite:
-  never). Its entry for the vehicle itself is the vehicle's latency.
-- ``age_s`` [N], with periodic messages: age of the newest sample received from each vehicle (s; infinite: none).
-- ``shield_NAME``, with a shield: infos of the shield.
+- ``cost``: harm that the last step added to the whole line (m2/s2); 0 after a reset. It is first-impact harm or total
+  harm, whichever the reward uses.
+- ``reward_NAME``: value of the reward term ``NAME`` in the last step, before it is weighted; 0 after a reset.
+- ``world_seed``, ``world``: seed and number of the world. The number is -1 if the caller passed the world.
+- ``known_from_s`` [N], only with a ``v2x`` channel: time from which this vehicle acts on news of each vehicle (s;
+  infinite: never). The entry for this vehicle itself is its latency.
+- ``age_s`` [N], only with periodic messages: age of the newest data received from each vehicle (s; infinite: none).
+- ``shield_NAME``, only with a shield: the shield's info ``NAME``.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _FLOAT32 = np.dtype(np.float32)
 
 
 def shield_columns(engine: Engine, rows: Ints | None = None) -> Columns:
-    """Return the infos of the engine's shield, by the name ``shield_NAME``, each [n, N]; empty without a shield.
+    """Return a mapping from ``shield_NAME`` to the shield's info ``NAME``, [n, N]; it is empty without a shield.
 
     ``rows`` are the indices of the worlds to include; None: all worlds.
     """
@@ -68,12 +68,12 @@ def shield_columns(engine: Engine, rows: Ints | None = None) -> Columns:
 def plain_rows(columns: Columns, vehicles: Ints, count: int) -> list[dict[str, Any]]:
     """Return one dictionary of plain values for each world and vehicle, such as ``{"time_s": 0.5, "collided": 0.0}``.
 
-    The result begins with all vehicles of the first world.
+    The list begins with the dictionaries for the vehicles of the first world.
 
     Args:
-        columns: name of an info -> values [n, N].
-        vehicles: indices of the vehicles to include.
-        count: number of empty dictionaries to return if ``columns`` is empty.
+        columns: mapping from the name of an info to its values, [n, N].
+        vehicles: indices of the vehicles whose infos are returned.
+        count: if ``columns`` is empty, this number of empty dictionaries is returned.
 
     """
     values = [column.take(vehicles, axis=1).reshape(-1).tolist() for column in columns.values()]
@@ -81,7 +81,7 @@ def plain_rows(columns: Columns, vehicles: Ints, count: int) -> list[dict[str, A
 
 
 class Report(NamedTuple):
-    """Content of the infos at one moment, for n worlds of N vehicles."""
+    """Values of all infos at one moment, for n worlds of N vehicles."""
 
     values: Floats  # [n, N, len(COLUMNS)] values of the infos in COLUMNS, in the same order
     cost: Floats  # [n] harm that the last step added to the line (m2/s2); 0 after a reset
@@ -94,9 +94,9 @@ class Report(NamedTuple):
 
     @classmethod
     def of(cls, engine: Engine, step: Step | None = None, rows: Ints | None = None) -> Report:
-        """Return the report of the present moment in an engine's worlds.
+        """Return the values of all infos at the present moment in an engine's worlds.
 
-        After a step, call this method before new episodes replace the ended episodes.
+        After a step, call this method before new episodes start in the worlds whose episodes have ended.
 
         Args:
             engine: the engine.
@@ -127,13 +127,14 @@ class Report(NamedTuple):
         return cls(values, cost, terms, engine.roster.seed, world, known, age, shield_columns(engine, rows))
 
     def columns(self) -> dict[str, Floats]:
-        """Return the values of the infos listed in ``COLUMNS``, by name, [n, N] each."""
+        """Return a mapping from the name of each info in ``COLUMNS`` to its values, [n, N]."""
         return {name: self.values[:, :, c] for c, name in enumerate(COLUMNS)}
 
     def plain_infos(self, vehicles: Ints) -> list[dict[str, Any]]:
-        """Return one dictionary of infos for each world and each vehicle in ``vehicles`` (indices), world by world.
+        """Return one dictionary of infos for each world and each vehicle in ``vehicles`` (indices).
 
-        The values are plain numbers, except the arrays ``chosen_action`` [1], ``known_from_s`` [N] and ``age_s`` [N].
+        The list begins with the dictionaries for the first world. The values are plain numbers, except the arrays
+        ``chosen_action`` [1], ``known_from_s`` [N] and ``age_s`` [N].
         """
         worlds: list[list[list[Any]]] = self.values.take(vehicles, axis=1).tolist()
         numbers, costs = self.world.tolist(), self.cost.tolist()
@@ -173,15 +174,16 @@ class Report(NamedTuple):
         return infos
 
     def batch_info(self, vehicle: int, rows: Bools, stepped: Bools) -> dict[str, Any]:
-        """Return one vehicle's infos in all worlds in Gymnasium's vector format.
+        """Return one vehicle's infos in all n worlds, in the format of Gymnasium's vector environments.
 
-        There are two arrays for each info, such as ``time_s`` [n] and ``_time_s`` [n]. The array ``_time_s`` is true
-        for the worlds that have the info ``time_s``.
+        The result contains two arrays for each info, for example ``time_s`` [n] and ``_time_s`` [n]. ``_time_s`` is
+        true for the worlds in which ``time_s`` has a value.
 
         Args:
             vehicle: index of the vehicle (0 = front).
-            rows: mask of the worlds that have infos, [n].
-            stepped: mask of the worlds that report values of the last step, [n]; in all others these values are 0.
+            rows: mask of the worlds whose infos have values, [n].
+            stepped: mask of the worlds whose running episode includes the last step, [n]. In all other worlds ``cost``
+                and the reward terms are 0.
 
         """
         columns: dict[str, NDArray[Any]] = {name: info[:, vehicle] for name, info in self.columns().items()}
@@ -206,7 +208,7 @@ class Report(NamedTuple):
 
 @compiled
 def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> None:
-    """Write the values of the infos listed in ``COLUMNS`` to ``out``.
+    """Write the values of the infos in ``COLUMNS`` to ``out``.
 
     Args:
         state: packed states of the worlds (``physics.columns``), which contain motion and harm.
@@ -249,10 +251,11 @@ def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> 
 
 
 class Begun:
-    """Base class of all environments, which starts episodes from a seed and options.
+    """Base class of all environments. It starts episodes with a seed and options.
 
     A subclass sets ``engine`` in its constructor, and calls ``_restart`` in its ``reset``. The worlds of a seed form a
-    *stream*: each new episode takes the next world. ``np_random`` and ``np_random_seed`` are as in ``gymnasium.Env``.
+    *stream*: each new episode takes the next world of this seed. ``np_random`` and ``np_random_seed`` have the same
+    meaning as in ``gymnasium.Env``.
     """
 
     engine: Engine  # engine that moves the worlds
@@ -264,10 +267,10 @@ class Begun:
 
     @property
     def np_random(self) -> np.random.Generator:
-        """Random generator for wrappers. The worlds depend on ``np_random_seed``, not on the state of this generator.
+        """Random generator that wrappers may use. The worlds depend on ``np_random_seed`` only.
 
-        If you set another generator, each ``reset`` without a seed draws a new seed from this generator, until you call
-        ``reset`` with a seed.
+        If you set another generator, each ``reset`` without a seed draws a new seed from the generator that you set.
+        This ends with the first ``reset`` with a seed.
         """
         if self._np_random is None:
             self._set_seed(chosen_seed(None))
@@ -282,7 +285,7 @@ class Begun:
 
     @property
     def np_random_seed(self) -> int:
-        """Seed of the stream of worlds, random if no seed was passed; -1 after the user has set ``np_random``."""
+        """Seed of the stream of worlds: random if no seed was passed; -1 after the user has set ``np_random``."""
         if self._np_random_seed is None:
             self._set_seed(chosen_seed(None))
             assert self._np_random_seed is not None
@@ -292,19 +295,20 @@ class Begun:
         self._np_random, self._np_random_seed = np.random.default_rng(seed), seed
 
     def _restart(self, seed: int | None, options: Mapping[str, Any] | None) -> None:
-        """Start new episodes in all worlds, for ``reset``.
+        """Start new episodes in all worlds. The method ``reset`` of each environment calls this method.
 
-        With ``options["initial_state"]``, every world starts in this state (``scenario.tables.worlds_from_state``).
-        With ``options["listed_world"] = {"seed": 7, "number": 3}``, the first world is world 3 of the evaluation list
-        with seed 7, the second one is world 4, and so on. Episodes that start by autoreset take worlds of the stream.
-        Other options cause the warning ``UnknownResetOption`` and are ignored.
+        With ``options["initial_state"]``, every world starts in this state, which ``scenario.tables.worlds_from_state``
+        reads. With ``options["listed_world"] = {"seed": 7, "number": 3}``, the first world is world 3 of the evaluation
+        list with seed 7, the second one is world 4, and so on. Later episodes, which start without a call of ``reset``,
+        take the next worlds of the stream. For other options a warning ``UnknownResetOption`` is issued, and these
+        options are ignored.
 
         Args:
             seed: start with the first world of this seed; None: continue with the next world of the stream.
-            options: the options; None: there are no options.
+            options: the options of ``reset``; None: there are no options.
 
         Raises ``InvalidInput`` for a seed that is not a whole number >= 0, for an invalid initial state or listed
-        world, and if both are passed. After such an error the environment is unchanged.
+        world, and if the options contain both. If this error is raised, the environment stays unchanged.
 
         """
         named = None if seed is None else chosen_seed(seed)
@@ -318,8 +322,8 @@ class Begun:
     def _begin(self, seed: int | None, worlds: Worlds | None) -> None:
         """Start episodes in ``worlds`` (at the alert), or in the next worlds of the stream if ``worlds`` is None.
 
-        With a ``seed``, a new stream begins. Without a seed, the current stream continues; if the user has set
-        ``np_random``, a new stream begins, with a seed drawn from this generator.
+        With a ``seed``, a new stream of worlds begins. Without a seed, the current stream continues, unless the user
+        has set ``np_random``: then a new stream begins, with a seed that is drawn from ``np_random``.
         """
         drawn, used = seed is None and self._np_random_seed == -1, seed
         if drawn:
@@ -338,16 +342,16 @@ class Begun:
             raise InvalidInput(f"{what}: no episode has started; call reset first")
 
     def describe_worlds(self) -> Columns:
-        """Return the random draw of each running world: name of a column -> values [n].
+        """Return what was drawn at random for each running world: a mapping from column names to values [n].
 
-        See ``envs.draws.describe_worlds``.
+        The columns are described in ``envs.draws.describe_worlds``.
         """
         self._check_started("describe_worlds")
         return describe_worlds(self.engine)
 
 
 class OneWorld(Begun):
-    """Base class of environments with a single world, with the methods ``describe_world``, ``render`` and ``close``.
+    """Base class of environments with a single world. It defines ``describe_world``, ``render`` and ``close``.
 
     A subclass sets ``viewer`` in its constructor.
     """
@@ -355,18 +359,18 @@ class OneWorld(Begun):
     viewer: Viewer  # object that draws pictures of the running episode
 
     def describe_world(self) -> dict[str, Any]:
-        """Return the random draw of the running world: name -> number or text (``envs.draws.describe_worlds``)."""
+        """Return what was drawn at random for the running world: a mapping from names to numbers or texts."""
         self._check_started("describe_world")
         return {name: column[0].item() for name, column in describe_worlds(self.engine).items()}
 
     def render(self) -> Any:
-        """Return a picture of the present moment, whose type depends on the render mode.
+        """Return a picture of the present moment. Its type depends on the render mode:
 
-        ``rgb_array``: a frame [H, W, 3] uint8. ``rgb_array_list``: the list of all frames since the last call.
-        ``ansi``: a text. ``human``: None, because the window shows every step.
+        ``rgb_array``: a frame [H, W, 3] uint8. ``rgb_array_list``: a list of all frames since the last call of
+        ``render``. ``ansi``: a text. ``human``: None, because a window already shows every step.
         """
         return self.viewer.render()
 
     def close(self) -> None:
-        """Close the window, if one is open."""
+        """Close the window of the render mode ``human``, if it is open."""
         self.viewer.close()

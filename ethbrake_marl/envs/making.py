@@ -1,4 +1,4 @@
-"""Functions that all environments use: spaces, engine, actions, seeds and options of ``reset``."""
+"""Functions that all environments use: they make spaces and engine, and read actions, seeds and options."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping is the cont
 
 
 def feature_box(features: Sequence[Feature]) -> Box[np.float32]:
-    """Return the observation space of the features: a float32 box [F] with the (finite) bounds of the features."""
+    """Return the observation space for ``features``: a float32 box [F], bounded by the range of each feature."""
     low, high = (np.array([getattr(f, side) for f in features], np.float32) for side in ("low", "high"))
     return Box(low, high, dtype=np.float32)
 
@@ -38,9 +38,10 @@ def action_box() -> Box[np.float32]:
 
 
 def reward_box(engine: Engine) -> Box[np.float64]:
-    """Return the space of the engine's vector rewards: a float64 box [K] for K components.
+    """Return the space of the engine's vector rewards: a float64 box [K], where K is the number of components.
 
-    With float64, a weighted sum of the components exactly equals the scalar reward with the same weights.
+    The type is float64, so that a weighted sum of the components exactly equals the scalar reward with the same
+    weights.
     """
     return Box(-np.inf, np.inf, (len(engine.components),), dtype=np.float64)
 
@@ -48,8 +49,8 @@ def reward_box(engine: Engine) -> Box[np.float64]:
 def learner_action_space(actions: int | None) -> Any:
     """Return the action space of a learner.
 
-    ``actions`` is the number of discrete actions, or None for ``action_box()``. Raises ``InvalidInput`` for a number
-    that is not a whole number of at least 2.
+    ``actions`` is the number of discrete actions, at least 2. If ``actions`` is None, the result is ``action_box()``.
+    Raises ``InvalidInput`` if ``actions`` is anything else.
     """
     if actions is None:
         return action_box()
@@ -74,12 +75,13 @@ def make_engine(
             ``Scenario``.
         n: number of worlds that are simulated together, at least 1.
         learners: vehicles that learn, by name (``vehicle_2``) or index (0 = front); None: the learners of the scenario.
-        reward: reward of a step (``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``).
-        observation: features that every vehicle observes, or a mapping from a vehicle's name to its features; None: the
-            observation of the scenario.
+        reward: reward of a step: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams``
+            object.
+        observation: features that every vehicle observes, or a mapping from each vehicle's name to its features; None:
+            the features that belong to the scenario.
         seed: seed of the stream of worlds.
-        reward_vector: components of a vector reward, which the result of a step contains as ``vector``, next to
-            ``reward``; None: there is no vector reward.
+        reward_vector: components of a vector reward. The result of a step contains the vector reward as ``vector``, in
+            addition to ``reward``. None: there is no vector reward.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -125,15 +127,17 @@ def only_learner(engine: Engine) -> int:
 def learner_actions(engine: Engine, actions: Mapping[str, Any], count: int | None) -> Floats | dict[int, Floats]:
     """Return the actions of the L learners in the form that ``Engine.step`` takes for one world: [1, L].
 
-    With a shield, actions may be missing. The result is then a mapping from a vehicle's index to its action [1].
+    If the engine has a shield, actions may be missing. If actions are missing, the result is a mapping from the index
+    of each learner that has an action to this action [1].
 
     Args:
         engine: engine with one world.
-        actions: name of a learner -> action [1] or, with discrete actions, index of the action.
-        count: number of discrete actions; None: actions are numbers in [-1, 1].
+        actions: mapping from the name of each learner to its action [1] or, with discrete actions, to the index of the
+            action.
+        count: number of discrete actions; None: the actions are not discrete, but numbers in [-1, 1].
 
-    Raises ``InvalidInput``, with the vehicle's name, if an action is missing or has the wrong shape. ``Engine.step``
-    checks the range of the actions.
+    Raises ``InvalidInput``, which names the vehicle, if an action has the wrong shape, or is missing without a shield.
+    This function does not check the range of the actions, because ``Engine.step`` checks it.
 
     """
     names, columns = engine.scenario.vehicle_names, np.empty((1, len(engine.learners)))
@@ -160,11 +164,11 @@ RESET_MASK = "reset_mask"
 
 
 class UnknownResetOption(UserWarning):
-    """Warning: ``options`` of ``reset`` has an unknown key, which is ignored."""
+    """Warning that ``options`` of ``reset`` has an unknown key, which is ignored."""
 
 
 class IgnoredAction(UserWarning):
-    """Warning: an action was passed for a vehicle that follows a script; the action is ignored."""
+    """Warning that an action for a vehicle that follows a script was passed. Such an action is ignored."""
 
 
 def chosen_seed(seed: int | None) -> int:
@@ -184,8 +188,8 @@ def chosen_seed(seed: int | None) -> int:
 def wanted_worlds(engine: Engine, options: Mapping[str, Any]) -> Worlds | None:
     """Return the worlds that the ``options`` of a reset choose, one for each of the engine's worlds.
 
-    With the key ``initial_state``, all worlds have this state. With the key ``listed_world``, the worlds are
-    consecutive worlds of an evaluation list. Without these keys the result is None: the worlds come from the stream.
+    With the key ``initial_state``, all worlds start in this state. With the key ``listed_world``, the worlds are
+    consecutive worlds of an evaluation list. Without these keys the result is None: the stream supplies the worlds.
     Raises ``InvalidInput`` if both keys are present, or if a value is invalid.
     """
     if LISTED_WORLD not in options:

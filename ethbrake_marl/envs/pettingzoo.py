@@ -1,4 +1,4 @@
-"""Environments for PettingZoo: the vehicles of a world are agents that act in parallel, or one after another (AEC)."""
+"""Environments for PettingZoo: the agents are vehicles, which act in parallel or one after another (AEC)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from ethbrake_marl.physics.state import Ints
 
 
 class SeededInside:
-    """Mixin for wrappers, whose ``np_random`` and ``np_random_seed`` belong to the innermost environment."""
+    """Mixin for wrappers: ``np_random`` and ``np_random_seed`` are those of the innermost environment."""
 
     unwrapped: Any  # the innermost environment
 
@@ -57,7 +57,7 @@ class SeededInside:
 
 
 class Ordered(SeededInside, OrderEnforcingWrapper):  # type: ignore[misc]  # PettingZoo is untyped
-    """PettingZoo's ``OrderEnforcingWrapper``, with the random generator of the wrapped environment."""
+    """PettingZoo's ``OrderEnforcingWrapper`` with the ``np_random`` of the environment inside the wrapper."""
 
     def __str__(self) -> str:
         return str(self.env)
@@ -66,22 +66,23 @@ class Ordered(SeededInside, OrderEnforcingWrapper):  # type: ignore[misc]  # Pet
 class InTurns(SeededInside, parallel_to_aec_wrapper):  # type: ignore[misc]  # PettingZoo is untyped
     """PettingZoo's wrapper from parallel to AEC, which also checks the action of an agent when it is the agent's turn.
 
-    After an invalid action the same agent can act again.
+    If an action is invalid, the same agent must act again.
     """
 
     @classmethod
     def around(cls, env: ParallelEnv[str, Observations, NDArray[Any]]) -> AECEnv[str, Observations, NDArray[Any]]:
-        """Return an AEC environment around a parallel environment of this package, which may have wrappers.
+        """Return an AEC environment around ``env``, a parallel environment of this package with or without wrappers.
 
-        Its methods raise an error if they are called before ``reset`` (PettingZoo's ``OrderEnforcingWrapper``).
+        The methods of the AEC environment raise an error if they are called before ``reset`` (PettingZoo's
+        ``OrderEnforcingWrapper``).
         """
         return Ordered(cls(env))
 
     def step(self, action: Any) -> None:
-        """Take the action [1] of the agent whose turn it is (``agent_selection``).
+        """Store the action [1] of the agent whose turn it is (``agent_selection``).
 
-        After the action of the last agent, all vehicles advance by one time step. Raises ``InvalidInput`` for an
-        invalid action of a learner, and for an action other than None after the end of the agent's episode.
+        When the last agent has acted, all vehicles advance by one time step. Raises ``InvalidInput`` for an invalid
+        action of a learner, and for any action except None after the end of the agent's episode.
         """
         agent, engine, count = self.agent_selection, self.env.unwrapped.engine, self.env.unwrapped.actions
         assert isinstance(engine, Engine)
@@ -93,7 +94,7 @@ class InTurns(SeededInside, parallel_to_aec_wrapper):  # type: ignore[misc]  # P
         super().step(action)
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
-        """Start an episode; ``seed`` and ``options`` are as in ``EthBrakeParallelEnv.reset``."""
+        """Start an episode; ``seed`` and ``options`` have the same meaning as in ``EthBrakeParallelEnv.reset``."""
         super().reset(seed, options)
         self._clear_rewards()
         self._cumulative_rewards = {agent: self._no_reward() for agent in self.agents}
@@ -104,7 +105,7 @@ class InTurns(SeededInside, parallel_to_aec_wrapper):  # type: ignore[misc]  # P
 
     @property
     def reward_spaces(self) -> dict[str, Any]:
-        """Spaces of the vector rewards by the agent's name, for MOMAland."""
+        """Mapping from the name of each agent to the space of its vector rewards, for the library MOMAland."""
         spaces: dict[str, Any] = self.unwrapped.reward_spaces
         return spaces
 
@@ -126,9 +127,9 @@ WhoIsAgent = Literal["all", "learners"]
 class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]):  # type: ignore[misc]  # PettingZoo is untyped
     """Environment in which the vehicles of a line, ``vehicle_1`` (front) to ``vehicle_N``, are agents.
 
-    - Action: in each step, each learner needs an array [1] in [-1, 1]. -1 brakes with full capacity, 0
-      coasts, +1 drives with full capacity. Other actions are ignored; ``infos[agent]`` contains the
-      commands of their scripts.
+    - Action: in each step, each learner needs an array [1] in [-1, 1]. -1 brakes with full capacity, 0 coasts, +1
+      drives with full capacity. Actions for scripted agents are ignored; ``infos[agent]`` contains the script's
+      commands.
     - End: the episodes of all agents end together, *terminated* when all vehicles are at rest and no command would move
       one, or *truncated* at the horizon.
     - ``state()`` returns the full state of the line, for central critics.
@@ -138,17 +139,22 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
     Args:
         scenario: name of a shipped scenario, path of a YAML file, content of such a file as a mapping, or a
             ``Scenario``.
-        render_mode: ``human``, ``rgb_array``, ``rgb_array_list``, ``ansi``, or None (docs/environments.md).
+        render_mode: ``human``, ``rgb_array``, ``rgb_array_list`` or ``ansi`` (see docs/environments.md); None: no
+            pictures.
         learners: vehicles that learn, by name (``vehicle_2``) or index (0 = front); None: the learners of the scenario.
-        reward: reward of a step (``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``).
-        observation: features that every vehicle observes, or a mapping from a vehicle's name to its features; None: the
-            observation of the scenario.
-        agents: vehicles that are agents, ``all`` or ``learners``. Use ``learners`` for trainers that train all agents.
+        reward: reward of a step: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams``
+            object.
+        observation: features that every vehicle observes, or a mapping from each vehicle's name to its features; None:
+            the features that belong to the scenario.
+        agents: which vehicles are agents: ``all`` vehicles or only the ``learners``. Choose ``learners`` for training
+            libraries that train every agent.
         max_cycles: number of steps after which an episode is truncated; None: it is truncated at the horizon only.
-        actions: None: an action is a number in [-1, 1]. A whole number K of at least 2: an action is the index of one
-            of K evenly spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
-        reward_vector: None: a reward is a number. ``vehicles``: a reward is an array [N], minus the harm that each
-            vehicle bears in the step. A list: a reward is an array with the named components (docs/environments.md).
+        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete, and an action is
+            an index from 0 to K - 1. The indices stand for K evenly spaced numbers from -1 (full braking capacity) to 1
+            (full driving capacity).
+        reward_vector: None: a reward is a number. ``vehicles``: a reward is an array [N] with minus the harm that each
+            vehicle bears in the step. A list of components: a reward is an array with these components (see
+            docs/environments.md).
 
     >>> import ethbrake_marl as eb
     >>> env = eb.parallel_env(scenario="paper-random")
@@ -206,11 +212,11 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
             self.reward_spaces = {agent: reward_box(self.engine) for agent in self.possible_agents}
 
     def observation_space(self, agent: str) -> Any:
-        """Return the observation space of ``agent``, a float32 box [F]; always the same object."""
+        """Return the observation space of ``agent``, a float32 box [F]. Every call returns the same object."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> Any:
-        """Return the action space of ``agent``; always the same object.
+        """Return the action space of ``agent``. Every call returns the same object.
 
         The space is a float32 box [1] or, for a learner with discrete actions, ``Discrete(actions)``.
         """
@@ -227,12 +233,12 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observations], Infos]:
-        """Start an episode, and return observations and infos by the agent's name.
+        """Start an episode, and return two mappings: from each agent's name to its observation, and to its infos.
 
         Args:
-            seed: start the first world of this seed; None: start the next world of the current seed.
-            options: choose the world with ``{"initial_state": ...}``, or with
-                ``{"listed_world": {"seed": 7, "number": 3}}`` (docs/environments.md).
+            seed: start the first world of this seed; None: continue with the next world of the current seed.
+            options: to choose the world, ``{"initial_state": ...}`` or ``{"listed_world": {"seed": 7, "number": 3}}``
+                (see docs/environments.md).
 
         """
         self._restart(seed, options)
@@ -243,10 +249,11 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
     def step(
         self, actions: Mapping[str, Any]
     ) -> tuple[dict[str, Observations], dict[str, Any], dict[str, bool], dict[str, bool], Infos]:
-        """Advance by one time step; return observations, rewards, terminations, truncations and infos by agent.
+        """Advance by one time step; return observations, rewards, terminations, truncations and infos of all agents.
 
-        ``actions`` maps the name of an agent to its action [1] in [-1, 1]. Raises ``InvalidInput`` if the action of a
-        learner is missing or invalid; the message names the learner.
+        ``actions`` is a mapping from the names of agents to their actions, each [1] in [-1, 1]. The results are
+        mappings from the names of agents as well. Raises ``InvalidInput``, which names the learner, if the action of a
+        learner is missing or invalid.
         """
         if not self.agents:
             raise InvalidInput("step: no episode is running; call reset first")
@@ -282,13 +289,13 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
         )
 
     def state(self) -> Observations:
-        """Return the full state of the line, float32 [S], an element of ``state_space``."""
+        """Return the full state of the line, a float32 array [S] in the space ``state_space``."""
         self._check_started("state")
         state: Observations = full_state(self.engine.worlds, self.engine.scenario)[0].copy()
         return state
 
     def _warn_of_ignored(self, actions: Mapping[str, Any]) -> None:
-        """Warn, once per environment, about actions that are ignored because their vehicles follow scripts."""
+        """Warn, only once in each environment, if actions are ignored because the vehicles follow scripts."""
         ignored = [agent for agent in self._scripted if actions.get(agent) is not None]
         if not ignored:
             return
@@ -331,7 +338,7 @@ parallel_env = EthBrakeParallelEnv
 def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
     """Return the environment in which agents act one after another, from front to rear (AEC).
 
-    ``scenario`` and ``settings`` are the arguments of ``parallel_env``.
+    ``scenario`` and ``settings`` have the same meaning as in ``parallel_env``.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.raw_env("paper-random")
@@ -346,7 +353,7 @@ def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[s
 def env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
     """Return the environment in which agents act one after another (AEC), the same as ``raw_env``.
 
-    ``scenario`` and ``settings`` are the arguments of ``parallel_env``. An invalid action raises ``InvalidInput``. The
-    episode goes on, and the same agent can act again.
+    ``scenario`` and ``settings`` have the same meaning as in ``parallel_env``. An invalid action raises
+    ``InvalidInput``. After this error the episode goes on, and it is the same agent's turn again.
     """
     return raw_env(scenario, **settings)

@@ -1,4 +1,4 @@
-"""Registration of the environments in Gymnasium and PettingZoo. It does not import the environments' modules."""
+"""Registration of the environments in Gymnasium and PettingZoo. The modules of the environments are not imported."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ PETTINGZOO_ID = "ethbrake/ethbrake-v1"
 
 
 def register_environments() -> None:
-    """Register the ids of the environments in Gymnasium and PettingZoo. A second call has no effect."""
+    """Register the environments' ids in Gymnasium and PettingZoo. Further calls have no effect."""
     import gymnasium  # imported here, because the import takes time
     import pettingzoo
 

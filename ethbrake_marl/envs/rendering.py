@@ -1,4 +1,4 @@
-"""Pictures for ``render()``: one moment of a world as text or as pixels."""
+"""Pictures for ``render()``: one moment of one world, drawn as a text or as an image."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ LATE_S = 3.0  # longest latency that is considered when the length of road is ch
 
 
 class View(NamedTuple):
-    """The part of the road that a picture shows. Positions are relative to Vehicle 1's front at the alert."""
+    """The part of the road that a picture shows. Positions are distances (m) from Vehicle 1's front at the alert."""
 
     left_m: float  # position of the left end (m)
     right_m: float  # position of the right end (m)
@@ -54,7 +54,7 @@ class Struck(NamedTuple):
 
     @property
     def speed(self) -> str:
-        """Closing speed as a text, such as "3.2 m/s" or "< 0.1 m/s"."""
+        """The closing speed of the impact as a text, such as "3.2 m/s" or "< 0.1 m/s"."""
         return f"{self.closing_mps:.1f} m/s" if self.closing_mps >= 0.05 else "< 0.1 m/s"
 
 
@@ -84,7 +84,7 @@ class Scene(NamedTuple):
 
     @property
     def shield_words(self) -> str:
-        """Text about the shield's decision in this step: "shield: stepped in" or "shield: let it pass"."""
+        """Whether the shield replaced an action in this step: "shield: stepped in" or "shield: let it pass"."""
         return "shield: stepped in" if self.shield else "shield: let it pass"
 
     def command_words(self, i: int) -> str:
@@ -97,7 +97,7 @@ class Scene(NamedTuple):
         return f"{'brakes' if command < 0.0 else 'drives'} {abs(command):.1f} m/s2"
 
     def text(self) -> str:
-        """Return the scene as text: a line that shows the road to scale, then one line for each vehicle."""
+        """Return the scene as text: one line shows the road to scale, and one line describes each vehicle."""
         left, right = self.view
 
         def column(place_m: float) -> int:
@@ -126,7 +126,7 @@ class Scene(NamedTuple):
         return "\n".join([*facts, self.shield_words] if self.shield is not None else facts) + "\n"
 
     def frame(self) -> Frame:
-        """Return the scene as a picture, [H, W, 3] uint8. Equal scenes give equal pictures."""
+        """Return the scene as a picture, [H, W, 3] uint8. If two scenes are equal, their pictures are equal, too."""
         from PIL import Image, ImageDraw
 
         image = Image.new("RGB", (WIDTH * _FINE, HEIGHT * _FINE), _PAPER)
@@ -149,7 +149,7 @@ def vehicle_colour(i: int) -> str:
 
 
 def follow(view: View, front_m: Floats) -> View:
-    """Move a view forward and widen it until it contains the whole line, and return the new view.
+    """Return a new view: ``view``, moved forward and widened until it contains the whole line of vehicles.
 
     ``front_m`` [N] are the positions at which the front bumpers are drawn (m).
     """
@@ -161,7 +161,8 @@ def follow(view: View, front_m: Floats) -> View:
 def star(x: float, y: float, far: float, near: float) -> list[tuple[float, float]]:
     """Return the 16 corners of a star with eight points and the centre (x, y).
 
-    ``far`` is the distance of the points from the centre, ``near`` the distance of the corners between two points.
+    ``far`` is the distance of the points from the centre; ``near`` is the distance of the inner corners from the
+    centre.
     """
     return [
         (x + r * math.cos(k * math.pi / 8), y + r * math.sin(k * math.pi / 8)) for k, r in enumerate([far, near] * 8)
@@ -192,7 +193,7 @@ _BRAKE, _DRIVE, _FLASH, _SHIELD = "#c1121f", "#2a7f3f", "#ffd60a", "#6a3d9a"
 
 
 class _Pen:
-    """Pen that draws shapes ``_FINE`` times as large as in the final picture; reducing the picture makes edges smooth.
+    """Pen that draws on a picture ``_FINE`` times as large as the final one, so that reducing it makes edges smooth.
 
     All coordinates are in pixels of the final picture.
     """
@@ -249,7 +250,7 @@ def _draw_vehicle(pen: _Pen, scene: Scene, i: int) -> None:
 
 
 def _draw_panel(pen: _Pen, scene: Scene, i: int) -> None:
-    """Draw the panel of vehicle ``i``; its bar extends to the left for braking, to the right for driving."""
+    """Draw the panel of vehicle ``i``. The bar in it extends to the left for braking, and to the right for driving."""
     left, width = _panel(scene, i)
     pen.box(left, _PANEL_TOP, left + 20, _PANEL_TOP + 18, vehicle_colour(i))
     middle, half, top = left + width / 2, width / 2, _PANEL_TOP + 62
@@ -320,19 +321,19 @@ def _write_panel(text: ImageDraw.ImageDraw, scene: Scene, i: int) -> None:
 
 
 def _fitting(words: list[str], width: float, size: int) -> str:
-    """Return the first of several texts that is at most ``width`` pixels wide in this font size, or the last text."""
+    """Return the first of ``words`` that is at most ``width`` pixels wide; if all are wider, return the last one."""
     return next((each for each in words if _font(size).getlength(each) <= width), words[-1])
 
 
 def _share(scene: Scene, i: int) -> float:
-    """Return the command that vehicle ``i`` executes relative to its capacity: -1 full braking, 1 full driving."""
+    """Return the command of vehicle ``i`` as a share of its capacity, from -1 (brake fully) to 1 (drive fully)."""
     command = float(scene.command_mps2[i])
     capacity = float((scene.braking_mps2 if command < 0.0 else scene.driving_mps2)[i])
     return command / capacity if command != 0.0 else 0.0
 
 
 def _panel(scene: Scene, i: int) -> tuple[float, float]:
-    """Return left edge and width (pixels) of the panel of vehicle ``i``. Vehicle 1 has the rightmost panel."""
+    """Return left edge and width (pixels) of the panel of vehicle ``i``. The panel of Vehicle 1 is on the right."""
     count = len(scene.front_m)
     gap = 24.0 if count <= 5 else 10.0
     width = min((WIDTH - 2 * _MARGIN - gap * (count - 1)) / count, 240.0)
@@ -359,7 +360,7 @@ def _spaces(scene: Scene) -> list[tuple[float, float, float, bool]]:
 
 
 def _marks(scene: Scene, every_m: float) -> list[float]:
-    """Return all positions in view that are multiples of ``every_m`` (m)."""
+    """Return all positions (m) in view that are multiples of ``every_m`` (m)."""
     first, last = math.ceil(scene.view.left_m / every_m), math.floor(scene.view.right_m / every_m)
     return [k * every_m for k in range(first, last + 1)]
 
@@ -371,7 +372,7 @@ def _spacing(scene: Scene) -> float:
 
 
 def _contact(scene: Scene, struck: Struck) -> float:
-    """Return the horizontal position (pixels) of an impact in the picture, which is between the two bodies."""
+    """Return the horizontal position (pixels) in the picture where an impact is drawn: between the two bodies."""
     if struck.pair < 0:
         return _x(scene, scene.front_m[0])
     return (_x(scene, scene.front_m[struck.pair + 1]) + _x(scene, scene.front_m[struck.pair] - BODY_M)) / 2
@@ -379,7 +380,7 @@ def _contact(scene: Scene, struck: Struck) -> float:
 
 @cache
 def _font(size: int) -> ImageFont.FreeTypeFont:
-    """Return Pillow's built-in font in this size, which does not depend on the machine."""
+    """Return Pillow's built-in font in the size ``size``. This font is the same on every computer."""
     from PIL import ImageFont
 
     font = ImageFont.load_default(size)

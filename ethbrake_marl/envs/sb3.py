@@ -1,4 +1,4 @@
-"""Environment for Stable-Baselines3: a ``VecEnv`` whose rows are learners. Importing this module imports torch."""
+"""Environment for Stable-Baselines3: a ``VecEnv`` with one row per learner. Importing this module imports torch."""
 
 from __future__ import annotations
 
@@ -51,26 +51,30 @@ def make_sb3_vec_env(
     render_mode: str | None = None,
     actions: int | None = None,
 ) -> EthBrakeVecEnv:
-    """Return an environment with ``n_envs`` worlds for Stable-Baselines3.
+    """Return an environment for Stable-Baselines3 that simulates ``n_envs`` worlds together.
 
     Args:
         scenario: name of a shipped scenario, path of a YAML file, or a ``Scenario``.
         n_envs: number of worlds that are simulated together, at least 1.
         seed: seed of the stream of worlds; None: a random seed.
         learners: vehicles that learn, by name (``vehicle_2``) or index (0 = front); None: the learners of the scenario.
-        reward: reward of a step (``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``).
-        observation: features that the learners observe; None: the observation of the scenario (``observation_for``).
-        horizon_is_end: True: report no truncation at the horizon, so that the algorithm does not add an estimated value
-            of the time after the horizon. Such an estimate can grow without limit, because harm after the horizon is
-            not counted (docs/train.md). False: ``TimeLimit.truncated`` is true for episodes that ended at the horizon.
-        appended: numbers to append to each observation. ``number``: the number of the learner among the learners (0 =
-            foremost). ``state``: the full state of the line (``game.full_state.full_state``), for a central critic.
-            None: no numbers.
-        step_infos: True: fill the infos in every step, as the other environments do; False: only at the end of an
-            episode. This is slower.
+        reward: reward of a step: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams``
+            object.
+        observation: features that the learners observe; None: the features that belong to the scenario
+            (``observation_for``).
+        horizon_is_end: True: an episode that reaches the horizon is reported as ended, not as truncated. Therefore the
+            algorithm does not add an estimate of the return after the horizon. This estimate could grow without limit,
+            because harm after the horizon is not counted (see docs/train.md). False: ``TimeLimit.truncated`` is true
+            for episodes that ended at the horizon.
+        appended: numbers to append to each observation. ``number``: the learner's number, counted among the learners of
+            its world from the front, from 0. ``state``: the full state of the line (``game.full_state.full_state``),
+            for a central critic. None: no numbers.
+        step_infos: True: every step returns all infos, as in the other environments, which is slower. False: only the
+            last step of an episode returns all infos.
         render_mode: ``rgb_array`` or None. ``render`` and ``VecVideoRecorder`` show all worlds side by side.
-        actions: None: an action is a number in [-1, 1]. A whole number K of at least 2: an action is the index of one
-            of K evenly spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
+        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete, and an action is
+            an index from 0 to K - 1. The indices stand for K evenly spaced numbers from -1 (full braking capacity) to 1
+            (full driving capacity).
 
     >>> import ethbrake_marl as eb
     >>> eb.make_sb3_vec_env("paper-random", 4, seed=7).reset().shape
@@ -91,21 +95,21 @@ def make_sb3_vec_env(
 
 
 class EthBrakeVecEnv(Begun, VecEnv):
-    """``VecEnv`` whose rows are learners: row ``k * L + l`` is learner l of L (front to rear) in world k.
+    """``VecEnv`` with one row per learner and world: row ``k * L + l`` is learner l of L (front to rear) in world k.
 
-    The episodes in the rows of one world end together. Each new episode takes the next world of one stream. At the end
-    of an episode, the infos of its rows contain ``TimeLimit.truncated``, ``terminal_observation``, ``episode`` (return
-    ``r``, number of steps ``l``, and ``t``, which is always 0), and all infos of the other environments. At other steps
-    the infos contain only the infos of a shield, unless ``step_infos`` is true. ``get_attr`` and ``env_method`` act on
-    the whole environment.
+    The rows of one world share one episode. Each new episode takes the next world of the stream. In the last step of an
+    episode, the infos contain ``TimeLimit.truncated``, ``terminal_observation``, ``episode`` (return ``r``, number of
+    steps ``l``, and ``t``, which is always 0), and all infos of the other environments. In other steps, the infos
+    contain only those of a shield, unless ``step_infos`` is true. ``get_attr`` and ``env_method`` use this object.
 
     Args:
-        engine: the engine of the worlds; ``make_sb3_vec_env`` builds it.
+        engine: the engine that simulates the worlds; ``make_sb3_vec_env`` makes it.
         seed: seed of the stream of worlds.
-        horizon_is_end: whether to report no truncation at the horizon; see ``make_sb3_vec_env``.
-        appended: numbers to append to each observation: ``number``, the number of the learner among the learners, or
-            ``state``, the full state of the line. None: no numbers.
-        step_infos: True: fill the infos in every step; False: only at the end of an episode.
+        horizon_is_end: whether an episode that reaches the horizon is reported as ended, not as truncated; see
+            ``make_sb3_vec_env``.
+        appended: numbers to append to each observation: ``number`` (the learner's number among the learners of its
+            world) or ``state`` (the full state of the line). None: no numbers.
+        step_infos: True: every step returns all infos. False: only the last step of an episode returns all infos.
         render_mode: ``rgb_array`` or None.
         actions: number of discrete actions; None: an action is a number in [-1, 1].
 
@@ -155,7 +159,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         self.metadata = {**self.viewer.metadata, "render_modes": ["rgb_array"]}
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Set the seed of the worlds from the next reset on, and return the seed, once per row.
+        """Set the seed of the worlds for the next reset, and return a list that contains this seed once per row.
 
         If ``seed`` is None, the seed is random. All rows have the same seed, because they share one stream of worlds.
         """
@@ -166,8 +170,8 @@ class EthBrakeVecEnv(Begun, VecEnv):
     def reset(self) -> Observations:
         """Start an episode in every world, and return the observations, float32 [rows, F].
 
-        To choose the worlds, call ``seed`` or ``set_options`` before. Options apply to one reset only. Invalid options
-        raise ``InvalidInput``, and the next reset ignores them.
+        To choose the worlds, call ``seed`` or ``set_options`` before ``reset``. Options apply to one reset only.
+        Invalid options raise ``InvalidInput``; they, too, are ignored in later resets.
         """
         try:
             worlds = self._read_options()
@@ -180,14 +184,14 @@ class EthBrakeVecEnv(Begun, VecEnv):
         return self._observe()
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Store the actions of the next step, [rows, 1] in [-1, 1] or, with discrete actions, indices [rows]."""
+        """Store the actions for the next step: [rows, 1] in [-1, 1] or, if actions are discrete, indices [rows]."""
         self._actions = own_actions(actions, "the learners", self.actions)
 
     def step_wait(self) -> tuple[Observations, Rewards, Bools, list[dict[str, Any]]]:
         """Advance every world by one time step with the stored actions.
 
-        If an episode ends, the next episode starts at once in this row. Returns observations [rows, F], rewards [rows],
-        whether each row's episode ended [rows], and one dictionary of infos per row.
+        If an episode ends, the next episode starts at once in the same rows. Returns observations [rows, F], rewards
+        [rows], an array [rows] that is true where an episode has ended, and one dictionary of infos per row.
         """
         if not self._started or self._actions is None:
             raise InvalidInput("step: no episode is running; call reset first")
@@ -232,10 +236,9 @@ class EthBrakeVecEnv(Begun, VecEnv):
         return arrays | {"return": self._return.copy(), "steps": self._steps.copy(), "begun": self._begun.copy()}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Restore the state ``arrays`` from ``snapshot``; a reset is not needed.
+        """Restore the state ``arrays``, which ``snapshot`` has returned; a reset is not needed.
 
-        The snapshot must be of an environment with the same scenario and number of worlds; otherwise ``InvalidInput``
-        is raised.
+        Raises ``InvalidInput`` if the snapshot is from an environment with another scenario or number of worlds.
         """
         prefix = "engine."
         self.engine.restore({n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)})
@@ -252,33 +255,33 @@ class EthBrakeVecEnv(Begun, VecEnv):
         self._started = self._goes_on = True
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return the attribute ``attr_name`` of this environment, once per requested row."""
+        """Return a list that contains the attribute ``attr_name`` of this environment once per requested row."""
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set the attribute ``attr_name`` of this environment. Raises ``InvalidInput`` if ``indices`` omits rows."""
+        """Set the attribute ``attr_name`` of this environment. Raises ``InvalidInput`` if ``indices`` omits a row."""
         self._refuse_some_rows("set_attr", indices)
         setattr(self, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
-        """Call the method ``method_name`` of this environment once, and return its result once per row.
+        """Call the method ``method_name`` of this environment once; return a list with its result once per row.
 
-        ``args`` and ``kwargs`` are the method's arguments. Raises ``InvalidInput`` if ``indices`` omits rows.
+        ``args`` and ``kwargs`` are the method's arguments. Raises ``InvalidInput`` if ``indices`` omits a row.
         """
         self._refuse_some_rows("env_method", indices)
         return [getattr(self, method_name)(*args, **kwargs)] * self.num_envs
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
-        """Return False, once per requested row, because the rows have no environments that could be wrapped."""
+        """Return a list with False once per requested row. The rows have no environments of their own to wrap."""
         return [False for _ in self._get_indices(indices)]
 
     def _close_episodes(self, ended: Ints, step: Step, infos: list[dict[str, Any]]) -> None:
-        """Write the final infos of ended episodes into ``infos``, before the next episodes start.
+        """Write the final infos of the ended episodes into ``infos``. Call this method before the next episodes start.
 
         Args:
             ended: indices of the worlds whose episodes have ended.
             step: results of the last step.
-            infos: one dictionary per row; the dictionaries of ended episodes are replaced.
+            infos: list with one dictionary per row; the dictionaries in the rows of ended episodes are replaced.
 
         """
         rows, final = self._rows(ended), self._observe(ended)
@@ -295,13 +298,13 @@ class EthBrakeVecEnv(Begun, VecEnv):
         self._return[rows], self._steps[rows] = 0.0, 0
 
     def _rows(self, worlds: Ints) -> Ints:
-        """Return the rows of all learners of the worlds with the indices ``worlds``, in order."""
+        """Return the numbers of the rows that belong to the worlds with the indices ``worlds``, in order."""
         width = len(self.engine.learners)
         return (worlds[:, np.newaxis] * width + np.arange(width)).reshape(-1)
 
     @property
     def reset_infos(self) -> list[dict[str, Any]]:
-        """Infos at the start of the running episodes, one dictionary per row."""
+        """List with one dictionary per row: the infos at the start of the row's running episode."""
         if not self._started:
             return [{} for _ in range(self.num_envs)]
         report = Report.of(self.engine)._replace(values=self._begun, shield=self._begun_shield)
@@ -312,7 +315,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         """Ignore the empty infos that the constructor of Stable-Baselines3's ``VecEnv`` assigns."""
 
     def _observe(self, worlds: Ints | None = None) -> Observations:
-        """Return the observations of all learners in a new array, float32 [rows, F].
+        """Return the observations of all learners as a new array, float32 [rows, F].
 
         ``worlds`` are the indices of the worlds to include; None: all worlds.
         """
@@ -333,7 +336,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         return worlds.repeat(len(self._learners))
 
     def _read_options(self) -> Worlds | None:
-        """Return the worlds that the options of ``set_options`` choose; None: the next worlds of the stream.
+        """Return the worlds that the options of ``set_options`` choose; None if the stream supplies the worlds.
 
         Raises ``InvalidInput`` if some rows have an initial state and others do not, or if the rows of one world have
         different initial states.

@@ -1,7 +1,7 @@
-"""``Trace``: recorder of the motion of an engine's worlds, for pictures of any moment.
+"""``Trace``: object that records how the vehicles of an engine move, so that pictures can show any moment.
 
-It records the state and the commands at the beginning of each step. The state at a moment within the step is computed
-from them exactly.
+A ``Trace`` records the state and the commands at the beginning of each step. From these it computes the exact state at
+any moment within the step.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 class Motion:
     """Recorded motion of n worlds during one step, or from the alert to the first decision.
 
-    The latest motion is *open*: it has no end yet. ``closed`` returns the motion with the engine's current state as its
-    end, and with its ``parts``, which ``scenes`` needs. Positions are relative to Vehicle 1's front at the alert.
+    The motion that was recorded last is *open*: its end is not yet known. ``closed`` returns a copy of the motion that
+    ends with the engine's present state and contains the ``parts`` that ``scenes`` needs. All positions are distances
+    (m) from Vehicle 1's front at the alert.
     """
 
     start: Worlds  # the n worlds at the start
@@ -53,19 +54,20 @@ class Motion:
     parts: tuple[tuple[Worlds, Floats, Floats], ...] = ()
 
     def closed(self, engine: Engine) -> Motion:
-        """Return this motion with the current state of ``engine`` as its end."""
+        """Return a copy of this motion that ends with the present state of ``engine``."""
         worlds = engine.worlds
         command = np.where(self.fresh[:, np.newaxis], worlds.command_mps2, self.command_mps2)
         parts = tuple(engine.segments(self.start, command))
         return replace(self, command_mps2=command, until_s=worlds.time_s, parts=parts)
 
     def scenes(self, engine: Engine, row: int, times_s: Floats | None = None) -> list[Scene]:
-        """Return the scenes of one world at several times. The motion must be closed.
+        """Return the scenes of one world at several times. The motion must have an end (see ``closed``).
 
         Args:
-            engine: the engine that was recorded.
-            row: row of the world.
-            times_s: times within this motion, ascending, [k] s; None: the end of the motion.
+            engine: the engine whose worlds were recorded.
+            row: index of the world.
+            times_s: times within this motion in increasing order, [k] s since the alert; None: only the end of the
+                motion.
 
         """
         times = self.until_s[[row]] if times_s is None else times_s
@@ -121,13 +123,13 @@ Memory = tuple[Motion, ...]  # recorded motions in order of time; the last one i
 
 
 class Trace:
-    """Recorder of the motion of an engine's worlds, a ``Watcher`` of ``engine.engine``.
+    """Object that records how the vehicles of an engine move: a ``Watcher`` as defined in the module ``engine.engine``.
 
     Args:
-        engine: engine to record, from its next reset on.
-        whole: record all steps of the episode (for engines with one world). If false, record the latest step only.
-        alert: worlds at the alert; given if the engine has just reached its first decision, so that the running
-            episodes are recorded. None: recording starts at the next reset.
+        engine: the engine whose worlds are recorded, from the engine's next reset on.
+        whole: True: keep all steps of the episode (only for engines with one world). False: keep the latest step only.
+        alert: the running worlds at the alert, to record episodes that have already started; the engine must have just
+            reached the first decision. None: recording starts at the next reset.
 
     """
 
@@ -136,12 +138,12 @@ class Trace:
         engine.watch(self, () if alert is None else self.begun((), alert, np.arange(alert.n)))
 
     def begun(self, memory: Memory, alert: Worlds, rows: Ints) -> Memory:
-        """Return the recorded motions after new episodes have started in some worlds.
+        """Return the recorded motions after new episodes have started in the worlds with the indices ``rows``.
 
         Args:
-            memory: the motions recorded so far.
+            memory: the motions recorded before this call.
             alert: the worlds of the new episodes at the alert.
-            rows: rows of the worlds in which new episodes have started.
+            rows: indices of the worlds in which new episodes have started.
 
         """
         v, n = alert.vehicles, alert.n
@@ -172,11 +174,11 @@ class Trace:
     def stepped(self, memory: Memory, before: Engine, after: Engine) -> Memory:
         """Return the recorded motions after a step.
 
-        If ``whole`` is true, the result contains all motions so far (the last of them closed) and the motion of the
-        step. Otherwise only the motion of the step is returned.
+        If the constructor's argument ``whole`` is true, these are all motions of the episode so far, and only the last
+        one is open. If ``whole`` is false, this is only the motion of the new step.
 
         Args:
-            memory: the motions recorded so far.
+            memory: the motions recorded before this call.
             before: the engine before the step.
             after: the engine after the step.
 
@@ -205,7 +207,7 @@ class Trace:
         return (*memory[:-1], last, new) if self._whole else (new,)
 
     def motions(self, engine: Engine) -> Memory:
-        """Return all recorded motions in order of time, with the last one closed at the engine's current state.
+        """Return all recorded motions in order of time; the last motion ends with the engine's present state.
 
         Raises ``InvalidInput`` before the first reset.
         """

@@ -1,4 +1,4 @@
-"""Vector environment for Gymnasium: one learner in each of many worlds, which are simulated together."""
+"""Vector environment for Gymnasium: many worlds, each with one learner, which are simulated together."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ from ethbrake_marl.physics.state import Bools, Floats
 
 
 class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArray[Any]]):
-    """Wrapper whose ``step`` also returns a cost: observation, reward, cost, terminated, truncated, info.
+    """Wrapper whose ``step`` also returns a cost, as Safety-Gymnasium does, for example for OmniSafe.
 
-    OmniSafe expects this format of Safety-Gymnasium. The cost is the harm that the step added to the line (m2/s2),
-    first-impact or total harm as in the reward.
+    ``step`` returns observation, reward, cost, terminated, truncated and info. The cost is the harm (m2/s2) that the
+    step added to the whole line: first-impact or total harm, whichever the reward uses.
 
     Args:
-        env: an ``EthBrakeEnv``, possibly inside wrappers that pass on its infos.
+        env: an ``EthBrakeEnv``, or wrappers around one that pass on its infos.
 
-    Raises ``InvalidInput`` for another environment, or for an environment that already contains a ``CostEnv``.
+    Raises ``InvalidInput`` if ``env`` is not such an environment, or if it already contains a ``CostEnv``.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.CostEnv(eb.EthBrakeEnv("paper-random"))
@@ -68,7 +68,7 @@ class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArra
     ) -> tuple[Observations, float, float, bool, bool, dict[str, Any]]:
         """Advance by one time step, and return observation, reward, cost, terminated, truncated and info.
 
-        ``action`` is an array [1] in [-1, 1]. The cost is the harm that the step added to the line (m2/s2).
+        ``action`` is an array [1] in [-1, 1]. The cost is the harm (m2/s2) that the step added to the whole line.
         """
         observation, reward, terminated, truncated, info = self.env.step(action)
         if isinstance(reward, np.ndarray) and reward.ndim:
@@ -84,31 +84,36 @@ class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArra
 
 
 class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
-    """Many worlds of ``EthBrakeEnv`` (``gymnasium.make_vec("EthBrake-v1", num_envs=4096, scenario=...)``).
+    """Many worlds like the one of ``EthBrakeEnv`` (``gymnasium.make_vec("EthBrake-v1", num_envs=4096)``).
 
-    After ``reset(seed=s)``, row k is world k of seed s. Each new episode takes the next world of this seed. All
-    returned arrays are new objects, which later steps do not change.
+    All arrays have one row per world. After ``reset(seed=s)``, row k is world k of seed s. Each later episode, in any
+    row, takes the next world of seed s. Later steps do not change the arrays that a step has returned.
 
     Args:
         num_envs: number of worlds that are simulated together, at least 1.
         scenario: name of a shipped scenario, path of a YAML file, or a ``Scenario``.
-        render_mode: ``rgb_array``, ``ansi``, or None. ``render`` returns one frame or text for each world.
-        learners: the vehicle that learns, by name (``vehicle_2``) or index (0 = front), in a list; None: the learner
-            of the scenario.
-        reward: reward of a step (``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``).
-        observation: features that the learner observes; None: the observation of the scenario (``observation_for``).
-        autoreset_mode: Gymnasium's autoreset mode, which says what happens when an episode ends. ``NextStep``
-            (default): the step returns the last observation, and the next step resets the world, ignores its action and
-            returns the reward 0. ``SameStep``: the step resets the world and returns the first observation of the new
-            episode; ``infos["final_obs"]`` and ``infos["final_info"]`` have the last observation and infos of the old
-            episode. ``Disabled``: the caller must reset ended rows before the next step.
+        render_mode: ``rgb_array``: ``render`` returns one frame for each world; ``ansi``: ``render`` returns one text
+            for each world; None: no pictures.
+        learners: a list with the one vehicle that learns, by name (``vehicle_2``) or index (0 = front); None: the
+            learner of the scenario.
+        reward: reward of a step: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams``
+            object.
+        observation: features that the learner observes; None: the features that belong to the scenario
+            (``observation_for``).
+        autoreset_mode: Gymnasium's autoreset mode: what happens in a row whose episode ends. ``NextStep`` (default):
+            the step returns the last observation of the episode. The next step ignores the row's action, starts a new
+            episode in the row, and returns the reward 0 for it. ``SameStep``: the step itself starts the new episode
+            and returns its first observation; ``infos["final_obs"]`` and ``infos["final_info"]`` contain the last
+            observation and infos of the old episode. ``Disabled``: no new episode starts; the caller must reset the row
+            before the next step.
         max_episode_steps: number of steps after which an episode is truncated; None: it is truncated at the horizon
             only.
-        actions: None: an action is a number in [-1, 1]. A whole number K of at least 2: an action is the index of one
-            of K evenly spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
-        reward_vector: None: rewards are numbers, [n]. ``vehicles``: rewards are arrays, [n, N], minus the harm that
-            each vehicle bears in the step. A list: rewards are arrays with the named components, [n, K]
-            (docs/environments.md).
+        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete, and an action is
+            an index from 0 to K - 1. The indices stand for K evenly spaced numbers from -1 (full braking capacity) to 1
+            (full driving capacity).
+        reward_vector: None: each world has a number as its reward, so that rewards are [n]. ``vehicles``: rewards are
+            [n, N], with minus the harm that each vehicle bears in the step. A list of K components: rewards are [n, K]
+            (see docs/environments.md).
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -160,9 +165,9 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         """Start an episode in every world, and return observations [n, F] and infos.
 
         Args:
-            seed: start the first worlds of this seed; None: start the next worlds of the current seed.
-            options: ``initial_state`` or ``listed_world`` to choose the worlds; ``reset_mask`` [n], true for the rows
-                to reset, to reset only some rows (docs/environments.md).
+            seed: start the first n worlds of this seed; None: continue with the next n worlds of the current seed.
+            options: to choose the worlds, the key ``initial_state`` or ``listed_world``; to reset only some rows, the
+                key ``reset_mask`` with an array [n] that is true for these rows (see docs/environments.md).
 
         """
         rows = self._rows_to_reset(options)
@@ -176,8 +181,9 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
     def step(self, actions: NDArray[Any]) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
         """Advance every world by one time step with the actions [n, 1] in [-1, 1].
 
-        Returns observations [n, F], rewards [n], terminated [n], truncated [n], and infos in Gymnasium's vector format.
-        ``autoreset_mode`` says when a new episode starts after the end of an episode.
+        Returns observations [n, F], rewards [n], terminated [n], truncated [n], and infos in the format of Gymnasium's
+        vector environments. The constructor's argument ``autoreset_mode`` determines when a new episode starts after
+        the end of an episode.
         """
         if not self._started:
             raise InvalidInput("step: no episode is running; call reset first")
@@ -208,15 +214,15 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
     def render(self) -> tuple[Any, ...]:
         """Return a tuple with a picture of every world: a frame [H, W, 3] uint8, or a text.
 
-        If a new episode has just started in a world, the picture shows the start of this episode.
+        If a new episode has just started in a world, its picture shows the beginning of the new episode.
         """
         return tuple(self.viewer.render())
 
     def _fill_ignored(self, actions: NDArray[Any], before: Bools) -> NDArray[Any]:
-        """Return the actions, with 0 for the worlds whose actions are ignored.
+        """Return ``actions`` with the action 0 in each world whose action is ignored.
 
-        In mode ``NextStep``, actions are ignored in worlds whose episodes had ended before the step (mask ``before``
-        [n]).
+        In the autoreset mode ``NextStep``, the action of a world is ignored if its episode had ended before the step.
+        The mask ``before`` [n] is true for these worlds.
         """
         if self.autoreset_mode is not AutoresetMode.NEXT_STEP or not before.any():
             return actions
@@ -228,7 +234,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
     def _rows_to_reset(self, options: Any) -> Bools:
         """Return ``options["reset_mask"]``, the mask [n] of the rows to reset, or a mask of all rows if it is missing.
 
-        Raises ``InvalidInput`` for an invalid mask.
+        Raises ``InvalidInput`` if the mask is not a bool array [n], or has no True.
         """
         if not isinstance(options, Mapping) or RESET_MASK not in options:
             return np.ones(self.num_envs, np.bool_)
@@ -242,10 +248,10 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         return np.array(mask)
 
     def _renew(self, rows: Bools, seed: int | None, options: Mapping[str, Any]) -> None:
-        """Start new episodes in the rows of the mask ``rows`` [n], while the other rows continue.
+        """Start new episodes in the rows for which the mask ``rows`` [n] is true; all other episodes continue.
 
-        Raises ``InvalidInput`` if a ``seed`` or an option chooses the worlds, because such a reset must include all
-        rows.
+        Raises ``InvalidInput`` if ``seed`` or an option chooses the worlds, because a reset with chosen worlds must
+        include all rows.
         """
         warn_of_unknown(options, self._known_options)
         starts = [name for name in (INITIAL_STATE, LISTED_WORLD) if name in options]
@@ -258,7 +264,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         self.engine.renew(np.flatnonzero(rows))
 
     def _final_infos(self, step: Step) -> dict[str, Any]:
-        """Return the infos ``final_obs`` and ``final_info``, with their masks, of episodes that ended in this step."""
+        """Return the infos ``final_obs`` and ``final_info`` of the episodes that ended in this step, with masks."""
         ended = step.ended
         observations = self.engine.observe(self.learner)
         final = np.full(self.num_envs, None, dtype=object)

@@ -1,4 +1,4 @@
-"""``Viewer``: implementation of ``render()`` for all render modes."""
+"""``Viewer``: the object that draws pictures for the method ``render`` of all environments."""
 
 from __future__ import annotations
 
@@ -20,12 +20,13 @@ class Viewer:
     """Object that draws pictures of the running episodes of an engine.
 
     Args:
-        engine: the engine to show, from its next reset on.
-        mode: render mode, namely ``human``, ``rgb_array``, ``rgb_array_list`` or ``ansi``; None: there are no pictures.
-        batch: whether the environment has many worlds and shows all of them. Only the modes ``rgb_array`` and ``ansi``
-            are then allowed.
+        engine: the engine whose worlds are shown, from the engine's next reset on.
+        mode: render mode: ``human``, ``rgb_array``, ``rgb_array_list`` or ``ansi``; None: the viewer draws no pictures.
+        batch: True: the environment has many worlds, all of which are shown. In this case only the modes ``rgb_array``
+            and ``ansi`` are allowed. False: the environment has one world.
 
-    Raises ``InvalidInput`` for another mode, ``MissingExtra`` for ``human`` if pygame is missing.
+    Raises ``InvalidInput`` for any other mode. Raises ``MissingExtra`` for the mode ``human`` if pygame is not
+    installed.
 
     """
 
@@ -52,23 +53,24 @@ class Viewer:
         return {"render_modes": list(self.modes), "render_fps": round(fps) if abs(fps - round(fps)) < 1e-9 else fps}
 
     def began(self) -> None:
-        """Start a new list of frames, and show the motion up to the first decision; call it when an episode starts."""
+        """Show the motion up to the first decision, and empty the list of frames. Call it at an episode's start."""
         self._shown = 0
         if self._window is not None:
             self._window.closed_by_user = False
             self.play()
 
     def play(self) -> None:
-        """Show the last step in the window in real time. In other modes than ``human``, do nothing."""
+        """In the mode ``human``, show the last step in the window in real time; in other modes, do nothing."""
         if self._window is not None:
             for frame in self.step_frames():
                 self._window.show(frame, SMOOTH_FPS)
 
     def render(self) -> Any:
-        """Return a picture of the present moment, whose type depends on the mode; for a batch, a tuple of pictures.
+        """Return a picture of the present moment, or a tuple with one picture per world if ``batch`` is true.
 
-        ``rgb_array``: a frame [H, W, 3] uint8. ``rgb_array_list``: the list of all frames since the last call.
-        ``ansi``: a text. ``human``: None, because the window shows every step.
+        The type of a picture depends on the render mode. ``rgb_array``: a frame [H, W, 3] uint8. ``rgb_array_list``: a
+        list of all frames since the last call of ``render``. ``ansi``: a text. ``human``: None, because a window
+        already shows every step.
         """
         motions = self._motions(f"render: the environment needs a render_mode: {', '.join(self.modes)}")
         if self.mode == "human":
@@ -81,10 +83,10 @@ class Viewer:
         return shown if self._batch else shown[0]
 
     def step_frames(self, fps: float = SMOOTH_FPS) -> list[Frame]:
-        """Return frames [H, W, 3] of the last step or, after a reset, of the time until the first decision.
+        """Return frames [H, W, 3] of the last step or, after a reset, of the motion up to the first decision.
 
-        ``fps`` is the number of frames per second. Raises ``InvalidInput`` before the first reset, without a render
-        mode, and unless ``fps`` is a whole number of at least 1.
+        ``fps`` is the number of frames per second of the motion. Raises ``InvalidInput`` before the first reset, if the
+        viewer has no render mode, and unless ``fps`` is a whole number of at least 1.
         """
         check_whole_number("step_frames: fps", fps, 1)
         motion = self._motions("step_frames: the environment needs the render_mode 'rgb_array'")[-1]
@@ -93,7 +95,7 @@ class Viewer:
         return [scene.frame() for scene in motion.scenes(self._engine, 0, times)]
 
     def close(self) -> None:
-        """Close the window, if one is open."""
+        """Close the window of the render mode ``human``, if it is open."""
         if self._window is not None:
             self._window.close()
 

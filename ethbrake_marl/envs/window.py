@@ -12,8 +12,8 @@ from ethbrake_marl.errors import InvalidInput, need
 class Window:
     """Window for ``render_mode="human"``, which opens when the first frame is shown.
 
-    After the user has closed it, it opens again at the next episode. A copy of the object is another window. Raises
-    ``MissingExtra`` if pygame is missing.
+    If the user closes the window, it opens again at the next episode. A copy of the object opens a window of its own.
+    Raises ``MissingExtra`` if pygame is not installed.
     """
 
     def __init__(self) -> None:
@@ -30,7 +30,7 @@ class Window:
         return Window, ()
 
     def show(self, frame: Frame, fps: float) -> None:
-        """Show a frame [H, W, 3] uint8 for 1/fps seconds. Raise ``InvalidInput`` if there is no display."""
+        """Show a frame [H, W, 3] uint8 for 1 / ``fps`` seconds. Raise ``InvalidInput`` without a display."""
         if self.closed_by_user:
             return
         pygame = self._pygame

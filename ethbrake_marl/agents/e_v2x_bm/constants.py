@@ -1,10 +1,11 @@
-"""Simulate many constant decelerations of one vehicle in one world, for the coupled search. Compiled.
+"""Simulate many constant decelerations of one vehicle in one world, for the agent ``e_v2x_bm``. Compiled.
 
-The harm equals the harm from ``physics.advance`` under constant commands to the bit. Three things save time:
+The simulated harm has the same bits as the harm that ``physics.advance`` computes for the same constant commands. Three
+methods save time:
 
-- The motion until the vehicle's command takes effect is the same for all decelerations, and is simulated once.
+- The motion until the vehicle's command takes effect is the same for all decelerations, so it is simulated only once.
 - A simulation ends as soon as no pair can have another impact (``will_stay_apart``).
-- A simulation ends once its harm, which never decreases, has reached a bound.
+- A simulation ends as soon as its harm reaches a given number, because the harm never decreases again.
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ _DIGIT = 1_000.0  # base in which ``_course`` encodes the number of impacts of e
 
 
 class Line(NamedTuple):
-    """One world, as tables of ``physics.rows``, in which constant decelerations of one vehicle are simulated.
+    """One world in which constant decelerations of one vehicle are simulated, as tables of ``physics.rows``.
 
-    A table has a row for each quantity and a column for each vehicle, front to rear. With an obstacle ahead, column 0
-    is the obstacle.
+    A table has a row for each quantity and a column for each vehicle, front to rear. If the world has an obstacle ahead
+    of Vehicle 1, column 0 is the obstacle.
     """
 
     start: Floats  # [rows, N or N + 1] table at the start, with the commands of all other vehicles
@@ -56,7 +57,7 @@ def make_line(
     mass: Floats, limit: Floats, in_force: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats,
     time: float, restitution: float, horizon: float, vehicle: int, total: bool,
 ) -> Line:  # fmt: skip
-    """Return the tables of one world of N vehicles. Call ``share_start`` next.
+    """Return one world of N vehicles as tables. Call ``share_start`` next.
 
     Args:
         gap: gap of each pair, [N - 1] m, bumper to bumper.
@@ -64,19 +65,20 @@ def make_line(
         hit: whether each pair has had an impact, [N - 1].
         obstacle: distance from Vehicle 1 to an obstacle ahead, m; infinite without an obstacle.
         obstacle_hit: whether Vehicle 1 has had an impact with the obstacle.
-        command: command of each vehicle, [N] m/s2; the controlled vehicle's command is ignored.
-        latency: latency of each vehicle, [N] s since the alert.
+        command: constant command of each vehicle, [N] m/s2; the controlled vehicle's entry is ignored.
+        latency: latency of each vehicle (time from the alert until its command takes effect), [N] s.
         mass: mass of each vehicle, [N] t.
         limit: speed limit of each vehicle, [N] m/s.
-        in_force: acceleration of each vehicle in force at the start, [N] m/s2.
-        brake_rate: rate at which each vehicle's brakes build up, [N] m/s3.
-        release_rate: rate at which each vehicle's brakes are released, [N] m/s3.
-        pieces: braking profiles with K intervals of constant command, as in ``Vehicles``, [N, 2 K].
-        time: time of the world, s since the alert.
+        in_force: acceleration of each vehicle at the start, [N] m/s2.
+        brake_rate: rate at which the deceleration of each vehicle rises when it brakes, [N] m/s3.
+        release_rate: rate at which the deceleration of each vehicle falls when it releases its brakes, [N] m/s3.
+        pieces: braking profile of each vehicle: K intervals with constant commands, in the format of
+            ``Vehicles.pieces``, [N, 2 K].
+        time: time at the start of the simulations, s since the alert.
         restitution: restitution of every impact, 0 to 1.
-        horizon: end of the simulations, s since the alert.
+        horizon: time at the end of the simulations, s since the alert.
         vehicle: index of the controlled vehicle, from 0.
-        total: whether total harm is minimised; if False, first-impact harm.
+        total: True: total harm is minimised; False: first-impact harm is minimised.
 
     """
     at = 1 if obstacle < math.inf else 0
@@ -102,10 +104,10 @@ def make_line(
 
 @compiled(apart=True, bare=True)
 def share_start(line: Line) -> int:
-    """Simulate in ``line.shared`` until the controlled vehicle's command takes effect; return a status.
+    """Simulate the motion in ``line.shared`` until the controlled vehicle's command takes effect.
 
-    ``line.clock`` receives the time until the command takes effect, s. The status is ``FLAG.DONE``, or the code of the
-    physics check that failed.
+    The time (s) until the command takes effect is written to ``line.clock``. Returns ``FLAG.DONE`` or, if the
+    simulation failed, the code of the physics check that failed.
     """
     table, clock = line.shared, line.clock
     copy_table(line.start, table)
@@ -129,14 +131,15 @@ def simulate(line: Line, samples: Samples, first: int, end: int, bound: float) -
     """Simulate constant decelerations of the controlled vehicle, and write the results into ``samples``.
 
     Args:
-        line: the world, after ``share_start``; ``line.table`` is overwritten.
-        samples: samples with the decelerations in ``at``; the other columns receive the results.
+        line: the world, for which ``share_start`` was called before; ``line.table`` is overwritten.
+        samples: samples with the decelerations to simulate in ``samples.at``; the results are written to the other
+            arrays of ``samples``.
         first: index of the first sample to simulate.
         end: index after the last sample to simulate.
-        bound: harm at which a simulation stops, m2/s2. The harm of a sample whose simulation was stopped is at least
-            ``bound``, and the sample's other numbers are meaningless.
+        bound: a simulation stops when its harm reaches this number, m2/s2. The harm of such a sample is at least
+            ``bound``, and the sample's ``other`` and ``course`` have no meaning.
 
-    Returns a status: ``FLAG.DONE``, or the code of the physics check that failed.
+    Returns ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed.
 
     """
     for s in range(first, end):
@@ -154,9 +157,9 @@ def simulate(line: Line, samples: Samples, first: int, end: int, bound: float) -
 
 @compiled(within=True)
 def _simulate_one(line: Line, command: float, bound: float) -> int:
-    """Simulate one ``command`` (m/s2) in ``line.table``; stop early if the harm reaches ``bound`` (m2/s2).
+    """Simulate the controlled vehicle's ``command`` (m/s2) in ``line.table``; stop at the harm ``bound`` (m2/s2).
 
-    Returns a status: ``FLAG.DONE``, or the code of the physics check that failed.
+    Returns ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed.
     """
     table, duration = line.table, line.clock[DURATION]
     table[ROW.COMMAND, line.controlled] = command
@@ -178,7 +181,7 @@ def _simulate_one(line: Line, command: float, bound: float) -> int:
 
 @compiled(within=True)
 def _copy_state(of: Floats, table: Floats) -> None:
-    """Copy the state of all vehicles and pairs from table ``of`` to ``table``, but not masses and other parameters."""
+    """Copy the state of all vehicles and pairs (not parameters such as masses) from table ``of`` to ``table``."""
     vehicles = table.shape[1]
     for i in range(vehicles):
         table[ROW.SPEED, i] = of[ROW.SPEED, i]
@@ -210,19 +213,19 @@ def will_stay_apart(table: Floats) -> bool:
     """Return whether it is certain that no pair has another impact while the present commands last.
 
     ``table`` is the table of one world (``physics.rows``). The result is False if a command is not yet in full effect,
-    or if a vehicle drives or moves backward. Otherwise every vehicle keeps its acceleration until it is at rest, and
-    vehicles that press against each other have the same acceleration.
+    or if a vehicle drives or moves backward. In all other cases every vehicle keeps its acceleration until it is at
+    rest, and vehicles that press against each other have the same acceleration.
 
-    Let a pair of a front vehicle f and a rear vehicle r have the gap g, the closing speed w, the speeds v_f and v_r,
-    and the decelerations d_f and d_r. The pair has no impact under any of these conditions:
+    Let f be the front vehicle and r the rear vehicle of a pair, with the gap g, the closing speed w, the speeds v_f and
+    v_r, and the decelerations d_f and d_r. Each of the following conditions is enough to exclude an impact of the pair:
 
     * Vehicle r is at rest, or both vehicles move as one body.
     * ``w <= 0`` and ``d_r >= d_f``, so w stays at most 0 until r is at rest.
-    * Three conditions hold together, with margins for rounding. First, the vehicles do not touch, or they separate.
-      Second, the stopping point of r is behind the stopping point of f: ``g + v_f^2 / (2 d_f) > v_r^2 / (2 d_r)``.
-      Third, if r closes in and brakes harder than f, the smallest gap is positive: ``w^2 < 2 (d_r - d_f) g``. (If r
-      brakes less hard, the gap is smallest now or at the end, because the gap is a concave function of time until f is
-      at rest, and decreases afterwards.)
+    * Three statements are true together, with margins for rounding errors. First, f and r do not touch, or the gap
+      grows. Second, the stopping point of r is behind the stopping point of f: ``g + v_f^2 / (2 d_f) > v_r^2 / (2
+      d_r)``. Third, if r closes in and brakes harder than f, the smallest gap is positive: ``w^2 < 2 (d_r - d_f) g``.
+      (If r brakes less hard, the gap is smallest now or at the end, because the gap is a concave function of time until
+      f is at rest, and decreases afterwards.)
     """
     vehicles, hardest = table.shape[1], 0.0
     if pieces_to_come(table):
@@ -261,7 +264,7 @@ def will_stay_apart(table: Floats) -> bool:
 
 @compiled(within=True)
 def _way_to_stop(speed: float, acceleration: float) -> float:
-    """Return the distance in which a vehicle with ``speed`` (m/s) and ``acceleration`` (m/s2, at most 0) stops, m.
+    """Return the distance (m) in which a vehicle with ``speed`` (m/s) and ``acceleration`` (m/s2, at most 0) stops.
 
     The distance is infinite for a moving vehicle with acceleration 0.
     """
@@ -270,7 +273,7 @@ def _way_to_stop(speed: float, acceleration: float) -> float:
 
 @compiled(within=True)
 def _course(line: Line) -> float:
-    """Return a code of how many impacts each pair, and Vehicle 1 with the obstacle, have had in ``line.table``."""
+    """Return one number that encodes the number of impacts of each pair, and with the obstacle, in ``line.table``."""
     course, digit, table = 0.0, 1.0, line.table
     for p in range(line.vehicles, table.shape[1] - 1):
         course += table[ROW.COUNT, p] * digit
@@ -280,7 +283,7 @@ def _course(line: Line) -> float:
 
 @compiled(within=True)
 def _sum_row(line: Line, row: int) -> float:
-    """Return the sum of a row of ``line.table`` over the pairs and the obstacle, in NumPy's order of summation."""
+    """Sum up a row of ``line.table`` over the pairs and the obstacle, in the order in which NumPy adds."""
     table, first, total = line.table, line.vehicles, 0.0
     eights = (table.shape[1] - 1 - first) // 8
     if eights > 0:
@@ -292,9 +295,9 @@ def _sum_row(line: Line, row: int) -> float:
 
 @compiled(apart=True, bare=True)
 def _sum_eights(table: Floats, row: int, first: int, end: int) -> float:
-    """Return the sum of ``table[row, first:end]``, a multiple of eight entries, in NumPy's order of summation.
+    """Sum up ``table[row, first:end]`` in the order in which NumPy adds; the number of entries is a multiple of eight.
 
-    Eight partial sums, each of every eighth entry, are added pairwise.
+    NumPy forms eight partial sums, each over every eighth entry, and adds these eight sums pairwise.
     """
     return (
         (_sum_place(table, row, first, end) + _sum_place(table, row, first + 1, end))
@@ -307,7 +310,7 @@ def _sum_eights(table: Floats, row: int, first: int, end: int) -> float:
 
 @compiled(apart=True, bare=True)
 def _sum_place(table: Floats, row: int, first: int, end: int) -> float:
-    """Return the sum of every eighth entry of ``table[row, first:end]``, from index ``first`` on."""
+    """Return the sum of the entries ``first``, ``first + 8``, ``first + 16``, ... of ``table[row, :end]``."""
     total = table[row, first]
     for p in range(first + 8, end, 8):
         total += table[row, p]

@@ -1,6 +1,6 @@
 """First contact of a single pair in closed form, and the decelerations that avoid it.
 
-The table defines the symbols for a pair. docs/internals/proofs/constant-deceleration.md derives every formula.
+The following table defines the symbols. docs/internals/proofs/constant-deceleration.md derives every formula.
 
 =============  ===============================================================
 l, f           leader (front vehicle), follower (rear vehicle)
@@ -13,7 +13,7 @@ lead           time from the follower's onset to the leader's [s], > 0
 w              closing speed ``v_f - v_l`` [m/s]
 =============  ===============================================================
 
-Only + - * / and sqrt are used, so the result for a world has the same bits in any batch.
+The formulas use only + - * / and sqrt. Therefore the result for a world has the same bits in every batch of worlds.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ _NONE = -1.0
 
 @compiled
 def stopping_time(speed: float, deceleration: float) -> float:
-    """Return the time in which a vehicle stops, s; 0 at rest, inf without braking.
+    """Return the time (s) in which a vehicle stops: 0 if it is at rest, inf if it moves and does not brake.
 
-    The time is ``speed / deceleration``, with the speed in m/s and the deceleration in m/s2.
+    The stopping time is ``speed / deceleration``, with the speed in m/s and the deceleration in m/s2.
     """
     if speed == 0.0:
         return 0.0
@@ -43,9 +43,9 @@ def stopping_time(speed: float, deceleration: float) -> float:
 
 @compiled
 def stopping_distance(speed: float, deceleration: float) -> float:
-    """Return the distance in which a vehicle stops, m; 0 at rest, inf without braking.
+    """Return the distance (m) in which a vehicle stops: 0 if it is at rest, inf if it moves and does not brake.
 
-    The distance is ``speed^2 / (2 deceleration)``, with the speed in m/s and the deceleration in m/s2.
+    The stopping distance is ``speed^2 / (2 deceleration)``, with the speed in m/s and the deceleration in m/s2.
     """
     if speed == 0.0:
         return 0.0
@@ -54,17 +54,17 @@ def stopping_distance(speed: float, deceleration: float) -> float:
 
 @compiled
 def contact_while_coasting(gap: float, v_l: float, a_l: float, v_f: float, tau: float) -> float:
-    """Return the squared closing speed if the pair meets while the follower coasts, else -1. [m2/s2]
+    """Return the squared closing speed (m2/s2) of a contact while the follower coasts; -1 if there is no such contact.
 
-    These are the regimes A (the leader still moves) and A' (the leader is at rest) of
-    docs/internals/proofs/constant-deceleration.md.
+    docs/internals/proofs/constant-deceleration.md calls such a contact regime A if the leader still moves, and regime
+    A' if the leader is at rest.
 
     Args:
-        gap: gap at the start, m.
-        v_l: speed of the leader (front vehicle) at the start, m/s.
-        a_l: the leader's deceleration, held from the start to standstill, m/s2, >= 0.
-        v_f: speed of the follower (rear vehicle) at the start, m/s.
-        tau: time until which the follower coasts, s.
+        gap: gap between leader and follower at the start of the motion, m.
+        v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
+        a_l: the leader's deceleration, held from the start of the motion to standstill, m/s2, >= 0.
+        v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
+        tau: time for which the follower coasts before it brakes, s.
 
     """
     w = v_f - v_l
@@ -84,17 +84,17 @@ def contact_while_coasting(gap: float, v_l: float, a_l: float, v_f: float, tau: 
 
 @compiled
 def contact_while_both_brake(gap: float, v_l: float, a_l: float, v_f: float, a_f: float, tau: float) -> float:
-    """Return the squared closing speed if the pair meets while both vehicles brake and move, else -1. [m2/s2]
+    """Return the squared closing speed (m2/s2) of a contact while both vehicles brake and move, otherwise -1.
 
-    This is regime B of docs/internals/proofs/constant-deceleration.md.
+    docs/internals/proofs/constant-deceleration.md calls such a contact regime B.
 
     Args:
-        gap: gap at the start, m.
-        v_l: speed of the leader (front vehicle) at the start, m/s.
-        a_l: the leader's deceleration, held from the start to standstill, m/s2, >= 0.
-        v_f: speed of the follower (rear vehicle) at the start, m/s.
+        gap: gap between leader and follower at the start of the motion, m.
+        v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
+        a_l: the leader's deceleration, held from the start of the motion to standstill, m/s2, >= 0.
+        v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
         a_f: the follower's deceleration, held from ``tau`` to standstill, m/s2, >= 0.
-        tau: time until which the follower coasts, s.
+        tau: time for which the follower coasts before it brakes, s.
 
     """
     stop_l = stopping_time(v_l, a_l)
@@ -117,15 +117,15 @@ def contact_while_both_brake(gap: float, v_l: float, a_l: float, v_f: float, a_f
 
 @compiled
 def contact_leader_first(gap: float, v_l: float, a_l: float, v_f: float, a_f: float, tau: float) -> float:
-    """Return the squared closing speed at the first contact if the leader brakes first; 0 without contact. [m2/s2]
+    """Return the squared closing speed (m2/s2) at the first contact; 0 without contact. The leader brakes first.
 
     Args:
-        gap: gap at the start, m.
-        v_l: speed of the leader (front vehicle) at the start, m/s.
-        a_l: the leader's deceleration, held from the start to standstill, m/s2, >= 0.
-        v_f: speed of the follower (rear vehicle) at the start, m/s.
+        gap: gap between leader and follower at the start of the motion, m.
+        v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
+        a_l: the leader's deceleration, held from the start of the motion to standstill, m/s2, >= 0.
+        v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
         a_f: the follower's deceleration, held from ``tau`` to standstill, m/s2, >= 0.
-        tau: time until which the follower coasts, s.
+        tau: time for which the follower coasts before it brakes, s.
 
     """
     squared = contact_while_coasting(gap, v_l, a_l, v_f, tau)
@@ -142,16 +142,16 @@ def contact_leader_first(gap: float, v_l: float, a_l: float, v_f: float, a_f: fl
 
 @compiled
 def contact_before_leader_brakes(gap: float, w: float, a_f: float, lead: float) -> float:
-    """Return the squared closing speed if a braking follower meets a leader that still coasts; else -1. [m2/s2]
+    """Return the squared closing speed (m2/s2) if a braking follower hits a leader that still coasts, otherwise -1.
 
-    The pair meets at the time ``2 gap / (w + sqrt(w^2 - 2 a_f gap))``, if this time is at most ``lead``. A touch
-    without impact is ignored, because the pair then separates again.
+    The follower reaches the coasting leader at the time ``2 gap / (w + sqrt(w^2 - 2 a_f gap))``, if this time is at
+    most ``lead``. A touch (contact without an impact) is ignored, because the two vehicles separate again after it.
 
     Args:
-        gap: gap at the start, m.
-        w: closing speed at the start, follower minus leader, m/s.
-        a_f: deceleration of the follower, held from the start, m/s2, >= 0.
-        lead: time until which the leader coasts, s.
+        gap: gap between leader and follower at the start of the motion, m.
+        w: closing speed at the start of the motion: the follower's speed minus the leader's, m/s.
+        a_f: the follower's deceleration, held from the start of the motion, m/s2, >= 0.
+        lead: time for which the leader coasts before it brakes, s.
 
     """
     squared = w * w - 2.0 * a_f * gap
@@ -164,16 +164,16 @@ def contact_before_leader_brakes(gap: float, w: float, a_f: float, lead: float) 
 def closing_speed_squared(
     gap: float, v_l: float, a_l: float, onset_l: float, v_f: float, a_f: float, onset_f: float
 ) -> float:
-    """Return the squared closing speed at the pair's first impact; 0 without an impact. [m2/s2]
+    """Return the squared closing speed (m2/s2) at the pair's first impact, or 0 if there is no impact.
 
     Args:
-        gap: gap at the start, m.
-        v_l: speed of the leader (front vehicle) at the start, m/s.
+        gap: gap between leader and follower at the start of the motion, m.
+        v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
         a_l: the leader's deceleration, held from ``onset_l`` to standstill, m/s2, >= 0.
-        onset_l: time until which the leader coasts, s.
-        v_f: speed of the follower (rear vehicle) at the start, m/s.
+        onset_l: time for which the leader coasts before it brakes, s.
+        v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
         a_f: the follower's deceleration, held from ``onset_f`` to standstill, m/s2, >= 0.
-        onset_f: time until which the follower coasts, s.
+        onset_f: time for which the follower coasts before it brakes, s.
 
     """
     w = v_f - v_l
@@ -196,16 +196,16 @@ def closing_speed_squared(
 
 @compiled
 def least_behind_braking(gap: float, v_l: float, a_l: float, v_f: float, tau: float) -> float:
-    """Return the smallest deceleration of the follower that avoids an impact; inf if none does. [m/s2]
+    """Return the follower's smallest deceleration (m/s2) that avoids an impact; inf if every deceleration leads to one.
 
-    This is the case of ``least_to_spare_front`` in which the leader brakes first.
+    This function is for the case that the leader brakes first; ``least_to_spare_front`` covers all cases.
 
     Args:
-        gap: gap at the start, m.
-        v_l: speed of the leader (front vehicle) at the start, m/s.
-        a_l: the leader's deceleration, held from the start to standstill, m/s2, > 0.
-        v_f: speed of the follower (rear vehicle) at the start, m/s.
-        tau: time until which the follower coasts, s, >= 0.
+        gap: gap between leader and follower at the start of the motion, m.
+        v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
+        a_l: the leader's deceleration, held from the start of the motion to standstill, m/s2, > 0.
+        v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
+        tau: time for which the follower coasts before it brakes, s, >= 0.
 
     """
     coasting = contact_while_coasting(gap, v_l, a_l, v_f, tau)
@@ -226,16 +226,17 @@ def least_behind_braking(gap: float, v_l: float, a_l: float, v_f: float, tau: fl
 
 @compiled
 def least_behind_coasting(gap: float, v_l: float, a_l: float, v_f: float, lead: float) -> float:
-    """Return the smallest deceleration of the follower that avoids an impact; inf if none does. [m/s2]
+    """Return the follower's smallest deceleration (m/s2) that avoids an impact; inf if every deceleration leads to one.
 
-    This is the case of ``least_to_spare_front`` in which the follower brakes first, from the start on.
+    This function is for the case that the follower brakes from the start of the motion, before the leader.
+    ``least_to_spare_front`` covers all cases.
 
     Args:
-        gap: gap at the start, m.
-        v_l: speed of the leader (front vehicle) at the start, m/s.
+        gap: gap between leader and follower at the start of the motion, m.
+        v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
         a_l: the leader's deceleration, held from ``lead`` to standstill, m/s2, > 0.
-        v_f: speed of the follower (rear vehicle) at the start, m/s.
-        lead: time until which the leader coasts, s, > 0.
+        v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
+        lead: time for which the leader coasts before it brakes, s, > 0.
 
     """
     if v_f == 0.0:
@@ -254,19 +255,19 @@ def least_behind_coasting(gap: float, v_l: float, a_l: float, v_f: float, lead: 
 
 @compiled
 def least_to_spare_front(gap: float, v_l: float, a_l: float, onset_l: float, v_f: float, onset_f: float) -> float:
-    """Return the smallest constant deceleration of the follower that avoids an impact; inf if none does. [m/s2]
+    """Return the follower's smallest deceleration (m/s2) that avoids an impact; inf if every deceleration leads to one.
 
-    With a larger deceleration the follower is further back at any time, so every larger deceleration avoids the impact
-    as well. At the smallest deceleration, the follower stops directly behind the leader, or the two vehicles touch with
-    equal speeds while both move.
+    With a larger deceleration the follower is further back at every moment. Therefore every larger deceleration avoids
+    the impact as well. With the smallest such deceleration, the follower stops directly behind the leader, or the two
+    vehicles touch with equal speeds while both move.
 
     Args:
-        gap: gap at the start, m.
-        v_l: speed of the leader (front vehicle) at the start, m/s.
+        gap: gap between leader and follower at the start of the motion, m.
+        v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
         a_l: the leader's deceleration, held from ``onset_l`` to standstill, m/s2, > 0.
-        onset_l: time until which the leader coasts, s.
-        v_f: speed of the follower (rear vehicle) at the start, m/s.
-        onset_f: time until which the follower coasts, s.
+        onset_l: time for which the leader coasts before it brakes, s.
+        v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
+        onset_f: time for which the follower coasts before it brakes, s.
 
     """
     w = v_f - v_l
@@ -281,16 +282,17 @@ def least_to_spare_front(gap: float, v_l: float, a_l: float, onset_l: float, v_f
 
 @compiled
 def most_ahead_of_coasting(gap: float, v_l: float, v_f: float, a_f: float, tau: float) -> float:
-    """Return the leader's largest deceleration that avoids an impact; inf if all do, -inf if none does. [m/s2]
+    """Return the leader's largest deceleration (m/s2) that avoids an impact; inf if all avoid it, -inf if none does.
 
-    This is the case of ``most_to_spare_rear`` in which the leader brakes first, from the start on.
+    This function is for the case that the leader brakes from the start of the motion, before the follower.
+    ``most_to_spare_rear`` covers all cases.
 
     Args:
-        gap: gap at the start, m.
-        v_l: speed of the leader (front vehicle) at the start, m/s.
-        v_f: speed of the follower (rear vehicle) at the start, m/s.
+        gap: gap between leader and follower at the start of the motion, m.
+        v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
+        v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
         a_f: the follower's deceleration, held from ``tau`` to standstill, m/s2, > 0.
-        tau: time until which the follower coasts, s, >= 0.
+        tau: time for which the follower coasts before it brakes, s, >= 0.
 
     """
     reach = v_f * tau + stopping_distance(v_f, a_f)
@@ -309,19 +311,19 @@ def most_ahead_of_coasting(gap: float, v_l: float, v_f: float, a_f: float, tau: 
 
 @compiled
 def most_to_spare_rear(gap: float, v_l: float, onset_l: float, v_f: float, a_f: float, onset_f: float) -> float:
-    """Return the leader's largest constant deceleration that avoids an impact; inf if all do, -inf if none does. [m/s2]
+    """Return the leader's largest deceleration (m/s2) that avoids an impact; inf if all avoid it, -inf if none does.
 
-    With a smaller deceleration the leader is further ahead at any time, so every smaller deceleration avoids the impact
-    as well. If the follower brakes first, the motion until the leader's onset is computed first, because it does not
-    depend on the leader's deceleration.
+    With a smaller deceleration the leader is further ahead at every moment. Therefore every smaller deceleration avoids
+    the impact as well. If the follower brakes first, the motion until the leader brakes is computed first, because this
+    motion does not depend on the leader's deceleration.
 
     Args:
-        gap: gap at the start, m.
-        v_l: speed of the leader (front vehicle) at the start, m/s.
-        onset_l: time until which the leader coasts, s.
-        v_f: speed of the follower (rear vehicle) at the start, m/s.
+        gap: gap between leader and follower at the start of the motion, m.
+        v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
+        onset_l: time for which the leader coasts before it brakes, s.
+        v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
         a_f: the follower's deceleration, held from ``onset_f`` to standstill, m/s2, > 0.
-        onset_f: time until which the follower coasts, s.
+        onset_f: time for which the follower coasts before it brakes, s.
 
     """
     w = v_f - v_l

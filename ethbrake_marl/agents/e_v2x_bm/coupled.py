@@ -1,9 +1,9 @@
-"""Coupled E-V2X-BM: the best constant deceleration of one vehicle in the engine's physics.
+"""Coupled E-V2X-BM: the constant deceleration of one vehicle with the least harm in a simulation of the whole line.
 
-The closed form in ``pairwise`` treats the pairs as independent. In this module every candidate is simulated to the
-horizon, with velocity exchange, second impacts and resting contact. The predicted harm is therefore the harm that the
-engine produces, and the shield uses it as a bound. docs/evaluate.md says how close the search comes to the true
-minimum.
+The closed form in the module ``pairwise`` ignores that pairs influence each other. This module simulates every
+deceleration that it tries up to the horizon, with the speed changes of impacts, later impacts and lasting contact.
+Therefore the predicted harm is the harm that really happens in the engine, and the shield uses the predicted harm as a
+bound. docs/evaluate.md says how close the predicted harm comes to the true minimum.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _FOUND: dict[bytes, Floats] = {}  # cache: SHA-256 of the arguments of a search 
 
 
 class CoupledOptimum(NamedTuple):
-    """The best constant deceleration of one vehicle found in each of n worlds."""
+    """Result of ``optimise_coupled``: the best constant deceleration of one vehicle in each of n worlds."""
 
     deceleration_mps2: Floats  # [n] best deceleration a*, in [0, braking capacity]
     harm: Floats  # [n] harm with a* under the harm count that was minimised (m2/s2)
@@ -56,25 +56,25 @@ def optimise_coupled(
     horizon_s: float = 8.0,
     others_mps2: Floats | None = None,
 ) -> CoupledOptimum:
-    """Return the constant deceleration of ``vehicle`` with the least simulated harm until ``horizon_s``.
+    """Return, for each world, the constant deceleration of ``vehicle`` with the least harm in a simulation.
 
-    The closed form (``optimise_pairwise``) may find an interval of decelerations that avoid both neighbours. If the
-    middle of this interval does no harm in the simulation, the middle is the result. Otherwise an even grid of
-    decelerations, and the breakpoints of the closed form, are simulated. The harm may jump where the number of impacts
-    changes. These jumps and the best local minima are located to 1e-9 m/s2; at a jump the result lies on the side of
-    less harm. Among decelerations with equal harm, those with the least harm under the other harm count remain, and the
-    middle one of these is the result. The result of a world does not depend on the other worlds of the batch.
+    If the deceleration that the closed form (``optimise_pairwise``) chooses does no harm in a simulation, it is the
+    result. If it does harm, evenly spaced decelerations and the breakpoints of the closed form are simulated. The harm
+    may jump where the number of impacts changes. The jumps and local minima with the least harm are located to 1e-9
+    m/s2; at a jump the result lies on the side with less harm. If several decelerations have the least harm, those with
+    the least harm under the other harm count remain, and the middle one of these is the result. The result for a world
+    does not depend on the other worlds.
 
     Args:
         worlds: n worlds of N vehicles.
         vehicle: index of the controlled vehicle, from 0.
-        harm_count: impacts whose harm is minimised: ``first`` (each pair's first) or ``total`` (all).
-        horizon_s: end of the simulations, s since the alert.
+        harm_count: harm to minimise: ``first`` (harm of each pair's first impact) or ``total`` (harm of all impacts).
+        horizon_s: time at the end of the simulations, s since the alert.
         others_mps2: constant commands of the other vehicles, [n, N] m/s2; the controlled vehicle's column is ignored.
             None: all other vehicles brake fully.
 
-    Raises ``InvalidInput`` for an unknown ``vehicle`` or ``harm_count``, and for commands beyond the capacity. Raises
-    ``PhysicsError`` naming the worlds in which a candidate could not be simulated.
+    Raises ``InvalidInput`` for an unknown ``vehicle`` or ``harm_count``, and for commands beyond a vehicle's capacity.
+    Raises ``PhysicsError``, which names the worlds, if a deceleration could not be simulated.
 
     """
     check_harm_count(harm_count)
@@ -102,17 +102,17 @@ def optimise_coupled(
 def _minimise(
     worlds: Worlds, told: Worlds, command: Floats, vehicle: int, rows: Ints, harm_count: HarmCount, horizon_s: float
 ) -> Floats:
-    """Return the best deceleration found in m worlds, its harm, and its harm under the other harm count, [3, m].
+    """Return an array [3, m] with the best deceleration in m worlds, its harm, and its harm under the other harm count.
 
     Args:
         worlds: n worlds.
-        told: the same worlds for the closed form, in which the braking capacity of each other vehicle is replaced by
-            the deceleration that this vehicle commands.
-        command: commands of all vehicles, [n, N] m/s2; the controlled vehicle's command is ignored.
+        told: the same worlds for the closed form, which assumes full braking: the braking capacity of each vehicle
+            except ``vehicle`` is replaced by the deceleration that it commands.
+        command: constant commands of all vehicles, [n, N] m/s2; the controlled vehicle's column is ignored.
         vehicle: index of the controlled vehicle, from 0.
         rows: indices of the worlds to search, [m].
-        harm_count: impacts whose harm is minimised.
-        horizon_s: end of the simulations, s.
+        harm_count: harm to minimise: ``first`` or ``total``.
+        horizon_s: time at the end of the simulations, s since the alert.
 
     """
     v = worlds.vehicles
@@ -155,10 +155,11 @@ def _search_worlds(
 ) -> None:  # fmt: skip
     """Search for the best deceleration of ``vehicle`` (index) in the worlds with the indices ``rows`` [m].
 
-    ``found`` [3, m] receives the deceleration, its harm, and its harm under the other harm count. ``status`` [m]
-    receives ``FLAG.DONE``, or the code of the physics check that failed. ``capacity`` [n, N] are braking capacities
-    (m/s2), ``onset`` [n, N] times until a vehicle may brake (s). The other arguments have the same meaning as in
-    ``make_line``, with a new first axis for n worlds.
+    The best deceleration, its harm, and its harm under the other harm count are written to ``found`` [3, m].
+    ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed is written to ``status`` [m].
+    ``capacity`` [n, N] are the braking capacities (m/s2), and ``onset`` [n, N] are the times from now until each
+    vehicle may brake (s). The other arguments have the same meaning as in ``make_line``, with a new first axis for the
+    n worlds.
     """
     room, at, best = make_room(), np.empty(CANDIDATES), np.empty(3)
     for m in range(rows.shape[0]):
@@ -177,18 +178,21 @@ Mode = Literal["coupled", "pairwise"]
 
 
 class EV2XBM:
-    """Agent that brakes with the constant deceleration of least harm, called a*.
+    """Agent that brakes with the constant deceleration a* that is predicted to do the least harm.
 
     Args:
-        mode: ``coupled`` minimises the harm in the engine's physics. In this mode the agent assumes that the other
-            vehicles follow their scripts, and that vehicles without a script (learners) brake fully. ``pairwise`` is
-            the paper's closed form, which assumes that all other vehicles brake fully and that impacts change no speed.
-        harm_count: harm that mode ``coupled`` minimises: ``first`` (each pair's first impact) or ``total`` (all).
-        horizon_s: end of the simulations in mode ``coupled``, s since the alert.
+        mode: ``coupled`` minimises the harm in a simulation of the whole line. In mode ``coupled`` the agent assumes
+            that the other vehicles follow their scripts, and that vehicles without a script (learners) brake fully.
+            ``pairwise`` is the paper's closed form, which assumes that all other vehicles brake fully and that impacts
+            change no speed.
+        harm_count: harm that mode ``coupled`` minimises: ``first`` (harm of each pair's first impact) or ``total``
+            (harm of all impacts).
+        horizon_s: time at the end of the simulations in mode ``coupled``, s since the alert.
 
-    The memory contains ``deceleration_mps2`` [n], which is a*, and ``predicted_harm`` [n] (m2/s2). Raises
-    ``InvalidInput`` for an unknown mode or harm count. In mode ``coupled``, ``begin`` raises ``InvalidInput`` if the
-    script of another vehicle has a command that is not fixed at the alert.
+    The agent's memory contains ``deceleration_mps2`` [n], which is a*, and ``predicted_harm`` [n] (m2/s2), which is the
+    harm predicted for a*. The constructor raises ``InvalidInput`` for an unknown mode or harm count. In mode
+    ``coupled``, ``begin`` raises ``InvalidInput`` if the script of another vehicle has a command that is not fixed at
+    the alert.
 
     """
 
@@ -201,12 +205,12 @@ class EV2XBM:
         self._mode, self._harm_count, self._horizon_s = mode, harm_count, horizon_s
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Choose each world's best deceleration a* at the alert and return it in the memory.
+        """Choose the best deceleration a* of each world at the alert, and return the agent's memory, which contains a*.
 
         Args:
             alert: n worlds at the alert.
             vehicle: index of the controlled vehicle (0 = front).
-            scripts: index of each scripted vehicle -> its script.
+            scripts: mapping from the index of each scripted vehicle to its script.
 
         """
         if self._mode == "pairwise":
@@ -230,14 +234,14 @@ class EV2XBM:
         return {"deceleration_mps2": coupled.deceleration_mps2, "predicted_harm": coupled.harm}
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """Return the command ``-a*``, which was chosen at the alert, [n] m/s2, and the unchanged memory."""
+        """Return the command ``-a*`` [n] m/s2, where a* was chosen at the alert, and the unchanged memory."""
         return -memory["deceleration_mps2"], memory
 
 
 def make_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
     """Make E-V2X-BM with the horizon and harm count of ``settings``.
 
-    ``argument`` is ``pairwise``, ``coupled`` or None, which means ``coupled``.
+    ``argument`` is the mode: ``pairwise`` or ``coupled``; None means ``coupled``.
     """
     if argument not in (None, "coupled", "pairwise"):
         then = "".join(f", then {variant!r}" for variant in variants_of("e_v2x_bm"))

@@ -1,10 +1,12 @@
 """E-V2X-BM in closed form: the constant deceleration of one vehicle that minimises the predicted harm of its pairs.
 
-The neighbours of the controlled vehicle brake with full capacity after their own latencies. The pair in front and the
-pair behind are treated as independent: only the first contact of each pair counts, and impacts change no speed. The
-predicted harm is ``H(a) = c_front(a)^2 + c_rear(a)^2`` (m2/s2), where ``a`` is the deceleration (m/s2) and ``c_front``
-and ``c_rear`` are the closing speeds at the first contacts (m/s). Between a few breakpoints, which have a closed form,
-H(a) is concave, so the minimum is at a breakpoint. docs/internals/proofs/constant-deceleration.md has the derivation.
+The prediction assumes that the neighbours of the controlled vehicle brake with full capacity after their own latencies.
+It also assumes that only the first contact of each pair does harm and that impacts change no speed, so that the pair in
+front and the pair behind do not influence each other. The predicted harm is ``H(a) = c_front(a)^2 + c_rear(a)^2``
+(m2/s2). Here ``a`` is the controlled vehicle's deceleration (m/s2), and ``c_front`` and ``c_rear`` are the closing
+speeds (m/s) at its first contact with the vehicle in front and behind. A formula gives a few decelerations, called
+*breakpoints*. Between two neighbouring breakpoints H(a) is concave, so H(a) is least at a breakpoint.
+docs/internals/proofs/constant-deceleration.md has the derivation.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ _TIE = 1e-12  # harms closer than this, relative to 1 + harm, count as equal
 
 
 class PairwiseOptimum(NamedTuple):
-    """The best constant deceleration of one vehicle in closed form, in each of n worlds."""
+    """Result of the closed form: the best constant deceleration of one vehicle in each of n worlds."""
 
     deceleration_mps2: Floats  # [n] best deceleration a*, in [0, braking capacity]
     harm: Floats  # [n] predicted harm with a*, called H* (m2/s2)
@@ -42,21 +44,23 @@ class PairwiseOptimum(NamedTuple):
 
 @compiled
 def early_breakpoints(gap: float, w: float, onset_l: float, onset_f: float) -> tuple[float, float]:
-    """Return two decelerations of the follower: where the harm of the pair has a kink, and where it jumps. [m/s2]
+    """Return two decelerations (m/s2) of the follower: the pair's harm has a kink at the first and jumps at the second.
 
-    Both results are 0 unless the follower may brake before the leader (front vehicle). ``lead`` is the time from the
-    follower's onset to the leader's, and ``gap`` in the formulas is the gap at the follower's onset.
+    Both decelerations are 0 unless the follower may brake before the leader (front vehicle). In the formulas, ``w`` is
+    the closing speed, ``gap`` is the gap at the moment when the follower begins to brake, and ``lead`` is the time from
+    this moment until the leader begins to brake.
 
-    - Kink, at ``2 (w lead - gap) / lead^2``: the pair meets exactly when the leader begins to brake.
-    - Jump, at ``w^2 / (2 gap)``: with a smaller deceleration the follower strikes the coasting leader lightly. With a
-      larger deceleration the follower does not reach the coasting leader, but may strike the leader harder once the
-      leader brakes. The returned deceleration lies just below the jump, where the impact is lightest.
+    - Kink, at ``2 (w lead - gap) / lead^2``: with this deceleration, the contact happens exactly when the leader begins
+      to brake.
+    - Jump, at ``w^2 / (2 gap)``: with a slightly smaller deceleration, the follower strikes the coasting leader
+      lightly. With a larger deceleration, the follower does not reach the coasting leader, but may strike it harder
+      once the leader brakes. The returned deceleration lies just below the jump, where the impact is lightest.
 
     Args:
         gap: gap at the present time, m.
-        w: closing speed, follower minus leader, m/s.
-        onset_l: time at which the leader begins to brake, s.
-        onset_f: time at which the follower may begin to brake, s.
+        w: closing speed at the present time: the follower's speed minus the leader's, m/s.
+        onset_l: time from now until the leader begins to brake, s.
+        onset_f: time from now until the follower may begin to brake, s.
 
     """
     lead = onset_l - onset_f
@@ -70,8 +74,9 @@ def early_breakpoints(gap: float, w: float, onset_l: float, onset_f: float) -> t
 def front_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats) -> float:
     """Return the predicted harm of an impact of vehicle ``i`` with the vehicle in front, m2/s2; 0 for Vehicle 1.
 
-    Vehicle ``i`` brakes with ``a`` m/s2, the vehicle in front with its capacity. ``gap`` [P] m, ``speed`` [N] m/s, the
-    braking capacities ``capacity`` [N] m/s2 and ``onset`` [N] s (time until each vehicle may brake) describe the world.
+    Vehicle ``i`` brakes with ``a`` m/s2, and the vehicle in front brakes with its full capacity. The world has the gaps
+    ``gap`` [P] m, the speeds ``speed`` [N] m/s and the braking capacities ``capacity`` [N] m/s2. Vehicle k may brake
+    after ``onset[k]`` seconds.
     """
     if i == 0:
         return 0.0
@@ -82,8 +87,9 @@ def front_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, o
 def rear_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats) -> float:
     """Return the predicted harm of an impact of vehicle ``i`` with the vehicle behind, m2/s2; 0 for the last vehicle.
 
-    Vehicle ``i`` brakes with ``a`` m/s2, the vehicle behind with its capacity. ``gap`` [P] m, ``speed`` [N] m/s, the
-    braking capacities ``capacity`` [N] m/s2 and ``onset`` [N] s (time until each vehicle may brake) describe the world.
+    Vehicle ``i`` brakes with ``a`` m/s2, and the vehicle behind brakes with its full capacity. The world has the gaps
+    ``gap`` [P] m, the speeds ``speed`` [N] m/s and the braking capacities ``capacity`` [N] m/s2. Vehicle k may brake
+    after ``onset[k]`` seconds.
     """
     if i == gap.shape[0]:
         return 0.0
@@ -94,11 +100,12 @@ def rear_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, on
 def find_breakpoints(
     at: Floats, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats
 ) -> tuple[float, float]:
-    """Write to ``at`` [6] the decelerations in [0, capacity] of vehicle ``i`` at which its harm may be least, m/s2.
+    """Write the decelerations (m/s2) of vehicle ``i`` at which its predicted harm may be least to ``at`` [6].
 
-    Returns the smallest deceleration without an impact in front, and the largest deceleration without an impact behind,
-    in m/s2; each may be infinite. ``gap`` [P] m, ``speed`` [N] m/s, the braking capacities ``capacity`` [N] m/s2 and
-    ``onset`` [N] s (time until each vehicle may brake) describe the world.
+    All decelerations in ``at`` are in [0, braking capacity]. Returns two more decelerations (m/s2), which may be
+    infinite: the smallest one without an impact in front, and the largest one without an impact behind. The world has
+    the gaps ``gap`` [P] m, the speeds ``speed`` [N] m/s and the braking capacities ``capacity`` [N] m/s2. Vehicle k may
+    brake after ``onset[k]`` seconds.
     """
     low, high = 0.0, math.inf
     at[:] = 0.0
@@ -122,12 +129,12 @@ def find_breakpoints(
 def minimise_over(
     at: Floats, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats
 ) -> tuple[float, float]:
-    """Return the deceleration of least predicted harm of vehicle ``i``, and this harm (m2/s2).
+    """Return the deceleration (m/s2) of vehicle ``i`` with the least predicted harm, and this harm (m2/s2).
 
-    Only the candidates ``at`` [6] (m/s2) are compared. If several candidates have the least harm, the middle between
-    the smallest and the largest of them is returned, provided that the middle has the least harm as well. ``gap`` [P]
-    m, ``speed`` [N] m/s, the braking capacities ``capacity`` [N] m/s2 and ``onset`` [N] s (time until each vehicle may
-    brake) describe the world.
+    Only the six decelerations in ``at`` (m/s2) are compared. If several of them have the least harm, the middle between
+    the smallest and the largest of these is returned, provided that the middle has the least harm as well. The world
+    has the gaps ``gap`` [P] m, the speeds ``speed`` [N] m/s and the braking capacities ``capacity`` [N] m/s2. Vehicle k
+    may brake after ``onset[k]`` seconds.
     """
     best, first, last = math.inf, 0.0, 0.0
     for k in range(at.shape[0]):
@@ -153,9 +160,11 @@ def optimise_worlds(
 ) -> None:
     """Find the best constant deceleration of vehicle ``i`` in n worlds, in closed form.
 
-    ``at`` [n, 6] receives the candidates. ``out`` [4, n] receives the best deceleration, its predicted harm, and the
-    two decelerations that ``find_breakpoints`` returns. ``gaps`` [n, P] m, ``speeds`` [n, N] m/s, the braking
-    capacities ``capacity`` [n, N] m/s2 and ``onset`` [n, N] s (time until each vehicle may brake) describe the worlds.
+    The function writes its results to ``at`` [n, 6] and ``out`` [4, n]. ``at`` receives the decelerations that
+    ``find_breakpoints`` writes (m/s2). ``out`` receives the best deceleration, its predicted harm, and the two
+    decelerations that ``find_breakpoints`` returns. The worlds have the gaps ``gaps`` [n, P] m, the speeds ``speeds``
+    [n, N] m/s and the braking capacities ``capacity`` [n, N] m/s2. In world k, vehicle j may brake after ``onset[k,
+    j]`` seconds.
     """
     for k in range(gaps.shape[0]):
         low, high = find_breakpoints(at[k], i, gaps[k], speeds[k], capacity[k], onset[k])
@@ -169,10 +178,11 @@ def optimise_worlds(
 
 @compiled
 def contacts_of_worlds(gaps: Floats, speeds: Floats, deceleration: Floats, onset: Floats, out: Floats) -> None:
-    """Write the squared closing speed at each pair's first impact to ``out`` [n, P] m2/s2; 0 without an impact.
+    """Write the squared closing speed at each pair's first impact to ``out`` [n, P] m2/s2, or 0 if there is no impact.
 
-    All pairs are treated as independent. ``gaps`` [n, P] m, ``speeds`` [n, N] m/s, the constant ``deceleration`` [n, N]
-    m/s2 and ``onset`` [n, N] s (time until each vehicle may brake) describe the worlds.
+    It is assumed that impacts change no speed, so that pairs do not influence each other. The worlds have the gaps
+    ``gaps`` [n, P] m and the speeds ``speeds`` [n, N] m/s. In world k, vehicle j brakes with the constant
+    ``deceleration[k, j]`` m/s2 from ``onset[k, j]`` seconds on.
     """
     for k in range(gaps.shape[0]):
         for p in range(gaps.shape[1]):
@@ -186,19 +196,20 @@ def optimise_pairwise(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
     """Return the best constant deceleration a* of ``vehicle`` (index from 0) in every world, in closed form.
 
     ``a*`` minimises ``H(a) = c_front^2 + c_rear^2`` over ``a`` in [0, capacity], where ``c_front`` and ``c_rear`` are
-    the closing speeds (m/s) at the first contacts with the two neighbours. If some decelerations avoid both impacts,
-    ``a*`` is the middle of their interval, otherwise the best breakpoint. The first and the last vehicle of a line have
-    one neighbour. Only gaps, speeds, capacities and latencies of the vehicle and its neighbours are used.
+    the closing speeds (m/s) at the first contacts with the two neighbours. If an interval of decelerations avoids both
+    impacts, ``a*`` is the middle of this interval; otherwise ``a*`` is the breakpoint with the least H. For the first
+    and the last vehicle of a line, H contains only the one neighbour. Only gaps, speeds, capacities and latencies of
+    the vehicle and its neighbours are used.
 
-    Raises ``InvalidInput`` if ``vehicle`` is not in the line, if a vehicle moves backward, or if brakes build up at a
-    finite rate.
+    Raises ``InvalidInput`` if ``vehicle`` is not in the line, if a vehicle moves backward, or if brakes build up
+    gradually.
     """
     worlds.refuse_build_up("the closed form of E-V2X-BM and planner")
     return closed_form(worlds, vehicle)
 
 
 def closed_form(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
-    """Return the result of ``optimise_pairwise``; brakes that build up at a finite rate are assumed to act at once."""
+    """Do the same as ``optimise_pairwise``, but treat brakes that build up gradually as if they acted at once."""
     onset, capacity = onset_s(worlds, vehicle), worlds.vehicles.braking_capacity_mps2
     at, out = np.empty((worlds.n, CANDIDATES)), np.empty((4, worlds.n))
     optimise_worlds(worlds.gaps_m, worlds.speeds_mps, capacity, onset, vehicle, at, out)
@@ -207,16 +218,16 @@ def closed_form(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
 
 
 def pairwise_harm(worlds: Worlds, deceleration_mps2: ArrayLike) -> Floats:
-    """Return the predicted harm of each pair, [n, P] m2/s2; all pairs are treated as independent.
+    """Return the predicted harm of each pair, [n, P] m2/s2, as if no pair influenced another pair.
 
-    Every vehicle coasts until its latency has elapsed and then brakes to rest. The harm that E-V2X-BM predicts is the
-    sum over the pairs of the controlled vehicle.
+    Every vehicle coasts until its latency has elapsed, and then brakes with its constant deceleration to rest. The harm
+    that E-V2X-BM predicts for a vehicle is the sum over the pairs that contain this vehicle.
 
     Args:
         worlds: n worlds.
         deceleration_mps2: constant deceleration of each vehicle, [n, N] m/s2, or a shape that broadcasts to [n, N].
 
-    Raises ``InvalidInput`` for a deceleration that is negative or not finite, and if brakes build up at a finite rate.
+    Raises ``InvalidInput`` for a deceleration that is negative or not finite, and for brakes that build up gradually.
 
     """
     worlds.refuse_build_up("the closed form of E-V2X-BM and planner")
@@ -232,7 +243,7 @@ def pairwise_harm(worlds: Worlds, deceleration_mps2: ArrayLike) -> Floats:
 
 
 def onset_s(worlds: Worlds, vehicle: int) -> Floats:
-    """Return the time from the worlds' present time until each vehicle may brake, [n, N] s; 0 if it may brake now.
+    """Return the time from now until each vehicle may brake, [n, N] s; 0 for a vehicle that may brake now.
 
     Raises ``InvalidInput`` if no vehicle has the index ``vehicle``, or if a speed is negative, because the closed form
     then does not apply.

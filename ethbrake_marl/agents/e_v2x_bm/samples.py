@@ -1,6 +1,6 @@
-"""Operations on samples of one world's harm at several decelerations: sort, merge, bound and select. Compiled.
+"""Operations on samples, which are decelerations with their simulated harm: sort, merge, estimate, select. Compiled.
 
-The search uses about 560 samples per world, in increasing order of the deceleration.
+The search for the best deceleration uses about 560 samples per world, sorted by deceleration.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ class Samples(NamedTuple):
 
 @compiled
 def make_samples(most: int) -> Samples:
-    """Return uninitialised space for ``most`` samples."""
+    """Return arrays for ``most`` samples, whose values are not yet set."""
     return Samples(np.empty(most), np.empty(most), np.empty(most), np.empty(most))
 
 
 @compiled(bare=True)
 def copy_sample(one: Samples, k: int, other: Samples, to: int) -> None:
-    """Copy sample ``k`` (index) of ``one`` to index ``to`` of ``other``."""
+    """Copy the sample with the index ``k`` in ``one`` to the index ``to`` in ``other``."""
     other.at[to] = one.at[k]
     other.harm[to] = one.harm[k]
     other.other[to] = one.other[k]
@@ -46,9 +46,9 @@ def copy_sample(one: Samples, k: int, other: Samples, to: int) -> None:
 
 @compiled(bare=True)
 def merge(one: Samples, n: int, other: Samples, m: int, into: Samples) -> None:
-    """Merge the first ``n`` samples of ``one`` and the first ``m`` of ``other``, both sorted by deceleration.
+    """Merge the first ``n`` samples of ``one`` with the first ``m`` of ``other``; both are sorted by deceleration.
 
-    The first ``n + m`` entries of ``into`` receive the sorted result.
+    The first ``n + m`` samples of ``into`` are overwritten with the merged samples, sorted by deceleration.
     """
     i, j = 0, 0
     for to in range(n + m):
@@ -62,7 +62,7 @@ def merge(one: Samples, n: int, other: Samples, m: int, into: Samples) -> None:
 
 @compiled(bare=True)
 def put_in_order(samples: Samples, n: int) -> None:
-    """Sort the first ``n`` samples by deceleration, in place. This is fast for few or nearly sorted samples."""
+    """Sort the first ``n`` samples by deceleration, in place. Sorting is fast for few or nearly sorted samples."""
     for k in range(1, n):
         at, harm, other, course = samples.at[k], samples.harm[k], samples.other[k], samples.course[k]
         to = k
@@ -74,10 +74,10 @@ def put_in_order(samples: Samples, n: int) -> None:
 
 @compiled(bare=True)
 def bound_cells(samples: Samples, n: int, bounds: Floats) -> None:
-    """Estimate the least harm between each two neighbouring samples; write it to ``bounds`` [n - 1], m2/s2.
+    """Estimate the least harm in each interval between two neighbouring samples; write it to ``bounds`` [n - 1], m2/s2.
 
-    The first ``n`` samples are used; they must be sorted by deceleration. Where the harm falls towards an interval, it
-    is assumed to continue to fall inside the interval, with at most ``STEEPER`` times the slope.
+    The first ``n`` samples are used; they must be sorted by deceleration. If the harm falls from outside an interval
+    towards it, the harm is assumed to fall on inside the interval, at most ``STEEPER`` times as steeply.
     """
     before, slope = 0.0, _slope(samples, 0)
     for k in range(n - 1):
@@ -107,9 +107,10 @@ def least_harm(samples: Samples, n: int) -> float:
 
 @compiled(bare=True)
 def find_smallest(values: Floats, n: int, places: Ints) -> None:
-    """Write the indices of the smallest of the first ``n`` values to ``places``, in increasing order of value.
+    """Find the smallest of the first ``n`` entries of ``values``; write their indices, smallest first, to ``places``.
 
-    The length of ``places``, at most ``n``, is the number of values to find. Equal values keep their order.
+    The length of ``places``, at most ``n``, is the number of entries to find. Of equal values, the one with the lower
+    index comes first.
     """
     count = 0
     for k in range(n):
@@ -127,8 +128,8 @@ def find_smallest(values: Floats, n: int, places: Ints) -> None:
 def find_minima(samples: Samples, n: int, depth: Floats, places: Ints) -> None:
     """Write the indices of the lowest local minima of the first ``n`` samples to ``places``, lowest harm first.
 
-    ``depth`` [n or more] receives the harm at each local minimum, and infinity at other samples. If there are fewer
-    minima than entries in ``places``, the remaining entries are indices of other samples.
+    ``depth`` [n or more] is overwritten: with the harm at each local minimum, and with infinity at all other samples.
+    If there are fewer local minima than entries in ``places``, the remaining entries are indices of other samples.
     """
     for k in range(n):
         falls = k == 0 or samples.harm[k] < samples.harm[k - 1]
@@ -139,10 +140,11 @@ def find_minima(samples: Samples, n: int, depth: Floats, places: Ints) -> None:
 
 @compiled(bare=True)
 def choose(samples: Samples, n: int, room: Floats) -> float:
-    """Return the deceleration of least harm among the first ``n`` samples, m/s2.
+    """Return the deceleration (m/s2) with the least harm among the first ``n`` samples.
 
-    Among samples with equal harm, those with the least ``other`` harm remain; the middle one of these is returned.
-    ``room`` [n or more] is a workspace. The function is faster if the samples are sorted.
+    If several samples have the least harm, those with the least harm under the other harm count (``other``) remain, and
+    the middle one of these is returned. ``room`` [n or more] is an array for intermediate results. The function is
+    faster if the samples are sorted.
     """
     least, rest = least_harm(samples, n) + TIE, math.inf
     for k in range(n):

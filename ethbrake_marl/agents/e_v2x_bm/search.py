@@ -1,8 +1,9 @@
 """The coupled search for the best constant deceleration in one world, in five steps. Compiled.
 
-The search simulates an even grid of decelerations, then a finer grid, then decelerations around borders (where the
-number of impacts changes) and around local minima. Finally it moves the result away from jumps of the harm.
-docs/evaluate.md gives the reasons for these steps.
+The search simulates evenly spaced decelerations, then more decelerations where the harm may be least. Then it simulates
+decelerations around local minima and around *borders*, at which the number of impacts changes. If the result lies close
+to a jump of the harm, the search finally moves the result away from the jump. docs/evaluate.md gives the reasons for
+these steps.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ _FIFTHS = np.arange(1, 5) / 5  # new samples between the two sides of a border
 
 
 class Room(NamedTuple):
-    """Workspace of a search, reused for every world of a batch.
+    """Arrays for intermediate results of a search, reused for every world of a batch.
 
     A *cell* is the interval between two neighbouring decelerations of the grid. A *border* is a deceleration at which
     the number of impacts changes.
@@ -80,7 +81,7 @@ class Room(NamedTuple):
 
 @compiled
 def make_room() -> Room:
-    """Return uninitialised workspace for searches."""
+    """Return arrays for intermediate results of searches, whose values are not yet set."""
     return Room(
         make_samples(_MOST), make_samples(_MOST), make_samples(_MOST), make_samples(_FEW), np.empty(_MOST),
         np.empty(CELLS, np.int64), np.empty(BORDERS, np.int64), np.empty(MINIMA, np.int64),
@@ -92,13 +93,14 @@ def search_line(line: Line, room: Room, breakpoints: Floats, capacity: float, ou
     """Find the best constant deceleration of the controlled vehicle in one world.
 
     Args:
-        line: the world, from ``make_line``.
-        room: workspace.
+        line: the world, as ``make_line`` returns it.
+        room: arrays for intermediate results.
         breakpoints: decelerations that are simulated in addition to an even grid, [CANDIDATES] m/s2.
         capacity: braking capacity of the vehicle, m/s2.
-        out: receives the deceleration (m/s2), its harm, and its harm under the other harm count (m2/s2), [3].
+        out: array [3] for the result: best deceleration (m/s2), its harm, and its harm under the other harm count
+            (m2/s2).
 
-    Returns a status: ``FLAG.DONE``, or the code of the physics check that failed.
+    Returns ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed.
 
     """
     status = share_start(line)
@@ -117,10 +119,11 @@ def search_line(line: Line, room: Room, breakpoints: Floats, capacity: float, ou
 
 @compiled(apart=True, bare=True)
 def look_evenly(line: Line, room: Room, breakpoints: Floats, capacity: float) -> int:
-    """Step 1: simulate an even grid of decelerations and the ``breakpoints`` [CANDIDATES] (m/s2) in the world ``line``.
+    """Step 1: simulate evenly spaced decelerations and the ``breakpoints`` [CANDIDATES] (m/s2) in the world ``line``.
 
-    ``room.one`` receives the grid, ``room.two`` grid and breakpoints, sorted. ``capacity`` is the largest deceleration,
-    m/s2. Returns a status: ``FLAG.DONE``, or the code of the physics check that failed.
+    The samples of the evenly spaced decelerations (the *grid*) are written to ``room.one``. The samples of grid and
+    breakpoints together are written to ``room.two``, sorted by deceleration. The grid ends at ``capacity`` (m/s2).
+    Returns ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed.
     """
     grid, new = room.one, room.few
     for k in range(GRID):
@@ -137,11 +140,12 @@ def look_evenly(line: Line, room: Room, breakpoints: Floats, capacity: float) ->
 
 @compiled(apart=True, bare=True)
 def look_inside(line: Line, room: Room) -> int:
-    """Step 2: simulate more decelerations in the cells of the grid that may contain the least harm.
+    """Step 2: simulate more decelerations in some cells (intervals between neighbouring decelerations of the grid).
 
-    A cell is refined if the number of impacts changes in it, or if its estimated harm is below the harm of all samples
-    so far. ``room.one`` receives ``_LOOKED`` samples; if there are fewer, the last sample is repeated. Returns a
-    status: ``FLAG.DONE``, or the code of the physics check that failed.
+    These are the cells in which the number of impacts changes, and the cells whose estimated least harm is below the
+    harm of all samples so far. All samples so far are written to ``room.one``; the last sample is repeated until there
+    are ``_LOOKED`` samples. Returns ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that
+    failed.
     """
     grid, looked, new, cells, bounds = room.one, room.two, room.new, room.cells, room.values
     best = least_harm(looked, GRID + CANDIDATES)
@@ -169,7 +173,7 @@ def look_inside(line: Line, room: Room) -> int:
 
 @compiled(bare=True)
 def _put_in_order(places: Ints, n: int) -> None:
-    """Sort the first ``n`` entries of ``places`` in place."""
+    """Sort the first ``n`` entries of ``places`` in increasing order, in place."""
     for k in range(1, n):
         place, to = places[k], k
         while to > 0 and places[to - 1] > place:
@@ -180,11 +184,12 @@ def _put_in_order(places: Ints, n: int) -> None:
 
 @compiled(apart=True, bare=True)
 def locate_borders(line: Line, room: Room) -> int:
-    """Step 3: locate borders (decelerations at which the number of impacts changes) that may have less harm.
+    """Step 3: locate borders (decelerations at which the number of impacts changes) near which the harm may be least.
 
-    Between two borders the harm is smooth, so harm that falls towards a border is least directly at the border. Each
-    border is enclosed between two samples 1e-9 m/s2 apart. ``room.two`` receives all samples. Returns a status:
-    ``FLAG.DONE``, or the code of the physics check that failed.
+    Between two borders the harm has no jumps. If the harm falls towards a border, it is therefore least directly at the
+    border. For each located border, two samples that are at most 1e-9 m/s2 apart are found, one on each side. All
+    samples so far are written to ``room.two``. Returns ``FLAG.DONE`` or, if a simulation failed, the code of the
+    physics check that failed.
     """
     looked, new, few, places, bounds = room.one, room.new, room.few, room.borders, room.values
     best = least_harm(looked, _LOOKED)
@@ -209,10 +214,10 @@ def locate_borders(line: Line, room: Room) -> int:
 
 @compiled(bare=True)
 def _cut(line: Line, few: Samples) -> int:
-    """Enclose a border between samples 0 and 5 of ``few``, at most 1e-9 m/s2 apart.
+    """Move samples 0 and 5 of ``few``, between which a border lies, towards it until they are at most 1e-9 m/s2 apart.
 
-    A border is a deceleration at which the number of impacts changes. Each round divides the distance of the samples by
-    five. Returns a status: ``FLAG.DONE``, or the code of the physics check that failed.
+    A border is a deceleration at which the number of impacts changes. Each round divides the distance of the two
+    samples by five. Returns ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed.
     """
     while few.at[5] - few.at[0] > NARROWEST_MPS2:
         low, width = few.at[0], few.at[5] - few.at[0]
@@ -235,7 +240,7 @@ def _cut(line: Line, few: Samples) -> int:
 def narrow_minima(line: Line, room: Room) -> int:
     """Step 4: locate the lowest local minima of the harm to 1e-9 m/s2, and append them to ``room.two``.
 
-    Returns a status: ``FLAG.DONE``, or the code of the physics check that failed.
+    Returns ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed.
     """
     inner, minima, last = room.two, room.minima, _NARROWED - 1
     find_minima(inner, _NARROWED, room.values, minima)
@@ -252,17 +257,19 @@ def narrow_minima(line: Line, room: Room) -> int:
 
 @compiled(bare=True)
 def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, to: int) -> int:
-    """Narrow an interval around a local minimum of the harm to 1e-9 m/s2; return a status.
+    """Narrow an interval around a local minimum of the harm until it is at most 1e-9 m/s2 wide.
 
-    Each round divides the intervals on both sides of the minimum into three parts.
+    Each round divides the interval on each side of the minimum into three parts. Returns ``FLAG.DONE`` or, if a
+    simulation failed, the code of the physics check that failed.
 
     Args:
         line: the world.
-        few: workspace.
-        low: lower end of the interval, m/s2.
-        high: upper end of the interval, m/s2.
-        found: samples; sample ``to`` has the least harm so far in the interval, and is replaced if less harm is found.
-        to: index of the sample of the minimum.
+        few: samples for intermediate results.
+        low: lower end of the interval at first, m/s2.
+        high: upper end of the interval at first, m/s2.
+        found: samples, of which sample ``to`` has the least harm in the interval so far. It is overwritten whenever a
+            deceleration with less harm is found.
+        to: index of the sample with the least harm so far.
 
     """
     while high - low > NARROWEST_MPS2:
@@ -290,19 +297,20 @@ def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, t
 
 @compiled(apart=True, bare=True)
 def step_back(line: Line, around: Samples, best: float, capacity: float, out: Floats) -> int:
-    """Step 5: if ``best`` lies within 1e-9 m/s2 of a jump of the harm, move it away from the jump, towards less harm.
+    """Step 5: if ``best`` lies within 1e-9 m/s2 of a jump of the harm, move it to the side of the jump with less harm.
 
-    The engine simulates the same motion step by step, with other rounding errors. Directly at a jump, rounding errors
-    would decide between less and more harm.
+    The engine simulates the same motion step by step, with other rounding errors. If the agent braked with a
+    deceleration directly at a jump, these rounding errors would decide on which side of the jump the harm lies.
 
     Args:
         line: the world.
-        around: workspace.
+        around: samples for intermediate results.
         best: best deceleration found, m/s2.
         capacity: braking capacity of the vehicle, m/s2.
-        out: receives the deceleration (m/s2), its harm, and its harm under the other harm count (m2/s2), [3].
+        out: array [3] for the result: best deceleration (m/s2), its harm, and its harm under the other harm count
+            (m2/s2).
 
-    Returns a status: ``FLAG.DONE``, or the code of the physics check that failed.
+    Returns ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed.
 
     """
     for k in range(5):
