@@ -257,7 +257,7 @@ class Messages(NamedTuple):
 
     @property
     def links(self) -> Floats:
-        """View of the columns of all links, [n, N, N, LINK.WIDTH], by world, receiver, sender and column of ``LINK``."""
+        """View of the columns of all links, [n, N, N, LINK.WIDTH]: by world, receiver, sender, column of ``LINK``."""
         N = self.vehicles
         return self.columns[:, link_at(0, 0, N) : contents_at(N)].reshape(-1, N, N, LINK.WIDTH)
 
