@@ -17,7 +17,7 @@ LeftOutRows = tuple[tuple[int, str], ...]  # row of each world that was left out
 
 
 def measured_without_failed(measure: Callable[[Ints], Result], n: int) -> tuple[Result, Ints, LeftOutRows]:
-    """Call ``measure`` for n worlds, without those that fail; return the result, the indices used, and the failed worlds.
+    """Call ``measure`` for the worlds that do not fail; return its result, their indices, and the failed worlds.
 
     The failed worlds are returned as pairs (index of the world, reason), in ascending order. The function works like
     ``leaving_out_failed``, but raises ``PhysicsError`` if every world fails.

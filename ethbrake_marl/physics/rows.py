@@ -93,7 +93,7 @@ ROW = _Rows()
 
 
 class _Flags(NamedTuple):
-    """Status codes that say how the motion of one world ended: at an impact, at the end of the segment, or in a failure."""
+    """Status codes of one world after its motion: an impact, the end of the segment, or a failure."""
 
     IMPACT: int = 0  # a round of impacts was resolved; the segment goes on
     DONE: int = 1  # the end of the segment is reached

@@ -1,4 +1,4 @@
-"""Compiled functions that advance one world through a segment (an interval of constant commands) from event to event."""
+"""Compiled motion of one world through a segment (an interval of constant commands), from event to event."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def to_next_impact(table: Floats, restitution: float, now: float, duration: floa
 
 @compiled(bare=True)
 def to_next_event(table: Floats, now: float, duration: float, building: bool) -> tuple[bool, float]:
-    """Move a world to its next event or the end of the segment; return whether this succeeded, and the time reached (s).
+    """Move a world to its next event or the end of the segment; return whether this succeeded, and the new time (s).
 
     The first result is False if a gap became negative, which means that a contact was missed. The time is counted from
     the start of the segment.
