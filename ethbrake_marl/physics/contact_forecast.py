@@ -33,7 +33,7 @@ def forecast_contacts(table: Floats, restitution: float, duration: float, contac
     """Simulate one world for ``duration`` (s) and write each pair's next impact into ``contacts``; return a status.
 
     The status is ``FLAG.DONE``, or the code of the check that failed. The next impact of a pair is also reported if the
-    pair had an impact before the forecast.
+    pair had an impact before the forecast; this next impact adds no first-impact harm.
 
     Args:
         table: the world in the layout of ``physics.rows``: a row per quantity, a column per vehicle or pair. The

@@ -38,8 +38,8 @@ def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) ->
 
     Args:
         table: one world in the layout of ``physics.rows``.
-        low: row with the least value (m/s or m/s2) that each vehicle alone can have.
-        high: row with the largest value that each vehicle alone can have; the same row as ``low`` if the value is known
+        low: row with the lower bound of each vehicle's own value (m/s or m/s2).
+        high: row with the upper bound of each vehicle's own value; the same row as ``low`` if the value is known
             exactly.
         first: column of the first of the touching vehicles, from the front.
         last: column of the last of the touching vehicles.
@@ -154,9 +154,9 @@ def resolve_impacts(table: Floats, restitution: float) -> bool:
 
 @compiled(bare=True)
 def record_impacts(table: Floats, time_s: float, world: int, rows: Floats, recorded: int) -> int:
-    """Add the impacts of the last ``resolve_impacts`` to the harm in ``table`` and to ``rows``; return their new number.
+    """Add the impacts of the last ``resolve_impacts`` to the harm in ``table`` and to ``rows``; return their number.
 
-    The result is ``recorded`` plus the number of these impacts.
+    The number is ``recorded`` plus the number of the added impacts.
 
     Args:
         table: one world in the layout of ``physics.rows``, after ``resolve_impacts``.
