@@ -353,8 +353,8 @@ def next_moving_event(table: Floats, now: float, end: float, parting: float) -> 
 
     There is an event when a pair comes into contact or separates, a vehicle comes to rest or reaches its speed limit, a
     command takes effect, or a force reaches its command or passes 0. The function also writes into the table when each
-    vehicle next comes to rest or reaches its speed limit, and when each pair comes into contact. For brakes that act at
-    once, ``constant_motion.next_event`` replaces this function.
+    vehicle next comes to rest or reaches its speed limit, and when each pair next comes into contact. For brakes that
+    act at once, ``constant_motion.next_event`` replaces this function.
 
     Args:
         table: one world in the layout of ``physics.rows``, after ``accelerate_moving``.

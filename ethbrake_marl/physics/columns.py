@@ -194,9 +194,9 @@ class Packed(NamedTuple):
     def ledger(self) -> tuple[Floats, Floats, Ints, Floats, Floats, Ints]:
         """Return harm and number of impacts since the start of the episode, of the pairs and of the obstacle.
 
-        The first three arrays are first-impact harm (m2/s2), total harm (m2/s2) and number of impacts of each pair, [n,
-        P]. The other three arrays are first-impact harm, total harm and number of impacts of Vehicle 1 with the
-        obstacle, [n].
+        The first three arrays, [n, P], are first-impact harm (m2/s2), total harm (m2/s2) and number of impacts of each
+        pair. The other three arrays, [n], are first-impact harm, total harm and number of impacts of Vehicle 1 with the
+        obstacle.
         """
         state, column, pairs = self.state, self.column, self.column.vehicles - 1
         first, total, count = (state[:, at : at + pairs].copy() for at in range(column.harm, column.obstacle, pairs))

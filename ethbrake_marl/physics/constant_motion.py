@@ -49,7 +49,7 @@ def next_event(table: Floats, now: float, end: float) -> float:
 
     There is an event when a pair comes into contact, a vehicle comes to rest or reaches its speed limit, or a command
     takes effect. The function also writes into the table when each vehicle next comes to rest or reaches its speed
-    limit, and when each pair comes into contact.
+    limit, and when each pair next comes into contact.
 
     Args:
         table: one world in the layout of ``physics.rows``, after ``accelerate``.

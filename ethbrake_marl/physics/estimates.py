@@ -94,7 +94,7 @@ def moved_on(speed: float, command: float, limit: float, duration: float) -> tup
 
     Args:
         speed: present speed, m/s; may be negative.
-        command: command in force, m/s2; negative brakes.
+        command: acceleration in force, m/s2; negative brakes.
         limit: speed up to which the vehicle drives, m/s.
         duration: length of the motion, s.
 

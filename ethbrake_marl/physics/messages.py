@@ -2,10 +2,10 @@
 
 A vehicle samples its state at every decision, starting at the alert. A message contains the sender's newest sample. On
 each link (from one vehicle to another) a message is sent once per period. The link's channel is good or bad
-(Gilbert-Elliott model): after the first message that arrives, a good channel turns bad with probability p per message,
-and a bad channel turns good with probability r. A message sent while the channel is bad is lost. The random number that
-decides whether a message is lost depends only on the world's key (a seed), the link and the number of the message. A
-vehicle measures a neighbour in sight, so it knows the neighbour's present state.
+(Gilbert-Elliott model): with each message after the first message that arrives, a good channel turns bad with
+probability p, and a bad channel turns good with probability r. A message sent while the channel is bad is lost. The
+random number that decides whether a message is lost depends only on the world's key (a seed), the link and the number
+of the message. A vehicle measures a neighbour in sight, so it knows the neighbour's present state.
 
 The state of the messages is stored in the following columns of a world's parameters, after the group *news by link*
 (``physics.columns.Columns``). The columns contain the state of the channels and what each vehicle has received, so they
@@ -22,7 +22,7 @@ A scenario can say what a message contains (``v2x: tells``). A flag in the colum
 then marks such a world, and each sample also contains the *intents*: the commands of the N vehicles chosen at the last
 decision. Such a world has three more groups of columns between *links* and *ring*, even if it has no periodic messages:
 
-contents    N * CONTENTS: 1 if messages of this vehicle contain this piece of information
+contents    N * CONTENTS: 1 if messages of this vehicle contain this quantity (see ``PIECES``), else 0
 intents     N, present intent of each vehicle (m/s2)
 told        N * N, by receiver, then sender: intent in the newest message received (m/s2)
 """

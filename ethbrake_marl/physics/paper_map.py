@@ -86,7 +86,7 @@ def exchange_at_sample(
     of at most ``TOUCH_SPEED_MPS`` is a touch, which does no harm.
 
     Args:
-        k: row of the world in all arrays.
+        k: index of the world in all arrays.
         gaps: gaps of all pairs, [n, P] m.
         speeds: speeds of all vehicles, [n, N] m/s; updated.
         mass: masses of all vehicles, [n, N] t.
@@ -120,7 +120,7 @@ def held_motion(speed: float, command: float, limit: float, step: float) -> tupl
 
     The command u is first limited so that the speed does not go beyond 0 or the speed limit within the step. The
     distance is computed as h times the mean of the speeds at the start and the end of the step. For constant u this is
-    equal to the formula above. Brakes act against the motion, so they also reduce a negative speed to 0.
+    equal to the formula above. Brakes act against the motion, so they also bring a negative speed back to 0.
 
     Args:
         speed: speed v at the start, m/s; may be negative after an impact.
@@ -157,7 +157,7 @@ def move_to_grid(
     """Move world ``k`` exactly and without impacts, at a time before its first sample.
 
     Args:
-        k: row of the world in all arrays.
+        k: index of the world in all arrays.
         duration: length of the motion, s.
         time: present time, s.
         gaps: gaps of all pairs, [n, P] m; updated.

@@ -97,7 +97,7 @@ def move_apart(table: Floats, duration: float, building: bool) -> bool:
     Args:
         table: the world in the layout of ``physics.rows``.
         duration: length T of the segment, s.
-        building: whether brakes build up, see ``builds_up``.
+        building: result of ``builds_up``: whether brakes build up or follow a fixed sequence of commands.
 
     """
     if building:
@@ -135,7 +135,7 @@ def start_events(table: Floats, building: bool) -> None:
 
     Args:
         table: the world in the layout of ``physics.rows``.
-        building: whether brakes build up, see ``builds_up``.
+        building: result of ``builds_up``: whether brakes build up or follow a fixed sequence of commands.
 
     """
     for i in range(table.shape[1]):
@@ -157,7 +157,7 @@ def to_next_impact(table: Floats, restitution: float, now: float, duration: floa
         restitution: coefficient of restitution of every impact.
         now: present time, counted from the start of the segment, s.
         duration: length of the segment, s.
-        building: whether brakes build up, see ``builds_up``.
+        building: result of ``builds_up``: whether brakes build up or follow a fixed sequence of commands.
 
     """
     for _ in range(BOUND.MOST_EVENTS):
@@ -182,7 +182,7 @@ def to_next_event(table: Floats, now: float, duration: float, building: bool) ->
         table: the world in the layout of ``physics.rows``; it is advanced.
         now: present time, counted from the start of the segment, s.
         duration: length of the segment, s.
-        building: whether brakes build up, see ``builds_up``.
+        building: result of ``builds_up``: whether brakes build up or follow a fixed sequence of commands.
 
     """
     if building and not built_up(table):
@@ -209,7 +209,7 @@ def begin_commands(table: Floats, now: float, passed: float, building: bool) -> 
         table: the world in the layout of ``physics.rows``.
         now: start of the interval, counted from the start of the segment, s.
         passed: length of the interval, s.
-        building: whether brakes build up, see ``builds_up``.
+        building: result of ``builds_up``: whether brakes build up or follow a fixed sequence of commands.
 
     """
     for i in range(table.shape[1]):
