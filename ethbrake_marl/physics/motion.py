@@ -217,9 +217,10 @@ def stopping_distance(speed: float, latency_left: float, capacity: float) -> flo
 def ramped_stopping_distance(speed: float, latency_left: float, capacity: float, rate: float) -> float:
     """Return the distance (m) until a vehicle is at rest under full braking, if its brakes build up from 0.
 
-    After the remaining latency, the brakes build up at a constant rate. The distance is ``v tau + v a / (2 r) - a^3 /
-    (24 r^2) + v^2 / (2 a)``. If ``v < a^2 / (2 r)``, the vehicle stops before its brakes reach full force, and the
-    distance is ``v tau + (2 / 3) v sqrt(2 v / r)``. If the vehicle does not move forward, the distance is 0.
+    After the remaining latency, the brakes build up at a constant rate. The distance is
+    ``v tau + v a / (2 r) - a^3 / (24 r^2) + v^2 / (2 a)``. If ``v < a^2 / (2 r)``, the vehicle stops before its brakes
+    reach full force, and the distance is ``v tau + (2 / 3) v sqrt(2 v / r)``. If the vehicle does not move forward, the
+    distance is 0.
 
     Args:
         speed: present speed v, m/s.

@@ -91,8 +91,8 @@ def move_apart(table: Floats, duration: float, building: bool) -> bool:
 
     If the result is False, the world has not moved. If both vehicles of a pair have constant accelerations, the time of
     their contact is computed exactly. In other cases the function uses a bound. Without contact, the speed of a vehicle
-    only rises or only falls within a segment of length T. A gap therefore shrinks by at most ``(max rear speed - min
-    front speed) T``.
+    only rises or only falls within a segment of length T. A gap therefore shrinks by at most
+    ``(max rear speed - min front speed) T``.
 
     Args:
         table: the world in the layout of ``physics.rows``.
