@@ -36,21 +36,24 @@ def advance_worlds(
     command: Floats, until: Floats, braking: Floats, driving: Floats, latency: Floats, mass: Floats, limit: Floats,
     restitution: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats, failed: Ints, at: int, rows: Floats,
 ) -> tuple[int, bool]:  # fmt: skip
-    """Advance every world to its time ``until``, in place; return the number of impacts and if the input is valid.
+    """Advance every world to its time ``until``, in place; return the number of impacts, and False for bad input.
 
-    A world that fails keeps its state; the other worlds are advanced. The second result is False if some ``until`` or
-    command is invalid. Arguments that are not listed are fields of ``Worlds`` and ``Vehicles`` under short names, for
-    example ``gaps`` for ``gaps_m``.
+    A world in which a check of the physics fails keeps its state; the other worlds are advanced. The second result is
+    True if all entries of ``until`` and ``command`` are valid, otherwise False. Arguments that are not listed are
+    fields of ``Worlds`` and ``Vehicles`` under short names, for example ``gaps`` for ``gaps_m``.
 
-    - ``in_force``: accelerations in force at the start, [n, N] m/s2. The first seven arrays, the state, are updated.
+    - ``in_force``: accelerations in force at the start, [n, N] m/s2. This array and the other arrays from ``gaps`` to
+      ``ahead_hit`` are the state and are updated.
     - ``ahead``: gap between Vehicle 1 and the obstacle ahead, [n] m.
-    - ``first_harm``: harm of first impacts, [n, P] m2/s2. The arrays from here to ``ahead_count`` are results.
+    - ``first_harm``: first-impact harm, [n, P] m2/s2. This array and the other arrays up to ``ahead_count`` are
+      results.
     - ``command``: commands, [n, N] m/s2.
     - ``until``: time at which each world's segment ends, [n] s.
     - ``failed``: result, the status of each world, [n]: ``FLAG.DONE``, or the code of the check that failed.
     - ``at``: 1 if some world has an obstacle, otherwise 0; vehicle i is column ``at + i`` of the table
       (``physics.rows``).
-    - ``rows``: result, one row for each impact, [capacity, LISTED.WIDTH]; impacts beyond the capacity are only counted.
+    - ``rows``: result, one row for each impact, [capacity, LISTED.WIDTH]; if it is full, further impacts are only
+      counted.
     """
     n, vehicles = speeds.shape
     building = pieces.shape[2] > 0 or finite_among(brake_rate.ravel()) + finite_among(release_rate.ravel()) > 0
@@ -114,8 +117,8 @@ def advance(
 ) -> tuple[Worlds, Impacts]:
     """Advance ``worlds`` exactly under constant commands, and return the new worlds and their impacts.
 
-    Raises ``InvalidInput`` for an invalid command, end time or ``threads``, and ``PhysicsError``, which lists the
-    failed worlds, if a check of the kernel fails.
+    Raises ``InvalidInput`` for an invalid command, end time or ``threads``. Raises ``PhysicsError``, which lists the
+    failed worlds, if a check of the physics fails.
 
     Args:
         worlds: n worlds of N vehicles; they are not changed.
@@ -176,8 +179,8 @@ def _advance_part(arrays: tuple[NDArray[Any], ...], at: int, capacity: int, part
     Args:
         arrays: array arguments of ``advance_worlds`` for all worlds, in its order.
         at: 1 if some world has an obstacle ahead, otherwise 0.
-        capacity: number of impacts to record.
-        part: slice of the worlds.
+        capacity: largest number of impacts to record.
+        part: slice of the world indices to advance.
 
     """
     rows, kernel = np.empty((capacity, LISTED.WIDTH)), cast("Any", advance_worlds)
@@ -201,8 +204,8 @@ def refuse_bad(worlds: Worlds, command: Floats, until: Floats, in_time: Bools) -
 
     Args:
         worlds: n worlds.
-        command: [n, N] m/s2.
-        until: end times, [n] s, for the message.
+        command: commanded accelerations, [n, N] m/s2.
+        until: end times, [n] s, for the error message.
         in_time: whether each end time is valid, [n].
 
     """
@@ -221,9 +224,9 @@ def refuse_bad(worlds: Worlds, command: Floats, until: Floats, in_time: Bools) -
 
 
 def _impact_rows(parts: list[_Part], ahead: int) -> ImpactRows:
-    """Join the recorded impacts of all parts of a batch.
+    """Join the recorded impacts of all slices of a batch.
 
-    ``ahead`` is 1 if column 0 of the kernel's tables is an obstacle, otherwise 0.
+    ``ahead`` is 1 if pair 0 in the recorded rows is the obstacle ahead and Vehicle 1, otherwise 0.
     """
     rows = np.concatenate([part.rows[: part.recorded] for part in parts])
     first = np.repeat([part.first for part in parts], [part.recorded for part in parts])

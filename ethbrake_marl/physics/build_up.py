@@ -4,12 +4,12 @@ The kernels advance one world in a ``table`` with the layout of ``physics.rows``
 vehicle or pair.
 
 The *force* of a vehicle (row FORCE) is the acceleration that its brakes or engine alone would cause at the moment. The
-force falls at the rate BRAKE_RATE and rises at the rate RELEASE_RATE until it equals the command; before the latency
-has elapsed, the command counts as 0. The force also changes while the vehicle stands.
+force falls at the rate BRAKE_RATE or rises at the rate RELEASE_RATE until it equals the command. Until the vehicle's
+latency has elapsed, 0 replaces the command. The force also changes while the vehicle is at rest.
 
 A *body* is a vehicle, or several touching vehicles that move together. Between events each body has a constant jerk.
-There are two kinds of events that ``physics.constant_motion`` does not have: a force reaches its command or passes 0,
-and touching vehicles separate or a body that its brakes held starts to move.
+Two kinds of events occur here but not in ``physics.constant_motion``. In the first, a force reaches the command or
+passes 0. In the second, touching vehicles separate, or a body that its brakes held at rest starts to move.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ def built_up(table: Floats) -> bool:
     """Return whether every vehicle's force equals its command, so that no force changes until a latency elapses.
 
     The force of a vehicle is the acceleration by its brakes or engine. If a vehicle follows a fixed sequence of
-    commands (*pieces*), the last command must also have begun. If the result is True, ``constant_motion.move`` is
-    exact. ``table``: one world in the layout of ``physics.rows``.
+    commands, the result is True only after the last of these commands has begun. If the result is True,
+    ``constant_motion.move`` is exact. ``table``: one world in the layout of ``physics.rows``.
     """
     built = True
     for i in range(table.shape[1]):
@@ -47,7 +47,8 @@ def built_up(table: Floats) -> bool:
 def first_return(value: float, rate: float, jerk: float) -> float:
     """Return the first time t > 0 at which ``value + rate t + jerk t^2 / 2`` is 0, in s; infinite if there is none.
 
-    For a speed, ``value`` is in m/s, ``rate`` in m/s2 and ``jerk`` in m/s3. A zero at t = 0 does not count.
+    For a speed, ``value`` is in m/s, ``rate`` in m/s2 and ``jerk`` in m/s3. The result is later than 0 even if the
+    expression is 0 at t = 0.
     """
     if value == 0.0:
         return -2.0 * rate / jerk if rate * jerk < 0.0 else math.inf
@@ -67,15 +68,16 @@ def first_return(value: float, rate: float, jerk: float) -> float:
 
 @compiled
 def gap_after(gap: float, closing: float, pressing: float, jerk: float, time: float) -> float:
-    """Return the gap (m) after the time t at a constant closing jerk: ``g - (w + (b + j t / 3) t / 2) t``.
+    """Return the gap (m) of a pair after the time t at constant closing jerk: ``g - (w + (b + j t / 3) t / 2) t``.
 
-    Closing speed, acceleration and jerk are rear minus front.
+    Closing speed, closing acceleration and closing jerk are the value of the rear vehicle minus the value of the front
+    vehicle.
 
     Args:
         gap: present gap g, m.
         closing: present closing speed w, m/s.
         pressing: present closing acceleration b, m/s2.
-        jerk: rate j of the closing acceleration, m/s3.
+        jerk: closing jerk j, the rate of the closing acceleration, m/s3.
         time: time t, s.
 
     """
@@ -84,18 +86,18 @@ def gap_after(gap: float, closing: float, pressing: float, jerk: float, time: fl
 
 @compiled
 def contact_within(gap: float, closing: float, pressing: float, jerk: float, end: float) -> tuple[float, float]:
-    """Return time (s) and closing speed (m/s) of a pair's first contact before ``end``; no contact: ``(inf, 0)``.
+    """Return time (s) and closing speed (m/s) of a pair's first contact before ``end``; ``(inf, 0)`` if there is none.
 
-    ``motion.contact`` does the same for a constant closing acceleration. The closing speed ``w + b t + j t^2 / 2`` has
-    at most two roots, and between them the gap is monotone. The contact lies in the first monotone interval that ends
-    with a gap of at most 0. Newton's method finds the contact. If a Newton step leaves this interval, bisection
-    replaces the step.
+    The closing jerk is constant; ``motion.contact`` is the function for a constant closing acceleration. The closing
+    speed ``w + b t + j t^2 / 2`` has at most two roots, and between them the gap is monotone. The contact lies in the
+    first monotone interval that ends with a gap of at most 0. Newton's method finds the time of the contact in this
+    interval. If a step of Newton's method leaves the interval, a bisection step replaces it.
 
     Args:
         gap: present gap of the pair, m.
         closing: present closing speed w (rear minus front), m/s.
         pressing: present closing acceleration b, m/s2.
-        jerk: rate j of the closing acceleration, m/s3.
+        jerk: closing jerk j, the rate of the closing acceleration, m/s3.
         end: length of the time interval to search, s.
 
     """
@@ -143,7 +145,7 @@ def plan_force(table: Floats, i: int, wanted: float) -> None:
 
     The force is the acceleration by brakes or engine. The goal is the command ``wanted`` (m/s2), or 0 if the force
     changes its sign on the way to this command. The function writes the rows FORCE, FORCE_RATE, FORCE_TIME and
-    FORCE_VALUE; the time is infinite if the force already equals the command.
+    FORCE_VALUE. If the force already equals the command, the time until the goal (FORCE_TIME) is infinite.
     """
     force = table[ROW.FORCE, i]
     force = force_now(force, wanted, table[ROW.BRAKE_RATE, i], table[ROW.RELEASE_RATE, i])
@@ -161,11 +163,11 @@ def plan_force(table: Floats, i: int, wanted: float) -> None:
 
 @compiled
 def force_ranges(force: float, rate: float, speed: float, limit: float) -> tuple[float, float, float, float]:
-    """Return a vehicle's own acceleration for motion forward and for motion backward, and the rates of both.
+    """Return a vehicle's own acceleration for motion forward and for motion backward, and their rates of change.
 
-    The result is ``(forward, backward, rate of forward, rate of backward)``, in m/s2 and m/s3. The two accelerations
-    differ if the force depends on the direction of motion, as the force of brakes at standstill does (see
-    ``motion.force_range``).
+    The result is ``(forward, backward, rate of forward, rate of backward)``: two accelerations in m/s2 and their rates
+    in m/s3. The accelerations differ if the force depends on the direction of motion. For example, the brakes of a
+    vehicle at rest act against motion in either direction (see ``motion.force_range``).
 
     Args:
         force: present acceleration by brakes or engine, m/s2.
@@ -190,11 +192,11 @@ def force_ranges(force: float, rate: float, speed: float, limit: float) -> tuple
 
 @compiled
 def settle_moving(low: float, high: float, low_jerk: float, high_jerk: float) -> tuple[float, float]:
-    """Return acceleration (m/s2) and jerk (m/s3) of a body (a vehicle, or several vehicles that move as one).
+    """Return the acceleration (m/s2) and jerk (m/s3) of a body (a vehicle, or several vehicles that move as one).
 
-    The body's own forces allow every acceleration in the range ``[low, high]`` (m/s2). The ends of this range change at
-    the rates ``low_jerk`` and ``high_jerk`` (m/s3). The body's acceleration is the value in this range that is nearest
-    to 0, as in ``motion.settle``.
+    The body's own forces allow every acceleration in the range ``[low, high]`` (m/s2). The lower end of the range
+    changes at the rate ``low_jerk``, the upper end at the rate ``high_jerk`` (m/s3). The body's acceleration is the
+    value in this range that is nearest to 0, as in ``motion.settle``.
     """
     if low > 0.0 or (low == 0.0 and low_jerk > 0.0):
         return low, low_jerk
@@ -205,12 +207,12 @@ def settle_moving(low: float, high: float, low_jerk: float, high_jerk: float) ->
 
 @compiled(apart=True, bare=True)
 def pool_moving(table: Floats, first: int, last: int) -> float:
-    """Set accelerations and jerks of touching vehicles; return the time until two of them separate (s).
+    """Set the accelerations and jerks of touching vehicles; return the time (s) until two of them separate.
 
     The vehicles are the columns ``first..last`` of ``table`` and have the same speed. If the acceleration of a vehicle
-    is at least the acceleration of the vehicle in front, up to rounding, both move as one body with a common
-    acceleration and jerk. If their jerks differ, the two may separate later. The time is infinite if no vehicles
-    separate. Writes the rows ACCELERATION, JERK and JOINED.
+    is at least the acceleration of the vehicle in front, up to rounding, both vehicles move as one body with a common
+    acceleration and jerk. If the vehicles' own jerks differ, the body may separate later. If no vehicles of
+    ``first..last`` separate, the result is infinite. The function writes the rows ACCELERATION, JERK and JOINED.
     """
     count = 0
     for i in range(first, last + 1):
@@ -247,10 +249,10 @@ def pool_moving(table: Floats, first: int, last: int) -> float:
 
 @compiled(bare=True)
 def settle_block(table: Floats, block: int, out: int) -> None:
-    """Write the common acceleration and jerk of a pooled block into column ``out`` of the table.
+    """Write the common acceleration and jerk of a block into column ``out`` of the table.
 
-    A block consists of touching vehicles that move as one body. ``block`` is the block's column in the rows BLOCK_*,
-    which contain its mass and the sums of mass times force.
+    A block consists of touching vehicles that move as one body. ``block`` is the block's column in the rows whose names
+    begin with BLOCK. These rows contain the mass of the block and the sums of mass times force and of mass times jerk.
     """
     mass = table[ROW.BLOCK_MASS, block]
     table[ROW.ACCELERATION, out], table[ROW.JERK, out] = settle_moving(
@@ -261,10 +263,10 @@ def settle_block(table: Floats, block: int, out: int) -> None:
 
 @compiled(bare=True)
 def parting_s(table: Floats, head: int, tail: int, value: float, jerk: float) -> float:
-    """Return the time until the joined vehicles ``head..tail`` stop moving as one body (s); infinite if they never do.
+    """Return the time (s) until the vehicles ``head..tail`` stop moving as one body; infinite if they never do.
 
-    A moving body splits when its front vehicles alone would accelerate more than the whole body. A body that brakes
-    hold at rest starts to move when its front vehicles drive away or its rear vehicles would be pushed back.
+    A moving body splits when its front vehicles alone would accelerate more than the whole body. A body that its brakes
+    hold at rest starts to move when its front vehicles drive away or when its rear vehicles would move backward.
 
     Args:
         table: one world in the layout of ``physics.rows``.
@@ -302,8 +304,8 @@ def parting_s(table: Floats, head: int, tail: int, value: float, jerk: float) ->
 def crossing_s(below: float, rate: float) -> float:
     """Return the time (s) after which the difference of two accelerations is positive; infinite if it never is.
 
-    The present difference is ``below`` (m/s2), at most 0, and it grows at ``rate`` (m/s3). A small delay is added to
-    the time, because rounding could otherwise leave the difference at 0.
+    The present difference is ``below`` (m/s2), at most 0, and it grows at the rate ``rate`` (m/s3). The result is later
+    than the exact time by a small delay. Without this delay, rounding could leave the difference at 0.
     """
     if rate <= 0.0:
         return math.inf
@@ -312,11 +314,11 @@ def crossing_s(below: float, rate: float) -> float:
 
 @compiled(apart=True, bare=True)
 def accelerate_moving(table: Floats) -> float:
-    """Set the acceleration and jerk of every vehicle; return the time until touching vehicles separate (s).
+    """Set the acceleration and jerk of every vehicle; return the time (s) until touching vehicles separate.
 
-    ``constant_motion.accelerate`` does the same for brakes that act at once; ``table`` is one world in the layout of
-    ``physics.rows``. The function also sets how each vehicle's force changes next and marks the pairs that move as one
-    body (row JOINED). The time is infinite if no touching vehicles separate.
+    If no touching vehicles separate, the result is infinite. The function also sets how each vehicle's force changes
+    next and marks the pairs that move as one body (row JOINED). ``table`` is one world in the layout of
+    ``physics.rows``. For brakes that act at once, ``constant_motion.accelerate`` replaces this function.
     """
     vehicles = table.shape[1]
     for i in range(vehicles):
@@ -349,10 +351,10 @@ def accelerate_moving(table: Floats) -> float:
 def next_moving_event(table: Floats, now: float, end: float, parting: float) -> float:
     """Return the time from ``now`` to the next event, at most ``end - now`` (s).
 
-    An event is a contact, a separation, a vehicle that comes to rest or reaches its speed limit, a command that takes
-    effect, or a force that reaches its command. The function also writes into the table when each vehicle next comes to
-    rest or reaches its speed limit, and when each pair comes into contact. ``constant_motion.next_event`` does the same
-    for brakes that act at once.
+    There is an event when a pair comes into contact or separates, a vehicle comes to rest or reaches its speed limit, a
+    command takes effect, or a force reaches its command or passes 0. The function also writes into the table when each
+    vehicle next comes to rest or reaches its speed limit, and when each pair next comes into contact. For brakes that
+    act at once, ``constant_motion.next_event`` replaces this function.
 
     Args:
         table: one world in the layout of ``physics.rows``, after ``accelerate_moving``.
@@ -406,8 +408,8 @@ def next_moving_event(table: Floats, now: float, end: float, parting: float) -> 
 def move_on_cubics(table: Floats, duration: float) -> bool:
     """Move gaps, speeds and forces to the next event, ``duration`` (s) later; return False if a contact was missed.
 
-    ``constant_motion.move`` does the same for brakes that act at once; ``table`` is one world in the layout of
-    ``physics.rows``.
+    ``table`` is one world in the layout of ``physics.rows``. For brakes that act at once, ``constant_motion.move``
+    replaces this function.
     """
     vehicles, sound = table.shape[1], True
     for p in range(vehicles - 1):
@@ -450,11 +452,11 @@ def move_on_cubics(table: Floats, duration: float) -> bool:
 
 @compiled(apart=True, bare=True)
 def move_apart_on_cubics(table: Floats, duration: float) -> bool:
-    """Move every vehicle as if it were alone for ``duration`` (s); return False if two vehicles may meet, else True.
+    """Move all vehicles for ``duration`` (s) and return True, or return False if two vehicles may touch.
 
-    If the result is False, speeds and gaps are unchanged. Two neighbours cannot meet if their gap exceeds ``duration``
-    times their largest possible closing speed. ``segment.move_apart`` does the same for brakes that act at once;
-    ``table`` is one world in the layout of ``physics.rows``.
+    If the result is False, speeds and gaps are unchanged. Two neighbours cannot touch if their gap exceeds ``duration``
+    times their largest possible closing speed. ``table`` is one world in the layout of ``physics.rows``. For brakes
+    that act at once, ``segment.move_apart`` replaces this function.
     """
     vehicles = table.shape[1]
     slowest_in_front = math.inf
@@ -497,13 +499,13 @@ def move_apart_on_cubics(table: Floats, duration: float) -> bool:
 def move_alone(table: Floats, i: int, wanted: float, duration: float) -> tuple[float, float]:
     """Move vehicle ``i`` as if it were alone, under a constant command; return its lowest and highest speed (m/s).
 
-    Row SPEED_VALUE contains the speed at the start. The function updates the rows SPEED_VALUE and FORCE, and adds the
-    distance to row WAY.
+    When the function is called, row SPEED_VALUE must contain the vehicle's present speed. The function updates the rows
+    SPEED_VALUE and FORCE, and adds the distance that the vehicle travels to row WAY.
 
     Args:
         table: one world in the layout of ``physics.rows``.
         i: column of the vehicle.
-        wanted: command, m/s2.
+        wanted: command of the vehicle, m/s2; negative brakes.
         duration: length of the motion, s.
 
     """
@@ -531,7 +533,7 @@ def move_alone(table: Floats, i: int, wanted: float, duration: float) -> tuple[f
 
 @compiled(apart=True, bare=True)
 def move_alone_by_events(table: Floats, i: int, wanted: float, duration: float) -> tuple[float, float]:
-    """Do the work of ``move_alone`` event by event, for a vehicle that may come to rest or reach its speed limit.
+    """Do the work of ``move_alone`` for a vehicle that may come to rest or reach its speed limit, event by event.
 
     Arguments, result and updated rows are the same as in ``move_alone``.
     """

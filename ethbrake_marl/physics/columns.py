@@ -1,6 +1,6 @@
 """Worlds packed into two arrays, state and parameters, one row per world: the layout that the engine uses.
 
-Passing two arrays to a kernel, copying them and replacing their rows costs much less than doing so with a dozen arrays.
+Compiled functions receive, copy and change two arrays much faster than a dozen arrays.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ class Columns(NamedTuple):
     """First column of each group of quantities in the rows of ``Packed``, for N vehicles and P = N - 1 pairs.
 
     A group ends where the next group begins. The group *news by link* contains the times from which each vehicle may
-    act on information about each other vehicle. The group exists only if some world needs it; without the group every
-    vehicle knows everything from the end of its own latency on. The last columns belong to periodic messages
+    act on information about each other vehicle. If no world needs these times, the group does not exist, and every
+    vehicle knows everything once its own latency has elapsed. The last columns belong to periodic messages
     (``physics.messages``); their values change when messages arrive.
     """
 
@@ -70,12 +70,12 @@ _compiled_columns = compiled(_columns_of)
 
 @compiled
 def columns(state: Floats) -> Columns:
-    """Return the first column of each group of quantities, for rows of ``state`` [n, S] and of their parameters."""
+    """Return the first column of each group of quantities, for worlds with the packed ``state`` [n, S]."""
     return _compiled_columns((state.shape[1] + 4) // 8)
 
 
 class Packed(NamedTuple):
-    """n worlds packed into two arrays, one row per world."""
+    """State and parameters of n worlds, packed into two arrays with one row per world."""
 
     state: Floats  # [n, S] what changes during an episode; columns ``time`` to ``obstacle`` of ``Columns``
     # parameters of the vehicles and state of the messages; columns ``restitution`` to ``messages`` of ``Columns``:
@@ -86,8 +86,7 @@ class Packed(NamedTuple):
     def of(cls, worlds: Worlds) -> Packed:
         """Pack ``worlds`` as at the start of an episode, with harm 0.
 
-        Columns for an obstacle and for news by link (the times from which each vehicle may act on information about
-        each other vehicle) exist only if some world needs them.
+        The columns of an obstacle, and those of *news by link* (see ``Columns``), exist only if some world needs them.
         """
         v, (n, N) = worlds.vehicles, worlds.speeds_mps.shape
         none = np.zeros((n, 3 * (N - 1)))
@@ -117,7 +116,7 @@ class Packed(NamedTuple):
 
     @property
     def has_news(self) -> bool:
-        """Whether the rows have columns for the times from which vehicles may act on information about each other."""
+        """Whether the rows have the columns *news by link*: times from which vehicles may act on news of each other."""
         return bool(self.params.shape[1] > self.column.own_latency)
 
     @property
@@ -134,11 +133,12 @@ class Packed(NamedTuple):
     def widened(self, obstacle: bool, news: bool) -> Packed:
         """Return these worlds, with the requested columns added if they are missing.
 
-        The new columns say that there is no obstacle, and that each vehicle knows everything from its own latency on.
+        Added obstacle columns say that there is no obstacle. Added columns *news by link* say that each vehicle knows
+        everything once its own latency has elapsed.
 
         Args:
             obstacle: whether to add the columns of an obstacle.
-            news: whether to add the columns of news by link.
+            news: whether to add the columns *news by link* (see ``Columns``).
 
         """
         (state, params), column = self, self.column
@@ -151,9 +151,9 @@ class Packed(NamedTuple):
         return Packed(state, params)
 
     def worlds(self, vehicles: Vehicles | None = None) -> Worlds:
-        """Unpack the worlds into new arrays.
+        """Unpack the two arrays into ``Worlds`` with new arrays.
 
-        ``vehicles``: parameters to use in the result; None: unpack the parameters from the rows.
+        ``vehicles``: parameters of the result; None: unpack the parameters, too.
         """
         (state, params), column, far = self, self.column, not self.has_obstacle
         return Worlds(
@@ -192,10 +192,11 @@ class Packed(NamedTuple):
         return self.params[:, column.news : column.messages].copy().reshape(-1, column.vehicles, column.vehicles)
 
     def ledger(self) -> tuple[Floats, Floats, Ints, Floats, Floats, Ints]:
-        """Return six arrays: harm and impacts since the start of the episode, for the pairs and for the obstacle.
+        """Return harm and number of impacts since the start of the episode, of the pairs and of the obstacle.
 
-        The first three arrays are first-impact harm (m2/s2), total harm (m2/s2) and number of impacts of each pair,
-        [n, P]. The other three arrays are the same quantities for the obstacle, [n].
+        The first three arrays, [n, P], are first-impact harm (m2/s2), total harm (m2/s2) and number of impacts of each
+        pair. The other three arrays, [n], are first-impact harm, total harm and number of impacts of Vehicle 1 with the
+        obstacle.
         """
         state, column, pairs = self.state, self.column, self.column.vehicles - 1
         first, total, count = (state[:, at : at + pairs].copy() for at in range(column.harm, column.obstacle, pairs))

@@ -1,6 +1,6 @@
 """Compiled motion of one world from event to event, with constant accelerations between two events.
 
-The kernels work on a ``table`` in the layout of ``physics.rows``: a row per quantity, a column per vehicle or pair.
+The functions work on a ``table`` in the layout of ``physics.rows``: a row per quantity, a column per vehicle or pair.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ethbrake_marl.physics.state import Floats
 def accelerate(table: Floats) -> None:
     """Set the acceleration of every vehicle, and mark the pairs of touching vehicles that move as one body.
 
-    Reads speeds, commands and gaps of ``table``; writes the rows ACCELERATION and JOINED.
+    The function uses the speeds, commands and gaps in ``table``. It writes the rows ACCELERATION and JOINED.
     """
     vehicles = table.shape[1]
     for i in range(vehicles):
@@ -47,9 +47,9 @@ def accelerate(table: Floats) -> None:
 def next_event(table: Floats, now: float, end: float) -> float:
     """Return the time from ``now`` to the next event, at most ``end - now`` (s).
 
-    An event is a contact, a vehicle that comes to rest or reaches its speed limit, or a command that takes effect. The
-    function also writes into the table when each vehicle next comes to rest or reaches its speed limit, and when each
-    pair comes into contact.
+    There is an event when a pair comes into contact, a vehicle comes to rest or reaches its speed limit, or a command
+    takes effect. The function also writes into the table when each vehicle next comes to rest or reaches its speed
+    limit, and when each pair next comes into contact.
 
     Args:
         table: one world in the layout of ``physics.rows``, after ``accelerate``.
@@ -83,8 +83,8 @@ def next_event(table: Floats, now: float, end: float) -> float:
 def move(table: Floats, duration: float) -> bool:
     """Move the world of ``table`` to its next event, ``duration`` (s) later; return False if a contact was missed.
 
-    Quantities that reach an event are set to its exact value: a gap to 0, a speed to 0 or the speed limit. A contact
-    was missed if a gap is negative.
+    At the event, the function sets quantities to their exact values: the gap of a pair in contact to 0, and the speed
+    of a vehicle to 0 or to the speed limit. A negative gap means that a contact was missed.
     """
     sound = True
     for p in range(table.shape[1] - 1):
@@ -104,10 +104,10 @@ def move(table: Floats, duration: float) -> bool:
 
 @compiled(bare=True)
 def move_speeds(table: Floats, duration: float) -> None:
-    """Advance the speeds of ``table`` by ``duration`` (s), at most to the next event.
+    """Advance the speeds in ``table`` by ``duration`` (s), which must not go beyond the next event.
 
-    Vehicles that move as one body get one common speed. If a pair comes into contact, the difference of its two speeds
-    is exactly its closing speed.
+    Vehicles that move as one body get one common speed. If a pair comes into contact, the function sets the speed of
+    the rear vehicle to the speed of the front vehicle plus the closing speed in row CONTACT_SPEED.
     """
     vehicles = table.shape[1]
     first = 0

@@ -1,7 +1,7 @@
 """Forecast of contacts: time and closing speed of the next impact of each pair under constant commands.
 
-The forecast simulates the same physics as ``advance`` in a table that the caller has filled. It does not return the
-motion.
+The forecast simulates the same physics as ``advance``, but returns no motion. The caller describes the world in a table
+in the layout of ``physics.rows``.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ def forecast_contacts(table: Floats, restitution: float, duration: float, contac
     """Simulate one world for ``duration`` (s) and write each pair's next impact into ``contacts``; return a status.
 
     The status is ``FLAG.DONE``, or the code of the check that failed. The next impact of a pair is also reported if the
-    pair had an impact before, although it then adds no first-impact harm.
+    pair had an impact before the forecast; this next impact adds no first-impact harm.
 
     Args:
-        table: the world in the layout of ``physics.rows``: a row per quantity, a column per vehicle or pair. The rows
-            of motion and harm are overwritten.
+        table: the world in the layout of ``physics.rows``: a row per quantity, a column per vehicle or pair. The
+            function overwrites the rows of motion and harm.
         restitution: coefficient of restitution of every impact, in [0, 1].
         duration: length of the forecast, s.
         contacts: result, [CONTACT.WIDTH, N]; column p is pair p, and the last column is not used. Row ``CONTACT.TIME``

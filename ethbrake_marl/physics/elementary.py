@@ -1,9 +1,9 @@
 """Exponential, logarithm and normal quantile, computed with + - * / and sqrt only, so all machines get the same bits.
 
-The C library and numpy choose their implementation of exp, log and pow by the processor, and the implementations differ
-in the last bits. The functions of this module do the same IEEE operations in the same order on every machine, so worlds
-drawn from a seed have the same bits everywhere. The error bounds were measured: each is the largest error, rounded up,
-in a comparison with values of 40 digits (tests/physics/test_compiling.py).
+The C library and numpy have several implementations of exp, log and pow, and choose one by the processor. The results
+of these implementations differ in the last bits. The functions of this module do the same IEEE operations in the same
+order on every machine, so worlds drawn from a seed have the same bits everywhere. Each error bound in this module is
+the largest error, rounded up, that a comparison with values of 40 digits has shown (tests/physics/test_compiling.py).
 """
 
 from __future__ import annotations
@@ -100,8 +100,8 @@ def power_of_two(k: int) -> float:
 def exp_rest(x: float, k: int) -> float:
     """Return ``e^x / 2^k`` for the whole number k nearest to ``x / ln 2``.
 
-    The result is Taylor's series to the 13th power of ``x - k ln 2``, whose absolute value is at most ``ln(2) / 2``.
-    The relative error is 5e-18.
+    The result is the sum of Taylor's series of ``e^y`` to the 13th power of ``y = x - k ln 2``. The absolute value of y
+    is at most ``ln(2) / 2``. The relative error of cutting the series there is 5e-18.
     """
     return _polynomial(_EXP, (x - k * _LN2_HIGH) - k * _LN2_LOW)
 
@@ -122,7 +122,7 @@ def exp(x: float) -> float:
 
 @compiled
 def _log_parts(x: float) -> tuple[float, float]:
-    """Return two numbers whose sum is ``ln x``, for a finite x > 0; two numbers are more accurate than one.
+    """Return two numbers whose sum is ``ln x``, for a finite x > 0; the pair is more accurate than a single number.
 
     With ``x = 2^k m`` and m between ``sqrt(1/2)`` and ``sqrt(2)``, the first number is k times the leading bits of ``ln
     2``, which is exact. The second number is the rest of ``k ln 2``, plus the series of ``ln m = 2 artanh((m - 1) / (m
@@ -153,8 +153,9 @@ def log(x: float) -> float:
 def normal_quantile(p: float) -> float:
     """Return the number x below which a standard normal variable lies with probability p, within 1.5 ulp.
 
-    p is clipped to [1e-22, 1 - 1e-22]. In the tails, ``r = sqrt(-2 ln p)`` is represented as the sum of two numbers.
-    The first number has 24 bits, so its square is exact.
+    p is clipped to [1e-22, 1 - 1e-22]. For p outside [1/4, 3/4], with the smaller of p and 1 - p in place of p, the
+    function represents ``r = sqrt(-2 ln p)`` as the sum of two numbers. The first of them has 24 bits, so its square is
+    exact.
     """
     q = p - 0.5
     if abs(q) <= 0.25:
@@ -179,9 +180,9 @@ def normal_quantile(p: float) -> float:
 def normal_probability(x: float) -> float:
     """Return the probability that a standard normal variable is below x; the relative error is 1e-13 for x > -30.
 
-    With the density phi, the upper tail for ``0 <= x <= 2`` is the series
-    ``1/2 - phi(x) (x + x^3 / 3 + x^5 / 15 + ...)``, and for larger x the continued fraction
-    ``phi(x) / (x + 1 / (x + 2 / (x + ...)))``.
+    Let phi be the standard normal density. For ``0 <= x <= 2``, the probability of a value above x is computed by the
+    series ``1/2 - phi(x) (x + x^3 / 3 + x^5 / 15 + ...)``. For larger x, it is computed by the continued fraction
+    ``phi(x) / (x + 1 / (x + 2 / (x + ...)))``. For ``x < 0``, the result is the probability of a value above -x.
     """
     a = abs(x)
     density = _PER_SQRT_2PI * exp(-0.5 * a * a)

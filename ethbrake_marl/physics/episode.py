@@ -1,12 +1,13 @@
-"""Compiled rules of one step of an episode: onset of commands, motion, harm, rest, and times of decisions.
+"""Compiled rules of one step of an episode: when commands take effect, motion, harm, rest, and decision times.
 
-Searches and shields advance an episode with ``step_episode``. They copy one world at a time into a table in the layout
-of ``physics.rows``. The engine stores its worlds in the rows of two arrays and has its own loop. The loop uses the same
-rules (``step_end_s``, ``onset_s``, ``force_at``, ``stands``) and the same ``advance_table``. The results of engine,
-searches and shields are therefore equal to the last bit (decision 0025).
+Searches and shields copy one world at a time into a table in the layout of ``physics.rows``, and advance this world
+with ``step_episode``. The engine stores all its worlds in the rows of two arrays and advances them in its own loop.
+This loop uses the same rules (``step_end_s``, ``onset_s``, ``force_at``, ``stands``) and the same ``advance_table``.
+Therefore engine, searches and shields compute results that are equal to the last bit (decision 0025).
 
-A *profile* contains the commands of the controlled vehicles in each of its *phases*. Phases begin and end at decisions,
-so an agent can carry out a profile. The following letters are used in addition to those of ``physics.state``:
+A *profile* is a sequence of constant commands of the controlled vehicles. A *phase* is the time interval of one of
+these commands. Phases begin and end at decisions, so an agent can carry out a profile. This module uses the following
+shape letters in addition to those of ``physics.state``:
 
 ===  ===========================================================
 C    controlled vehicles
@@ -32,7 +33,7 @@ GOES_ON, AT_REST, AT_HORIZON = 0, 1, 2
 
 
 class _Clock(NamedTuple):
-    """Index of each entry of the array ``clock`` [WIDTH] of an episode."""
+    """Index of each entry of the array ``clock`` [WIDTH]: decision times and settings of an episode."""
 
     START: int = 0  # time of the first decision (s)
     TIME_STEP: int = 1  # time between decisions (s)
@@ -90,24 +91,24 @@ class Decisions(NamedTuple):
         return np.ceil((time_s - self.first_s) / self.time_step_s - _ROUNDING)
 
     def latest(self, time_s: Floats) -> Ints:
-        """Return the number of the latest decision at each time (s), from 0; negative before the first decision."""
+        """Return the number of the latest decision at or before each time (s), from 0; negative before decision 0."""
         number: Floats = np.floor((time_s - self.first_s) / self.time_step_s + _ON_GRID)
         return number.astype(np.int64)
 
     def at(self, step: Floats | Ints | float) -> Floats:
-        """Return the time of decision number ``step`` (s), counted from 0."""
+        """Return the time (s) of decision number ``step``, counted from 0."""
         return self.first_s + step * self.time_step_s
 
 
 @compiled
 def grid_of(clock: Floats) -> Grid:
-    """Return the decision times that a ``clock`` [CLOCK.WIDTH] describes."""
+    """Return the decision times of an episode from its array ``clock`` [CLOCK.WIDTH]."""
     return Grid(clock[CLOCK.START], clock[CLOCK.TIME_STEP], clock[CLOCK.LAST_STEP], clock[CLOCK.HORIZON])
 
 
 @compiled
 def step_end_s(step: float, last_step: float, first_s: float, time_step_s: float, horizon_s: float) -> float:
-    """Return the time at which step number ``step`` (from 1) ends (s); the last step ends at the horizon.
+    """Return the time (s) at which step number ``step`` (from 1) ends; the last step ends at the horizon.
 
     Args:
         step: number of the step; a step is the time between two decisions.
@@ -122,7 +123,7 @@ def step_end_s(step: float, last_step: float, first_s: float, time_step_s: float
 
 @compiled
 def time_of(grid: Grid, step: int) -> float:
-    """Return the time of decision number ``step`` (from 0) on the grid (s)."""
+    """Return the time (s) of decision number ``step`` (from 0), or the horizon if there is no such decision."""
     return step_end_s(step, grid.last_step, grid.first_s, grid.time_step_s, grid.horizon_s)
 
 
@@ -130,21 +131,20 @@ def time_of(grid: Grid, step: int) -> float:
 def onset_s(latency_s: float, time_s: float) -> float:
     """Return the time (s) from ``time_s`` until a vehicle's command takes effect; 0 or less if it acts at once.
 
-    ``latency_s`` is the time from the alert at which commands begin to have effect; ``time_s`` also counts from the
-    alert.
+    ``latency_s`` and ``time_s`` are in seconds from the alert. Commands take effect from ``latency_s`` on.
     """
     return latency_s - time_s
 
 
 @compiled
 def stands(speed_mps: float, command_mps2: float) -> bool:
-    """Return whether a vehicle stands still and its command does not drive it (negative commands brake)."""
+    """Return whether a vehicle is at rest and its command (m/s2) does not drive it, that is, is at most 0."""
     return speed_mps == 0.0 and command_mps2 <= 0.0
 
 
 @compiled(within=True)
 def at_rest(table: Floats) -> bool:
-    """Return whether all vehicles of ``table`` stand still and no command or force would start one moving.
+    """Return whether all vehicles of ``table`` are at rest and no vehicle's command or force would move it.
 
     If the result is True, the episode has ended. ``table``: one world in the layout of ``physics.rows``.
     """
@@ -161,12 +161,13 @@ def step_episode(
 ) -> int:
     """Advance one world from ``time`` to ``until`` under its commands, and add the harm of this step.
 
-    Returns GOES_ON, AT_REST, AT_HORIZON (not at rest at the horizon), or minus the status of a failed kernel; after a
-    failure the table is invalid. The last bits of the result depend on the times at which steps end. To get the same
-    bits as the engine, let each step go from one decision to the next.
+    Returns AT_REST, AT_HORIZON (some vehicle is not at rest at the horizon), GOES_ON (neither), or minus the status
+    code of ``FLAG`` if a check of the physics failed. After a failure the table is invalid. The last bits of the result
+    depend on the times at which steps end. To get the same bits as the engine, call the function once for each step
+    from one decision to the next.
 
     Args:
-        table: the world in the layout of ``physics.rows``, with its rows of an episode; it is advanced.
+        table: the world in the layout of ``physics.rows``, with at least ``ROW.OF_EPISODE`` rows; updated.
         restitution: coefficient of restitution of every impact.
         time: present time, s.
         until: end of the step, s.
@@ -189,12 +190,13 @@ def step_episode(
 def step_again(table: Floats, restitution: float, grid: Grid, step: int, end: int, no_rows: Floats) -> int:
     """Advance a world from decision number ``step`` to decision number ``end``; return the result of ``step_episode``.
 
-    The table must be unchanged since the previous step. The function computes anew when commands take effect.
+    Except for commands, the table must be as the previous step left it, or as ``restore`` filled it. For each vehicle,
+    the function computes again when the command takes effect.
 
     Args:
-        table: the world in the layout of ``physics.rows``, with its rows of an episode; it is advanced.
+        table: the world in the layout of ``physics.rows``, with at least ``ROW.OF_EPISODE`` rows; updated.
         restitution: coefficient of restitution of every impact.
-        grid: decision times.
+        grid: decision times of the episode.
         step: number of the decision to start at, from 0.
         end: number of the decision to stop at.
         no_rows: ``table[:0]`` or another empty array, so that no single impact is recorded.
@@ -208,10 +210,10 @@ def step_again(table: Floats, restitution: float, grid: Grid, step: int, end: in
 
 @compiled
 def harm_so_far(table: Floats, total: float) -> float:
-    """Return the harm of the line since the episode began, summed from front to rear (m2/s2).
+    """Return the harm (m2/s2) of all pairs since the episode began, summed from front to rear.
 
     Args:
-        table: one world in the layout of ``physics.rows``, with its rows of an episode.
+        table: one world in the layout of ``physics.rows``, with at least ``ROW.OF_EPISODE`` rows.
         total: 1 for total harm, 0 for first-impact harm.
 
     """
@@ -223,17 +225,17 @@ def harm_so_far(table: Floats, total: float) -> float:
 
 @compiled
 def value_of(table: Floats, clock: Floats, other_weight: float = OTHER_WEIGHT) -> float:
-    """Return the value that a search minimises, m2/s2; it never decreases during an episode.
+    """Return the harm of the episode so far that a search minimises, m2/s2; it never decreases during an episode.
 
-    The value is the harm of the line, the weighted sum of its vehicles' harms, or the largest weighted harm of a
-    vehicle. To break ties, the function adds ``other_weight`` times the line's harm in the other count (first-impact or
-    total).
+    The harm is one of three: the harm of the line, the weighted sum of the vehicles' harms, or the largest weighted
+    harm of a vehicle. It uses one of the two counts, first-impact harm or total harm. To break ties, the function adds
+    ``other_weight`` times the line's harm in the other count.
 
     Args:
-        table: one world in the layout of ``physics.rows``, with its rows of an episode.
+        table: one world in the layout of ``physics.rows``, with at least ``ROW.OF_EPISODE`` rows.
         clock: settings, [CLOCK.WIDTH]: ``HARM_IS_TOTAL`` chooses the count of harm, and ``AIM`` chooses one of the
-            three values.
-        other_weight: weight of the line's harm in the other count.
+            three harms.
+        other_weight: weight of the line's harm in the other count, a number without unit.
 
     """
     total, aim = clock[CLOCK.HARM_IS_TOTAL], clock[CLOCK.AIM]
@@ -253,7 +255,7 @@ def value_of(table: Floats, clock: Floats, other_weight: float = OTHER_WEIGHT) -
 
 @compiled
 def save(table: Floats, state: Floats) -> None:
-    """Save the state of a world, and its harm so far, from its ``table`` into the row ``state`` [S].
+    """Save the state of a world, and its harm so far, from its ``table`` into the array ``state`` [S].
 
     The columns of ``state`` are listed in the docstring of this module, under the letter S.
     """
@@ -272,7 +274,7 @@ def save(table: Floats, state: Floats) -> None:
 
 @compiled
 def restore(table: Floats, state: Floats) -> None:
-    """Load the row ``state`` [S], which ``save`` wrote, into the ``table`` of a world."""
+    """Load the array ``state`` [S], which ``save`` wrote, into the ``table`` of a world."""
     vehicles = table.shape[1]
     pairs = vehicles - 1
     for i in range(vehicles):
@@ -288,9 +290,9 @@ def restore(table: Floats, state: Floats) -> None:
 
 @compiled(apart=True)
 def follow_whole(world: Episode, ends: Ints, commands: Floats, states: Floats, bound: float) -> tuple[float, int]:
-    """Simulate a whole profile: a sequence of constant commands, one per phase.
+    """Simulate a whole profile (a sequence of constant commands) from its first phase on.
 
-    The arguments and the result are the same as in ``follow`` with ``phase`` 0.
+    Arguments and result are the same as in ``follow``, which this function calls with ``phase`` 0.
     """
     phase = min(0, ends.shape[0])  # 0, but not as a literal: numba would compile everything again for it
     return follow(world, ends, commands, states, phase, bound)
@@ -298,21 +300,22 @@ def follow_whole(world: Episode, ends: Ints, commands: Floats, states: Floats, b
 
 @compiled
 def follow(world: Episode, ends: Ints, commands: Floats, states: Floats, phase: int, bound: float) -> tuple[float, int]:
-    """Simulate a profile from ``phase`` on; return its value (m2/s2) and the number of phases until the episode ends.
+    """Simulate a profile from ``phase`` on; return its harm (m2/s2) and the number of phases until the simulation ends.
 
-    A profile is a sequence of constant commands; a phase is the time interval of one command. The value is the harm
-    that a search minimises (``value_of``). The number of phases is -1 if a check of the physics failed. If
-    ``world.clock[CLOCK.STEPWISE]`` is 1, the simulation steps from decision to decision, and its result has the same
-    bits as in the engine. Otherwise it steps from phase to phase, which is several times faster; the result then
-    differs by rounding.
+    A profile is a sequence of constant commands; a phase is the time interval of one command. The harm is the harm that
+    a search minimises (``value_of``). The number of phases is -1 if a check of the physics failed. If
+    ``world.clock[CLOCK.STEPWISE]`` is 1, the simulation moves from decision to decision, and the result has the same
+    bits as in the engine. If this entry is 0, the simulation moves from phase to phase, which is several times faster,
+    and the result differs by rounding.
 
     Args:
         world: the world and its decision times; its table is overwritten.
         ends: for each phase, the number of the decision at which it ends, [K].
         commands: for each phase, the commands of the C controlled vehicles, [K, C] m/s2.
-        states: state at the start of each phase, [K + 1, S]: entry ``phase`` is read, later entries are written.
+        states: states as ``save`` writes them, [K + 1, S]. The simulation starts from ``states[phase]`` and writes the
+            state at the end of phase k to ``states[k + 1]``.
         phase: number of the first phase to simulate, from 0.
-        bound: the simulation stops early when the value reaches this bound, m2/s2.
+        bound: the simulation stops after the phase in which the harm reaches this bound, m2/s2.
 
     """
     table, clock, controlled = world.table, world.clock, world.controlled

@@ -1,4 +1,4 @@
-"""A vehicle's estimate of the other vehicles' states from the newest periodic messages, which may be old."""
+"""One vehicle's estimate of the other vehicles' states, from the newest periodic messages, which may be old."""
 
 from __future__ import annotations
 
@@ -25,19 +25,20 @@ from ethbrake_marl.physics.state import Floats
 def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> None:
     """Fill ``out`` with the worlds as vehicle ``observer`` estimates them from the messages it has received.
 
-    If the observer knows a vehicle, the newest place and speed that it has received are extrapolated to the present,
-    under the command received with them and without contact. The estimate of a pair's gap is its true gap if the
-    information about both of its vehicles is current. Flags that a pair has had an impact are known only for the pairs
-    of the observer itself. The estimate places a vehicle that the observer does not know at rest, at the position of
-    the next vehicle towards the observer, so that the estimate contains no information about it. If messages do not
-    contain a quantity, it is replaced in a similar way: a place by the place of the next vehicle towards the observer,
-    a speed or a command by 0.
+    If the observer has received the state of a vehicle, the function extrapolates the newest received place and speed
+    to the present, under the received command and without contact. If the received states of both vehicles of a pair
+    are from the present time, the estimated gap is the true gap. The observer knows only of its own pairs whether they
+    have had an impact. If the observer has received nothing about a vehicle, the estimate contains no information about
+    this vehicle: it is at rest at the place of the next vehicle towards the observer. If messages do not contain a
+    quantity, the function replaces it in the same way: a place by the place of the next vehicle towards the observer, a
+    speed or a command by 0.
 
     Args:
-        state: true state rows of the worlds, [n, S], in the layout of ``physics.columns``.
-        params: parameter rows of the worlds, with the columns of messages.
+        state: true states of the worlds, [n, S], one row per world in the layout of ``physics.columns``.
+        params: parameters of the worlds, one row per world, with message columns.
         observer: index of the observing vehicle, from 0.
-        out: result, [n, S], in the layout of ``state``. Worlds without periodic messages get their true state.
+        out: result, the estimated states, [n, S], in the layout of ``state``; in a world without periodic messages, the
+            estimate is the true state.
 
     """
     column = columns(state)
@@ -87,9 +88,9 @@ def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> 
 
 @compiled
 def moved_on(speed: float, command: float, limit: float, duration: float) -> tuple[float, float]:
-    """Return the speed (m/s) and the distance (m) of a vehicle without contact after ``duration`` (s).
+    """Return a vehicle's speed (m/s) after ``duration`` (s) without contact, and the distance (m) that it travels.
 
-    A vehicle that moves backward brakes, whatever the sign of its command.
+    A vehicle that moves backward brakes until it is at rest, whatever the sign of its command.
 
     Args:
         speed: present speed, m/s; may be negative.
@@ -108,7 +109,7 @@ def moved_on(speed: float, command: float, limit: float, duration: float) -> tup
 
 @compiled
 def move_on(speed: Floats, command: Floats, onset: Floats, limit: Floats, duration: Floats) -> tuple[Floats, Floats]:
-    """Return the speeds (m/s) and the distances (m) of vehicles without contact after ``duration`` (s), [n, N] each.
+    """Return vehicles' speeds (m/s) after ``duration`` without contact, and the distances travelled (m), [n, N] each.
 
     Args:
         speed: present speeds, [n, N] m/s, at least 0.

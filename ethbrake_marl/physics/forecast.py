@@ -1,6 +1,6 @@
 """Forecast of harm under constant commands, for many candidate commands of one vehicle.
 
-The forecast uses the physics of ``advance``. It returns the harm but not the motion, so it is fast.
+The forecast uses the physics of ``advance``. It is fast because it returns only the harm, not the motion.
 """
 
 from __future__ import annotations
@@ -21,18 +21,19 @@ def forecast(
 ) -> tuple[Floats, Floats]:
     """Return the first-impact harm and the total harm up to ``until_s`` for each candidate command of ``vehicle``.
 
-    Both results are [n, K] in m2/s2. Harm is summed over all pairs and the obstacle ahead, if there is one. Harm is 0
-    in a world whose time is ``until_s`` or later. A pair that has already had an impact adds no first-impact harm.
+    Both results are [n, K] in m2/s2. Harm is summed over all pairs and the obstacle ahead, if there is one. If the
+    present time of a world is ``until_s`` or later, its harm is 0. A pair that has already had an impact adds no
+    first-impact harm.
 
     Args:
         worlds: n worlds of N vehicles.
         command_mps2: commands of all vehicles, [n, N] m/s2; the column of ``vehicle`` is ignored.
-        vehicle: index of the vehicle, from 0.
+        vehicle: index of the vehicle that tries the candidate commands, from 0.
         candidates_mps2: K candidate commands for the vehicle in each world, [n, K] m/s2.
-        until_s: absolute end of the forecast, s.
+        until_s: end of the forecast, s since the alert.
 
-    Raises ``InvalidInput`` for arrays of wrong shape or a candidate beyond capacity; raises ``PhysicsError``, which
-    lists the failed worlds, if a check of the physics failed.
+        Raises ``InvalidInput`` for arrays of wrong shape or a candidate command beyond the vehicle's capacity. Raises
+        ``PhysicsError``, which lists the failed worlds, if a check of the physics fails.
 
     """
     n, N = worlds.speeds_mps.shape
@@ -72,18 +73,19 @@ def forecast_worlds(
     in_force: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats, first: Floats, total: Floats,
     failed: Bools,
 ) -> None:  # fmt: skip
-    """Simulate every world with each candidate command; fill ``first`` and ``total`` [n, K] with the harm (m2/s2).
+    """Simulate every world with each candidate command; add the harm (m2/s2) to ``first`` and ``total`` [n, K].
 
-    ``first`` and ``total`` must be 0 on entry. Arguments that are not listed are fields of ``Worlds`` and ``Vehicles``
-    under short names, for example ``gaps`` for ``gaps_m``.
+    ``first`` is first-impact harm and ``total`` total harm; all entries must be 0 when the function is called.
+    Arguments that are not listed are fields of ``Worlds`` and ``Vehicles`` under short names, for example ``gaps`` for
+    ``gaps_m``.
 
     - ``ahead``: gap to an obstacle, [n] m, ``FAR_AWAY_M`` in a world without one; empty if no world has one.
     - ``command``: commands of all vehicles, [n, N] m/s2; the column of ``vehicle`` is ignored.
-    - ``vehicle``: index of the vehicle that tries the candidates, from 0.
+    - ``vehicle``: index of the vehicle that tries the candidate commands, from 0.
     - ``candidates``: K candidate commands for this vehicle in each world, [n, K] m/s2.
-    - ``until_s``: absolute end of the forecast, s.
+    - ``until_s``: end of the forecast, s since the alert.
     - ``in_force``: accelerations in force at the start, [n, N] m/s2.
-    - ``failed``: set to True where a check of the kernel failed, [n].
+    - ``failed``: result, [n]; set to True for a world in which a check of the physics failed.
     """
     n, vehicles = speeds.shape
     at = min(ahead.shape[0], 1)  # vehicle i is column at + i; an obstacle is column 0

@@ -1,18 +1,20 @@
 """Impacts and resting contact of touching vehicles, resolved by one law for all pairs at once.
 
 If pairs were resolved one after another, the result would depend on their order. Here all vehicles of a *cluster* (a
-sequence of touching vehicles) are resolved together by a mass-weighted isotonic regression ``P`` (pool adjacent
-violators) of values in the order of the vehicles:
+sequence of touching vehicles) are resolved together. The law uses P, the mass-weighted isotonic regression (pool
+adjacent violators) of the vehicles' speeds or accelerations, from front to rear. With the speeds v- before and v+ after
+the impact, and the restitution e:
 
 * impact: ``v+ = (1 + e) P(v-) - e v-``; for two vehicles this is the paper's eq. (13);
 * resting contact: the accelerations are ``P`` of the vehicles' own accelerations; a pooled block of vehicles with
   masses m and own accelerations u accelerates with ``sum(m u) / sum(m)``. The brakes of a vehicle at rest can have any
-  force up to a limit, so a block at rest moves only if the push exceeds the braking force of its vehicles.
+  force up to a limit. A block at rest therefore moves only if the push exceeds the braking force of its vehicles.
 
-In the result no vehicle is faster than the vehicle in front of it.
+After the impact, no vehicle of a cluster is faster than the vehicle in front of it.
 
-The kernels work on one table of floats per world, ``table[row, vehicle or pair]``, with the rows of ``physics.rows``.
-Passing one array from function to function is cheap; passing twenty small arrays would cost more than the physics.
+The functions work on one array per world, ``table[row, vehicle or pair]``, with the rows of ``physics.rows``. Passing
+one array from function to function takes little time; passing twenty small arrays would take more time than the
+physics.
 """
 
 from __future__ import annotations
@@ -27,18 +29,20 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(bare=True)
 def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) -> int:
-    """Set values so that no touching vehicle is faster than the vehicle in front of it; return the number of blocks.
+    """Compute the isotonic regression of the speeds or accelerations of touching vehicles; return the number of blocks.
 
-    A vehicle that would be faster than the vehicle in front is pooled with it into a *block*. All vehicles of a block
-    get the same value: the mean weighted by mass (isotonic regression). The values are written to row ``out``, and rows
-    BLOCK_* describe the blocks. A vehicle of infinite mass (the obstacle) and its block stand still.
+    A vehicle whose value (speed or acceleration) is above the value of the vehicle in front forms a *block* with this
+    vehicle. All vehicles of a block get the same value, the mean weighted by mass. Therefore no vehicle has a larger
+    value than the vehicle in front of it. The function writes the values to row ``out``, and the blocks to the rows
+    whose names begin with BLOCK. A vehicle of infinite mass (the obstacle) and its block get the value 0.
 
     Args:
         table: one world in the layout of ``physics.rows``.
-        low: row with the lower bound of each vehicle's value (a speed or an acceleration).
-        high: row with the upper bound; the same row as ``low`` for an exactly known value.
-        first: column of the front vehicle of the touching vehicles.
-        last: column of the rear vehicle of the touching vehicles.
+        low: row with the lower bound of each vehicle's own value (m/s or m/s2).
+        high: row with the upper bound of each vehicle's own value; the same row as ``low`` if the value is known
+            exactly.
+        first: column of the first of the touching vehicles, from the front.
+        last: column of the last of the touching vehicles.
         out: row into which the results are written.
 
     """
@@ -71,21 +75,22 @@ def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) ->
 
 @compiled(bare=True)
 def resolve_cluster(table: Floats, restitution: float, first: int, last: int) -> None:
-    """Replace the speeds of touching vehicles ``first..last`` by their speeds after the impact.
+    """Replace the speeds of the touching vehicles ``first..last`` by their speeds after the impact.
 
     The impact is plastic (restitution 0) if the largest closing speed is below ``PLASTIC_SPEED_MPS``. ``pool`` groups
-    the vehicles into blocks and gives each block one common speed, as in a plastic impact. This speed is corrected by
-    the mean of the remaining rounding error, so the error of the momentum is at most 4 machine epsilons times ``sum(m
-    |v|)`` for any masses. The speed of a vehicle that is not struck stays the same to the last bit.
+    the vehicles into blocks and computes one common speed per block, as in a plastic impact. The function corrects this
+    speed by the mean rounding error, so the error of the momentum is at most 4 machine epsilons times ``sum(m |v|)``
+    for any masses. The speed of a vehicle that is not struck stays the same to the last bit.
 
-    The corrected speeds are ordered only up to rounding. In a plastic impact each speed is therefore limited to the
-    speed of the vehicle in front. Without this limit, two blocks could exchange a rounding error forever.
+    Rounding can make a corrected speed larger than the speed of the vehicle in front. In a plastic impact, the function
+    therefore limits each speed to the speed of the vehicle in front. Without this limit, two blocks could exchange a
+    rounding error forever.
 
     Args:
         table: one world in the layout of ``physics.rows``.
         restitution: coefficient of restitution of every impact.
-        first: column of the front vehicle.
-        last: column of the rear vehicle.
+        first: column of the first of the touching vehicles, from the front.
+        last: column of the last of the touching vehicles.
 
     """
     largest = 0.0
@@ -111,10 +116,11 @@ def resolve_cluster(table: Floats, restitution: float, first: int, last: int) ->
 
 @compiled(bare=True)
 def resolve_impacts(table: Floats, restitution: float) -> bool:
-    """Resolve, once, every cluster of touching vehicles in which some pair approaches; return False if there is none.
+    """Resolve every cluster in which a pair has a closing speed above 0, once each; return False if there is none.
 
-    ``table``: one world in the layout of ``physics.rows``; ``restitution``: coefficient of restitution in [0, 1].
-    Updates SPEED, writes the rows CLOSING, BEFORE and STRUCK of this round of impacts, and clears CONTACT_SPEED.
+    A cluster is a sequence of touching vehicles. ``table``: one world in the layout of ``physics.rows``;
+    ``restitution``: coefficient of restitution in [0, 1]. If the result is True, the function has updated row SPEED,
+    written the rows CLOSING, BEFORE and STRUCK, and set row CONTACT_SPEED to 0.
     """
     pairs = table.shape[1] - 1
     approaching = False
@@ -148,14 +154,17 @@ def resolve_impacts(table: Floats, restitution: float) -> bool:
 
 @compiled(bare=True)
 def record_impacts(table: Floats, time_s: float, world: int, rows: Floats, recorded: int) -> int:
-    """Add the impacts of the last round to the rows of harm and to the array ``rows``; return the number of impacts.
+    """Add the impacts of the last ``resolve_impacts`` to the harm in ``table`` and to ``rows``; return their number.
+
+    The number is ``recorded`` plus the number of the added impacts.
 
     Args:
         table: one world in the layout of ``physics.rows``, after ``resolve_impacts``.
         time_s: time of the impacts, s.
         world: number of this world, written into ``rows``.
-        rows: array of impacts, [capacity, LISTED.WIDTH]; impacts beyond its capacity are only counted.
-        recorded: number of impacts that ``rows`` already contains.
+        rows: array to which the impacts are written, [capacity, LISTED.WIDTH]; if it is full, further impacts are only
+            counted.
+        recorded: number of impacts so far, written or only counted.
 
     """
     for p in range(table.shape[1] - 1):

@@ -1,11 +1,12 @@
-"""``compiled``, the decorator of all compiled kernels: strict floating point, and a cache that is safe to share.
+"""The decorator ``compiled``, which compiles functions with strict floating point and caches the machine code on disk.
 
-Numba's own cache has two problems. First, it checks only the file of the function itself. After an edit to another
-file, with a function that this function calls, it would still use the old machine code. Second, each process reads its
-index file, changes it and writes it back, which is not safe if several processes share a folder.
+A compiled function is called a *kernel*. Numba's own cache has two problems. First, it checks only the file that
+contains the kernel. If a kernel calls a function of another file and this file is edited, numba still uses the old
+machine code. Second, each process reads numba's index file, changes it and writes it back, which is not safe if several
+processes share a folder.
 
 The cache of this module has one file for each kernel and signature. The name of the file is a hash of everything that
-determines the machine code: sources, versions, signature and processor. It does not depend on the location of the
+determines the machine code: sources, versions, signature and processor. The name does not depend on the location of the
 package. After an edit, only the kernels that may use the edited code are compiled again. A second Python environment,
 or a copy of the package in another folder, reuses the existing files. A file is written under a temporary name and
 renamed when it is complete, so any number of processes may share a folder.
@@ -73,7 +74,7 @@ _loaded: list[str] = []
 
 
 class _Linkable(JITCodeLibrary):  # type: ignore[misc]
-    """Code of a kernel that is only inlined into its callers, so that it needs no machine code of its own."""
+    """Code of a kernel that is only inlined into its callers, so numba generates no machine code for it alone."""
 
     def _finalize_final_module(self) -> None:
         self._finalize_dynamic_globals()
@@ -81,11 +82,11 @@ class _Linkable(JITCodeLibrary):  # type: ignore[misc]
 
 
 class Kernel(CPUDispatcher):  # type: ignore[misc]
-    """A compiled function like the result of numba's ``njit``, but with the cache of this module, and compiled faster.
+    """A compiled function, like the result of numba's ``njit``, that uses the cache of this module and compiles faster.
 
     If one compiled function calls another, numba generates machine code and two wrappers for the called function,
-    although the caller already contains its code. Numba also compiles a function again for each integer literal that is
-    passed as an argument. This class avoids both kinds of additional compilation.
+    although the caller already contains the code of the called function. Numba also compiles a function again for each
+    integer literal that is passed as an argument. This class avoids both kinds of unnecessary compilation.
     """
 
     def __init__(self, *given: Any, **options: Any) -> None:
@@ -122,9 +123,10 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         self.add_overload(compiled)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """Return the template with which numba types a call of this kernel from another kernel (numba's own protocol).
+        """Return the template by which numba finds the types of a call of this kernel from another kernel.
 
-        ``args`` and ``kws`` are the numba types of the call's arguments.
+        This method is part of numba's protocol for dispatchers. ``args`` and ``kws`` are the numba types of the
+        positional and keyword arguments of the call.
         """
         if not _KNOWN:
             return super().get_call_template(args, kws)
@@ -136,7 +138,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         return make_concrete_template(self.__name__, self.__name__, signatures), pysig, arguments, {}
 
     def get_overload(self, sig: Any) -> Any:
-        """Return the key under which numba stores the code for the signature ``sig`` (numba's own protocol)."""
+        """Return the key under which numba stores the code for the signature ``sig`` (part of numba's protocol)."""
         return self._linked[tuple(normalize_signature(sig)[0])][1] if _KNOWN else super().get_overload(sig)
 
     def _compile_linked(self, arguments: tuple[Any, ...]) -> Any:
@@ -170,10 +172,10 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
 
         Args:
             way: ``"entry"`` for a kernel called from Python, ``"linked"`` for a kernel called from other kernels.
-            kinds: numba types of the arguments, and for an entry also the type of the result.
-            make: function that compiles the kernel. It returns whether the kernel must not be cached, and the compiled
-                parts, which can be pickled.
-            load: function that makes a kernel from the compiled parts in this process.
+            kinds: numba types of the arguments; if ``way`` is ``"entry"``, also the type of the result.
+            make: function that compiles the kernel and returns two values: True if the kernel must not be cached, and
+                the compiled code as objects that can be pickled.
+            load: function that makes a kernel in this process from the compiled code that ``make`` returned.
 
         """
         name = self._name(way, kinds)
@@ -189,7 +191,10 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         load(*pickle.loads(stored))
 
     def _name(self, way: str, kinds: tuple[Any, ...]) -> str:
-        """Return the cache file name for argument types ``kinds``; empty if the code's sources are not fully known.
+        """Return the cache file name for argument types ``kinds``; empty if the kernel must not be cached.
+
+        A kernel must not be cached if its source files have no valid hash (``digest_of_sources``), or if it is a
+        closure.
 
         ``way`` is ``"entry"`` for a kernel called from Python, ``"linked"`` for a kernel called from other kernels.
         """
@@ -210,18 +215,18 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
 
 
 def _without_c_wrapper(flags: Any) -> Any:
-    """Set numba's compiler ``flags`` to omit the C wrapper, because no C code calls kernels."""
+    """Change numba's compiler ``flags`` so that kernels get no C wrapper, because no C code calls kernels."""
     flags.no_cfunc_wrapper = _KNOWN
     return flags
 
 
 def _symbols(library: Any) -> list[str]:
-    """Return the names under which other kernels call the functions of ``library``, numba's code of one kernel."""
+    """Return the names of the functions in ``library`` (numba's code of one kernel) that other kernels can call."""
     return [function.name for function in library._final_module.functions if function.name.startswith("_ZN7cpython")]
 
 
 def _described(kind: Any) -> str:
-    """Return a text for the numba type ``kind``, with the field names of named tuples, which numba's own text omits."""
+    """Return a text for the numba type ``kind`` with the field names of named tuples, which numba's own text omits."""
     parts = [_described(part) for part in getattr(kind, "types", ())]
     return f"{kind} {getattr(kind, 'fields', '')} {parts}"
 
@@ -246,7 +251,7 @@ def load_kernel(name: str) -> bytes | None:
 
 
 def keep_kernel(name: str, content: bytes) -> None:
-    """Write ``content`` to the cache file ``name`` for ``load_kernel``; warn if this fails (full disk)."""
+    """Write ``content`` to the cache file ``name`` for ``load_kernel``; warn if this fails (for example, disk full)."""
     folder = cache_folder()
     try:
         handle, part = tempfile.mkstemp(dir=folder, prefix=".")
@@ -286,11 +291,11 @@ def _alone(name: str) -> Iterator[None]:
 
 @cache
 def digest_of_sources(source: Path) -> str:
-    """Return a hash of all files that determine the kernels in the file ``source``; empty if the hash is not known.
+    """Return a hash of all files that determine the kernels in the file ``source``; empty if there is no valid hash.
 
-    The hash is not known for code that is not in a file (in an interactive shell). It is also not known for a file that
-    was edited after this process started, because the process may have imported the older version. A file with a date
-    in the future counts as edited, and a warning is given.
+    There is no valid hash for code that is not in a file, such as code typed in an interactive shell. There is also
+    none if one of the files was edited after this process started, because the process may have imported the older
+    version. A file with a date in the future is treated as edited, and the function warns.
     """
     digest = hashlib.sha256()
     for file in kernel_sources(source) if source.is_file() else ():
@@ -308,15 +313,16 @@ def digest_of_sources(source: Path) -> str:
 
 
 def _place_of(file: Path) -> str:
-    """Return the path of ``file`` relative to this package's folder, or its full path if it lies elsewhere."""
+    """Return the path of ``file`` relative to this package's folder, or the full path of a file outside this folder."""
     return file.relative_to(_PACKAGE).as_posix() if file.is_relative_to(_PACKAGE) else str(file)
 
 
 def kernel_sources(source: Path) -> list[Path]:
-    """Return the file ``source`` and all files of this package that its kernels may be compiled from, sorted by name.
+    """Return ``source`` and all other files of this package whose code its kernels may contain, sorted by name.
 
-    The result contains the files with kernels that ``source`` imports, directly or through other files with kernels.
-    It also contains the files from which one of these files imports a constant (a name in capitals).
+    A file with kernels is in the result if ``source`` imports it, directly or through other files with kernels. A file
+    without kernels is in the result if ``source`` or one of these files imports a constant (a name in capitals) from
+    it.
     """
     sources, follow = {source}, [source]
     while follow:
@@ -329,7 +335,7 @@ def kernel_sources(source: Path) -> list[Path]:
 
 @cache
 def _imports(source: Path) -> list[tuple[Path, bool]]:
-    """Return the files with kernels or constants that ``source`` imports, as (file, whether it has kernels)."""
+    """Return the files from which ``source`` imports kernels or constants, as pairs (file, True if it has kernels)."""
     modules = []
     for module, names in _IMPORT.findall(source.read_bytes()):
         for imported, taken in _homes(module.decode(), set(re.findall(r"\w+", names.decode()))):
@@ -340,10 +346,10 @@ def _imports(source: Path) -> list[tuple[Path, bool]]:
 
 
 def _homes(module: str, names: set[str]) -> list[tuple[Path, set[str]]]:
-    """Return the files from which the imported ``names`` come, as (file, names that this file defines).
+    """Return the files that define the imported ``names``, as pairs (file, names that this file defines).
 
-    ``module`` is the dotted name in the import: a module, or a folder whose ``__init__`` imports the names from other
-    modules.
+    ``module`` is the name after ``from`` in the import statement: a module, or a folder whose ``__init__`` imports the
+    names from other modules.
     """
     place = _PACKAGE.joinpath(*module.split(".")[1:])
     if place.with_suffix(".py").is_file():
@@ -366,17 +372,19 @@ def compiled(*, apart: bool = False, within: bool = False, bare: bool = False) -
 def compiled(function: Any = None, *, apart: bool = False, within: bool = False, bare: bool = False) -> Any:
     """Compile a function with numba: no fast-math, no bounds checks, no GIL, cached on disk.
 
-    By default a kernel is inlined into its callers (``forceinline``). A call that is not inlined counts the references
-    to its arrays with atomic operations, which takes more than half as long as the physics itself.
+    By default a compiled function (*kernel*) is inlined into its callers (numba's option ``forceinline``). If a call is
+    not inlined, numba counts the references to its arrays with atomic operations. This counting takes more than half as
+    long as the physics itself.
 
     Args:
-        function: the function, if the decorator is used without arguments.
-        apart: do not inline this kernel. Use this for a large kernel that many kernels contain but rarely call. If such
-            a kernel were inlined, it would be compiled once per caller, which takes minutes instead of seconds.
+        function: the function to compile; None if the decorator is used with arguments.
+        apart: do not inline this kernel. Use this option for a large kernel that many kernels call, but rarely. If such
+            a kernel were inlined, numba would compile it once per caller, which takes minutes instead of seconds.
         within: inline this kernel into the code of its callers before numba compiles them. In contrast to
-            ``forceinline``, this avoids the counting of references in each function that passes an array on.
-        bare: compile without any reference counting. Use this for kernels that neither create nor return arrays. A
-            callee with ``forceinline`` still counts references unless it is also ``bare``.
+            ``forceinline``, this option avoids the counting of references in each function that passes an array on.
+        bare: compile this kernel without any counting of references. Use this option for kernels that neither create
+            nor return arrays. A kernel that is inlined into a bare kernel still counts references unless it is bare,
+            too.
 
     """
     if function is None:
@@ -397,8 +405,9 @@ def by_parts(work: Callable[[slice], Result], n: int, threads: int) -> list[Resu
     """Call ``work`` for contiguous slices of the rows 0 to n - 1; return the results in the order of the slices.
 
     There is one slice per thread. The calling thread works on the first slice, so ``threads=1`` starts no thread. If
-    ``work`` fails on a slice, the other slices are still finished before the error is raised. If several slices fail,
-    the error of the first one is raised. Raises ``InvalidInput`` unless ``threads`` is a whole number of at least 1.
+    ``work`` raises an error for a slice, the function finishes the other slices and then raises this error. If ``work``
+    raises errors for several slices, the function raises the error of the first of these slices. Raises
+    ``InvalidInput`` unless ``threads`` is a whole number of at least 1.
 
     Args:
         work: function that is called with each slice of the rows.

@@ -1,4 +1,4 @@
-"""Leave out and report worlds that the physics cannot advance; the results of the other worlds do not change."""
+"""Leave out worlds that the physics cannot advance, and report them; the results of the other worlds do not change."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ LeftOutRows = tuple[tuple[int, str], ...]  # row of each world that was left out
 
 
 def measured_without_failed(measure: Callable[[Ints], Result], n: int) -> tuple[Result, Ints, LeftOutRows]:
-    """Measure n worlds without failed worlds; return the result, the rows that were measured, and the failed rows.
+    """Call ``measure`` for the worlds that do not fail; return its result, their indices, and the failed worlds.
 
-    The failed rows are returned as pairs (row, reason), in ascending order. The function works like
+    The failed worlds are returned as pairs (index of the world, reason), in ascending order. The function works like
     ``leaving_out_failed``, but raises ``PhysicsError`` if every world fails.
 
     Args:
-        measure: function of rows (indices of worlds, from 0 to n - 1). It raises a ``PhysicsError`` that lists the
-            failed worlds by their position in these rows.
+        measure: function of an array of world indices (from 0 to n - 1). If the physics fails, it must raise a
+            ``PhysicsError`` that lists the failed worlds by their position in this array.
         n: number of worlds.
 
     """
@@ -35,14 +35,15 @@ def measured_without_failed(measure: Callable[[Ints], Result], n: int) -> tuple[
 
 
 def leaving_out_failed(work: Callable[[Ints], Result], rows: Ints) -> tuple[Result | None, Ints, dict[int, str]]:
-    """Call ``work`` for the rows that do not fail; return its result, the rows it used, and {failed row: reason}.
+    """Call ``work`` for the worlds that do not fail; return its result, their indices, and {failed index: reason}.
 
-    ``work`` is repeated without the failed rows until no row fails. This is possible because a world's result does not
-    depend on the other worlds. The result is None if no row is left.
+    ``work`` is repeated without the failed worlds until no world fails. The results of the other worlds stay the same,
+    because the result of a world does not depend on the other worlds. If every world fails, the returned result is
+    None.
 
     Args:
-        work: function of rows of a batch. It raises a ``PhysicsError`` that lists the failed worlds by their position
-            in these rows.
+        work: function of an array of world indices. If the physics fails, it must raise a ``PhysicsError`` that lists
+            the failed worlds by their position in this array.
         rows: indices of the worlds for the first call of ``work``, [k].
 
     """
@@ -87,5 +88,5 @@ class Impacts:
 
     @staticmethod
     def no_obstacle(n: int) -> tuple[Floats, Floats, Ints]:
-        """Return zeros for the three obstacle fields of n worlds: first-impact harm, total harm and count, [n] each."""
+        """Return zeros for the three obstacle fields of n worlds without obstacle, [n] each."""
         return np.zeros(n), np.zeros(n), np.zeros(n, np.int64)

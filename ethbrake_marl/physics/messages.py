@@ -2,14 +2,14 @@
 
 A vehicle samples its state at every decision, starting at the alert. A message contains the sender's newest sample. On
 each link (from one vehicle to another) a message is sent once per period. The link's channel is good or bad
-(Gilbert-Elliott model): after the first message that arrives, a good channel turns bad with probability p per message,
-and a bad channel turns good with probability r. A message sent while the channel is bad is lost. The random numbers
-depend only on the world's key, the link and the message's number. A vehicle measures a neighbour in sight, so it knows
-the neighbour's present state.
+(Gilbert-Elliott model): with each message after the first message that arrives, a good channel turns bad with
+probability p, and a bad channel turns good with probability r. A message sent while the channel is bad is lost. The
+random number that decides whether a message is lost depends only on the world's key (a seed), the link and the number
+of the message. A vehicle measures a neighbour in sight, so it knows the neighbour's present state.
 
-For N vehicles the messages use the following columns of the parameters. They come after the group *news by link*
-(``physics.columns.Columns``). These columns store the state of the channels and what was received, and change during an
-episode. If the period is 0, the world has no periodic messages, and vehicles know the present state.
+The state of the messages is stored in the following columns of a world's parameters, after the group *news by link*
+(``physics.columns.Columns``). The columns contain the state of the channels and what each vehicle has received, so they
+change during an episode. If the period is 0, the world has no periodic messages, and vehicles know the present state.
 
 head    period (s), delay from sending to use (s), p, r, key (a whole number below 2^53), number of samples taken, place
         of the obstacle ahead (m; infinite: none)
@@ -18,11 +18,11 @@ links   N * N times the columns of ``_Link``, ordered by receiver, then sender
 ring    the newest samples in a ring buffer, RING_HEAD + 3 N columns each: time, whether Vehicle 1 has hit the obstacle,
         and places, speeds and commands in force of all vehicles
 
-If the scenario says what a message contains (``v2x: tells``), an entry of the link from Vehicle 1 to itself marks this,
-and each sample also contains the commands chosen at the last decision (*intents*, N columns). In this case three more
-groups of columns exist between *links* and *ring*, even in a world without periodic messages:
+A scenario can say what a message contains (``v2x: tells``). A flag in the columns of the link from Vehicle 1 to itself
+then marks such a world, and each sample also contains the *intents*: the commands of the N vehicles chosen at the last
+decision. Such a world has three more groups of columns between *links* and *ring*, even if it has no periodic messages:
 
-contents    N * CONTENTS: 1 if messages of this vehicle contain this piece of information
+contents    N * CONTENTS: 1 if messages of this vehicle contain this quantity (see ``PIECES``), else 0
 intents     N, present intent of each vehicle (m/s2)
 told        N * N, by receiver, then sender: intent in the newest message received (m/s2)
 """
@@ -60,7 +60,7 @@ CONTENTS = len(PIECES)  # number of columns that say what messages of one vehicl
 
 
 class _Channel(NamedTuple):
-    """Column numbers of the head of the messages: quantities that all links of a world share."""
+    """Column numbers of the group *head*, which contains the quantities that all links of a world share."""
 
     PERIOD: int = 0  # time between two messages of a link (s); 0: the world has no periodic messages
     DELAY: int = 1  # time from sending a message to its use (s)
@@ -114,7 +114,7 @@ def link_at(receiver: int, sender: int, vehicles: int) -> int:
 def contents_at(vehicles: int) -> int:
     """Return the first column of the group *contents*, counted from the first column of the messages.
 
-    If this group does not exist, the ring buffer begins at this column.
+    If the group *contents* does not exist, the result is the first column of the ring buffer.
     """
     return CHANNEL.WIDTH + vehicles + LINK.WIDTH * vehicles * vehicles
 
@@ -123,7 +123,7 @@ def contents_at(vehicles: int) -> int:
 def intent_at(vehicles: int) -> int:
     """Return the first column of the group *intents*, counted from the first column of the messages.
 
-    The group *told* (the intents in the newest messages received) begins N columns later.
+    The group *told* (the intents in the newest messages received) begins N columns after the group *intents*.
     """
     return contents_at(vehicles) + CONTENTS * vehicles
 
@@ -146,18 +146,18 @@ def ring_at(messages: Floats, vehicles: int) -> int:
 
 @compiled
 def sample_width(messages: Floats, vehicles: int) -> int:
-    """Return the number of columns of a sample in the ring buffer."""
+    """Return the number of columns that one sample of all vehicles has in the ring buffer."""
     return RING_HEAD + (4 if has_contents(messages, vehicles) else 3) * vehicles
 
 
 @compiled
 def knows_piece(messages: Floats, vehicles: int, receiver: int, sender: int, piece: int, time: float) -> bool:
-    """Return whether ``receiver`` knows one of ``PIECES`` (such as the mass) of ``sender`` at ``time`` (s).
+    """Return whether ``receiver`` knows the quantity number ``piece`` in ``PIECES`` of ``sender`` at ``time`` (s).
 
-    The function assumes that by this time the first message has arrived, or the sender is in sight. ``messages`` is a
-    row of message columns, or empty. Place, speed and acceleration are measured once the sender is in sight. The intent
-    becomes known only by a message. Every other piece is known, if messages contain it, as soon as a message has
-    arrived or the sender is in sight.
+    The function assumes that by ``time`` the first message has arrived, or the sender is in sight. ``messages`` are the
+    message columns of one world; the array may be empty. The receiver knows the intent (the command chosen at the last
+    decision) only by a message. The receiver knows every other quantity if the sender's messages contain it. It also
+    knows place, speed and acceleration once the sender is in sight, because it measures them.
     """
     if not has_contents(messages, vehicles):
         return piece != INTENT
@@ -171,7 +171,7 @@ def knows_piece(messages: Floats, vehicles: int, receiver: int, sender: int, pie
 
 @compiled
 def knows_line(messages: Floats, vehicles: int, receiver: int, sender: int, time: float) -> bool:
-    """Return whether ``receiver`` knows everything about ``sender`` that a prediction of its motion needs."""
+    """Return whether ``receiver`` knows everything about ``sender`` that it needs to predict the sender's motion."""
     known = True
     for piece in range(INTENT):
         known = known and knows_piece(messages, vehicles, receiver, sender, piece, time)
@@ -187,9 +187,9 @@ def _known_pieces(messages: Floats, time: Floats, vehicles: int, receiver: int, 
 
 
 class Told(NamedTuple):
-    """Newest states of all vehicles, as one vehicle has received them by message or by sight.
+    """Newest state of every vehicle that one vehicle has received by message or by sight.
 
-    Arrays are [n, N] unless stated otherwise, with column j for vehicle j. They are views of the message columns.
+    Arrays are [n, N] unless stated otherwise, with column j for vehicle j. The arrays are views of the message columns.
     """
 
     at_s: Floats  # time at which the state was sampled (s); below 0: nothing received
@@ -209,12 +209,12 @@ class Messages(NamedTuple):
 
     @classmethod
     def of(cls, worlds: Worlds) -> Messages:
-        """Return the messages of ``worlds``, as a view of their columns."""
+        """Return the messages of ``worlds``; the result shares memory with ``worlds.messages``."""
         return cls(worlds.messages, worlds.N)
 
     @staticmethod
     def ring_length(delay_s: float, time_step_s: float) -> int:
-        """Return the number of samples to store: those taken during a message's delay, and some more.
+        """Return the number of samples that the ring buffer must store: those of one message delay, and three more.
 
         ``delay_s``: time from sending a message to its use (s); ``time_step_s``: time between two samples (s).
         """
@@ -230,13 +230,14 @@ class Messages(NamedTuple):
         Args:
             heard_s: time from which vehicle i can use the first message of vehicle j, [n, N, N] s; infinite: never.
             seen_s: time from which vehicle i measures vehicle j, [n, N, N] s; infinite: never.
-            key: seed of the message losses, [n], whole numbers below 2^53.
-            samples: length of the ring buffer, see ``ring_length``.
+            key: seed of the message losses in each world, [n], whole numbers below 2^53.
+            samples: number of samples that the ring buffer stores, see ``ring_length``.
             period_s: time between two messages of a link, s.
             delay_s: time from sending a message to its use, s.
             loss_begins: probability per message that a good channel turns bad.
             loss_ends: probability per message that a bad channel turns good again.
-            contents: whether messages of vehicle j contain each of ``PIECES``, [N, CONTENTS]; None: all except intent.
+            contents: whether messages of vehicle j contain each quantity of ``PIECES``, [N, CONTENTS]; None: all
+                quantities except the intent.
 
         """
         n, N = heard_s.shape[:2]
@@ -256,18 +257,18 @@ class Messages(NamedTuple):
 
     @property
     def links(self) -> Floats:
-        """Columns of every link, [n, N, N, LINK.WIDTH], by world, receiver, sender and entry (``LINK``); a view."""
+        """View of the columns of all links, [n, N, N, LINK.WIDTH]: by world, receiver, sender, column of ``LINK``."""
         N = self.vehicles
         return self.columns[:, link_at(0, 0, N) : contents_at(N)].reshape(-1, N, N, LINK.WIDTH)
 
     @property
     def periodic(self) -> Bools:
-        """Whether vehicles of each world send messages periodically, so that information ages between them, [n]."""
+        """Whether vehicles of each world send messages periodically, so that received information can be old, [n]."""
         return np.asarray((self.columns[:, CHANNEL.PERIOD : CHANNEL.PERIOD + 1] > 0.0).any(axis=1))
 
     @property
     def contents(self) -> Bools:
-        """Whether messages of each vehicle contain each of ``PIECES``, [n, N, CONTENTS]."""
+        """Whether messages of each vehicle contain each quantity of ``PIECES``, [n, N, CONTENTS]."""
         usual = np.array([piece in USUAL_PIECES for piece in PIECES])
         n, N = len(self.columns), self.vehicles
         contents = np.broadcast_to(usual, (n, N, CONTENTS)).copy()
@@ -277,36 +278,36 @@ class Messages(NamedTuple):
 
     @property
     def says_contents(self) -> bool:
-        """Whether the columns contain the group *contents*; this is the same for all worlds of a batch."""
+        """Whether the message columns contain the group *contents*; all worlds of a batch have it, or none."""
         marked: bool = self.columns.shape[1] > 0 and bool((self.links[:, 0, 0, LINK.NUMBER] == 1.0).any())
         return marked
 
     def lacks(self, sender: int, pieces: Sequence[Piece] = USUAL_PIECES) -> tuple[Piece, ...]:
-        """Return the ``pieces`` that the messages of ``sender`` lack in at least one world."""
+        """Return the quantities among ``pieces`` that messages of ``sender`` do not contain in at least one world."""
         always: Bools = np.logical_and.reduce(self.contents[:, sender])
         return tuple(piece for piece in pieces if not always[PIECES.index(piece)])
 
     def withhold_from(self, vehicle: int) -> Bools:
-        """Return whether messages of some vehicle other than ``vehicle`` lack one of ``USUAL_PIECES``, [n]."""
+        """Return whether messages of any vehicle but ``vehicle`` lack a quantity of ``USUAL_PIECES``, [n]."""
         others = np.delete(self.contents, vehicle, axis=1)[:, :, : len(USUAL_PIECES)]
         return np.asarray(~others.all(axis=(1, 2)))
 
     def seen_from_s(self, vehicle: int, other: int) -> Floats:
-        """Return the time from which ``vehicle`` measures ``other``, [n] s; infinite: never, or no message columns."""
+        """Return the time from which ``vehicle`` measures ``other``, [n] s; infinite: never, or without messages."""
         seen = self.links[:, vehicle, other, LINK.SEEN_FROM] if self.columns.shape[1] else None
         return np.full(len(self.columns), np.inf) if seen is None else seen
 
     def known_pieces(self, vehicle: int, time_s: Floats) -> Bools:
-        """Return which of ``PIECES`` the ``vehicle`` knows about each vehicle at ``time_s`` [n], [n, N, CONTENTS].
+        """Return whether ``vehicle`` knows each of ``PIECES`` of each vehicle at ``time_s`` [n], [n, N, CONTENTS].
 
-        The result is valid for vehicles whose first message has arrived by this time or that are in sight.
+        The result is valid for a vehicle whose first message has arrived by ``time_s``, and for a vehicle in sight.
         """
         known = np.empty((len(time_s), self.vehicles, CONTENTS), np.bool_)
         _known_pieces(np.ascontiguousarray(self.columns), time_s, self.vehicles, vehicle, known)
         return known
 
     def intents(self, vehicle: int) -> Floats:
-        """Return the newest intent of each vehicle that ``vehicle`` has received, [n, N] m/s2; 0 if unknown."""
+        """Return each vehicle's newest intent that ``vehicle`` knows, [n, N] m/s2; 0 if ``vehicle`` knows none."""
         n, N = len(self.columns), self.vehicles
         if not self.says_contents:
             return np.zeros((n, N))
@@ -315,7 +316,10 @@ class Messages(NamedTuple):
         return np.where(periodic, self.columns[:, messages : messages + N], self.columns[:, at : at + N])
 
     def with_intents(self, intents_mps2: Floats) -> Floats:
-        """Return the columns with ``intents_mps2`` [n, N] as present intents; unchanged if they have no intents."""
+        """Return a copy of the message columns with the present intents ``intents_mps2`` [n, N].
+
+        If the columns have no group *intents*, the function returns the columns themselves.
+        """
         if not self.says_contents:
             return self.columns
         columns, at = self.columns.copy(), intent_at(self.vehicles)
@@ -323,9 +327,9 @@ class Messages(NamedTuple):
         return columns
 
     def newest_told(self, vehicle: int) -> Told:
-        """Return the newest states of all vehicles that ``vehicle`` (index from 0) has received.
+        """Return the newest state of every vehicle that ``vehicle`` (index from 0) has received.
 
-        All worlds must have columns of messages.
+        All worlds must have message columns.
         """
         own, obstacle = self.columns[:, PLACES_AT + vehicle], self.columns[:, CHANNEL.OBSTACLE_PLACE]
         newest = self.links[:, vehicle]
@@ -335,9 +339,9 @@ class Messages(NamedTuple):
     def age_s(self, time_s: Floats) -> Floats:
         """Return the age at ``time_s`` [n] of the newest state that vehicle i received from vehicle j, [n, N, N] s.
 
-        The age is the time since the state was sampled. The age is infinite if nothing has been received yet. It is 0
-        in worlds without periodic messages, because the present state is known there. Vehicle i may use the state from
-        the time ``Vehicles.known_from_s`` on.
+        The age is the time since the state was sampled. The age is infinite if vehicle i has received nothing from
+        vehicle j yet. The age is 0 in a world without periodic messages, because vehicles know the present state there.
+        Vehicle i may use the state from the time ``Vehicles.known_from_s`` on.
         """
         age, periodic = np.zeros((len(time_s), self.vehicles, self.vehicles)), self.periodic
         if periodic.any():
@@ -357,10 +361,11 @@ def refuse_untold(
     needs: Sequence[Piece] = LOOK_AHEAD,
     senders: Sequence[int] | None = None,
 ) -> None:
-    """Raise ``InvalidInput`` if messages lack a piece of information that ``who``, which controls ``vehicles``, needs.
+    """Raise ``InvalidInput`` if messages lack a quantity that the agent ``who`` needs to control ``vehicles``.
 
-    Vehicles that are controlled together also need each other's messages. ``needs``: the pieces that ``who`` must know.
-    ``senders``: the vehicles whose messages are needed; None: all vehicles.
+    The agent needs messages of every vehicle in ``senders`` (None: of all vehicles), also of vehicles that it controls
+    itself. A single controlled vehicle needs no message of its own. ``needs``: the quantities that these messages must
+    contain. ``who``: name of the agent in the error message.
     """
     messages = Messages.of(worlds)
     for sender in (range(worlds.N) if senders is None else senders) if messages.says_contents else ():
@@ -381,7 +386,7 @@ def chance(key: float, link: int, number: float) -> float:
     Args:
         key: seed of the message losses in this world, a whole number below 2^53.
         link: number of the link, ``receiver * N + sender``.
-        number: number of the message on this link, from 0.
+        number: number of the message on this link, counted from 0.
 
     """
     z = np.uint64(key) ^ (np.uint64(link + 1) * np.uint64(0x9E3779B97F4A7C15))
@@ -400,13 +405,13 @@ def hear_rows(
 ) -> None:  # fmt: skip
     """Advance the messages and the state of every world from its present time to ``until_s``, in place.
 
-    All vehicles are sampled at the next decision, and at multiples of ``time_step_s`` before it. If ``until_s`` lies
-    between two samples, vehicles in sight are also measured at ``until_s``, but this sample is not stored. If the
-    kernel cannot advance a world, the vehicles of this world receive nothing more.
+    The function samples all vehicles at the next decision, and at multiples of ``time_step_s`` before this decision. If
+    ``until_s`` lies between two samples, vehicles in sight are also measured at ``until_s``, but the ring buffer does
+    not keep this sample. If the physics cannot advance a world, the vehicles of this world receive nothing more.
 
     Args:
-        moving: state rows of the worlds, [n, S], in the layout of ``physics.columns``; they are advanced.
-        params: parameter rows of the worlds; their columns of messages are updated.
+        moving: states of the worlds, [n, S], one row per world in the layout of ``physics.columns``; updated.
+        params: parameters of the worlds, one row per world; the message columns are updated.
         wanted: commands of the vehicles until ``until_s``, [n, N] m/s2.
         until_s: end times, [n] s.
         decision_s: time of the next decision, [n] s.
@@ -443,15 +448,15 @@ def hear_rows(
 
 @compiled
 def _start(state: Floats, params: Floats, column: Columns, wanted: Floats) -> None:
-    """Begin the messages of one world at the alert, in the rows ``state`` and ``params``.
+    """Begin the messages of one world at the alert; the function updates ``state`` and ``params``.
 
     The function sets the place of each vehicle along the road, stores the first sample of all states, and lets each
     vehicle measure the vehicles in sight.
 
     Args:
-        state: state row of one world, [S].
-        params: parameter row of the world.
-        column: first column of each group of quantities in the two rows.
+        state: state of the world, [S], in the layout of ``physics.columns``.
+        params: parameters of the world, in the layout of ``physics.columns``.
+        column: first column of each group of quantities in ``state`` and ``params``.
         wanted: commands of the vehicles, [N] m/s2.
 
     """
@@ -473,10 +478,10 @@ def _start(state: Floats, params: Floats, column: Columns, wanted: Floats) -> No
 
 @compiled
 def _choose(params: Floats, column: Columns, wanted: Floats, time: float) -> None:
-    """Write the present intents at ``time`` (s): the commands ``wanted`` that were chosen at the last decision.
+    """Write the intents of all vehicles at ``time`` (s): the commands ``wanted`` that were chosen at the last decision.
 
-    If the channel extends a vehicle's latency, the vehicle does not know of the emergency until the latency has
-    elapsed. Until this time its intent is 0.
+    If the V2X channel extends a vehicle's latency, the vehicle does not know of the emergency until the latency has
+    elapsed. The intent of this vehicle is 0 until its latency has elapsed.
     """
     messages, N = params[column.messages :], column.vehicles
     if not has_contents(messages, N):
@@ -492,20 +497,20 @@ def _move(
     state: Floats, params: Floats, column: Columns, wanted: Floats, end: float, pieces: Floats, table: Floats,
     no_rows: Floats,
 ) -> bool:  # fmt: skip
-    """Advance one world, and the places of its vehicles, to the time ``end``; return whether the kernel succeeded.
+    """Advance one world, and the places of its vehicles, to the time ``end``; return whether this succeeded.
 
-    After a failure, state and places are unchanged.
+    If the physics cannot advance the world, state and places are unchanged.
 
     Args:
-        state: state row of the world, [S]; updated.
-        params: parameter row of the world; the places of its vehicles are updated.
-        column: first column of each group of quantities in the two rows.
+        state: state of the world, [S], in the layout of ``physics.columns``; updated.
+        params: parameters of the world, in the layout of ``physics.columns``; the places of the vehicles are updated.
+        column: first column of each group of quantities in ``state`` and ``params``.
         wanted: commands of the vehicles, [N] m/s2.
         end: time to advance to, s.
         pieces: start (s) and command (m/s2) of the K intervals of a fixed sequence of commands, [N, 2 K]; see
             ``Vehicles.pieces``.
-        table: workspace in the layout of ``physics.rows``, N + 1 columns; overwritten.
-        no_rows: empty array of impacts, [0, LISTED.WIDTH].
+        table: working memory in the layout of ``physics.rows``, with N + 1 columns; overwritten.
+        no_rows: empty array of impacts, [0, LISTED.WIDTH], so that no single impact is recorded.
 
     """
     N, time = column.vehicles, state[column.time]
@@ -547,9 +552,10 @@ def _move(
 
 @compiled
 def _sample(state: Floats, messages: Floats, column: Columns) -> None:
-    """Store a sample of every vehicle's state in the ring buffer; it replaces the oldest sample.
+    """Store a sample of every vehicle's state in the ring buffer, in place of the oldest sample.
 
-    ``state``: state row of one world, [S]; ``messages``: its message columns, updated; ``column``: layout of the state.
+    ``state``: state of one world, [S]; ``messages``: message columns of this world, updated; ``column``: first column
+    of each group of quantities in ``state``.
     """
     N, obstacle = column.vehicles, column.obstacle
     width, first = sample_width(messages, N), ring_at(messages, N)
@@ -567,9 +573,9 @@ def _sample(state: Floats, messages: Floats, column: Columns) -> None:
 
 @compiled
 def _receive(time: float, messages: Floats, N: int) -> None:
-    """Process all messages of one world that may be used from ``time`` (s) or earlier; measure the vehicles in sight.
+    """Receive all messages of one world that may be used at ``time`` (s), and measure the vehicles in sight.
 
-    ``messages``: columns of messages of the world, updated; ``N``: number of vehicles.
+    ``messages``: message columns of the world, updated; ``N``: number of vehicles.
     """
     for i in range(N):
         for j in range(N):
@@ -592,14 +598,15 @@ def _receive(time: float, messages: Floats, N: int) -> None:
 
 @compiled
 def _take(messages: Floats, link: int, sender: int, sent_s: float, N: int) -> int:
-    """Receive one message: copy the sender's newest sample from the ring buffer to the link.
+    """Receive one message: copy the sender's state from the ring buffer to the link's columns.
 
-    The message contains the newest sample taken at ``sent_s`` or earlier. Nothing is copied if the receiver already has
-    a newer sample. Returns the first column of the message's sample; 0 if the ring buffer does not contain it any more.
+    The message contains the newest sample taken at ``sent_s`` or earlier. The function copies nothing if the receiver
+    already has a newer sample. The function returns the first column of the message's sample, or 0 if the ring buffer
+    no longer contains this sample.
 
     Args:
-        messages: columns of messages of one world; updated.
-        link: first column of the link, see ``link_at``.
+        messages: message columns of one world; updated.
+        link: first column of the link from the sender to the receiver, see ``link_at``.
         sender: index of the sending vehicle, from 0.
         sent_s: time at which the message is sent, s.
         N: number of vehicles.

@@ -1,7 +1,7 @@
 """Closed formulas for motion at constant acceleration: time until the next event, gap, stopping distance.
 
-Between events every gap is quadratic in time, so the next event is found exactly and no event is missed. The formulas
-use only + - * / and sqrt, so a world's results have the same bits in any batch.
+Between events every gap is a quadratic function of time, so the formulas give the time of the next event exactly, and
+no event is missed. The formulas use only + - * / and sqrt, so a world's results have the same bits in any batch.
 """
 
 from __future__ import annotations
@@ -33,8 +33,9 @@ ONSET_ROUNDING_S = 1e-9  # a latency that elapses this shortly before the end of
 def has_acted(latency_s: Any, time_s: Any) -> Any:
     """Return whether a command has taken effect before the end of a time interval; accepts numbers and arrays.
 
-    The result is True for a command that takes effect at the start of the interval. It is False for a command that
-    would take effect exactly at the end, because the next decision replaces the command before it acts.
+    The result is True for a command that takes effect at the start of the interval. The result is False for a command
+    that would take effect exactly at the end of the interval, because the next decision replaces this command before it
+    acts.
 
     Args:
         latency_s: time from the start of the interval until the command takes effect, s; may be negative.
@@ -76,7 +77,7 @@ def contact(gap: float, closing: float, pressing: float) -> tuple[float, float]:
 
 @compiled
 def drift(gap: float, closing: float, pressing: float, duration: float) -> float:
-    """Return the gap (m) after the time t at a constant closing acceleration: ``g - (w + b t / 2) t``.
+    """Return the gap (m) of a pair after the time t at a constant closing acceleration: ``g - (w + b t / 2) t``.
 
     Args:
         gap: present gap g, m.
@@ -90,10 +91,10 @@ def drift(gap: float, closing: float, pressing: float, duration: float) -> float
 
 @compiled
 def speed_event(speed: float, acceleration: float, command: float, limit: float) -> tuple[float, float]:
-    """Return the time (s) until the speed next reaches a value at which forces change, and this value (m/s).
+    """Return the time (s) until a vehicle next comes to rest or reaches its speed limit, and its speed then (m/s).
 
-    Forces change at standstill, where brakes hold the vehicle, and at the speed limit of a vehicle that drives. The
-    result is ``(inf, 0)`` if the speed reaches neither standstill nor the limit.
+    At rest the brakes hold the vehicle. The speed limit matters only if the command drives the vehicle. If the vehicle
+    neither comes to rest nor reaches the limit, the result is ``(inf, 0)``.
 
     Args:
         speed: present speed, m/s.
@@ -120,8 +121,8 @@ def speed_event(speed: float, acceleration: float, command: float, limit: float)
 def force_range(speed: float, command: float, limit: float) -> tuple[float, float]:
     """Return a vehicle's own acceleration for motion forward, and its own acceleration for motion backward (m/s2).
 
-    The two values differ if the force can take a range of values: brakes at standstill hold against a push from either
-    side, and a driving vehicle at its speed limit uses only the force that keeps it at this speed.
+    The two accelerations differ in two cases. The brakes of a vehicle at rest act against motion in either direction. A
+    driving vehicle at its speed limit uses only as much force as keeps it at this speed.
 
     Args:
         speed: present speed, m/s.
@@ -145,9 +146,10 @@ def force_range(speed: float, command: float, limit: float) -> tuple[float, floa
 
 @compiled
 def settle(low: float, high: float) -> float:
-    """Return the value nearest to 0 in the range ``[low, high]`` of accelerations that a body's own forces allow, m/s2.
+    """Return the acceleration (m/s2) of a body: the value nearest to 0 in the range ``[low, high]``.
 
-    The body is a vehicle, or several vehicles that move as one.
+    The body is a vehicle, or several vehicles that move as one. ``[low, high]`` is the range of accelerations (m/s2)
+    that the body's own forces allow.
     """
     if low > 0.0:
         return low
@@ -160,10 +162,10 @@ def settle(low: float, high: float) -> float:
 def solo_motion(
     speed: float, command: float, onset: float, limit: float, duration: float
 ) -> tuple[float, float, float]:
-    """Move a vehicle without contact; return its final speed (m/s), its distance (m) and its acceleration (m/s2).
+    """Move a vehicle without contact; return its final speed (m/s), distance travelled (m) and acceleration (m/s2).
 
-    The vehicle coasts until ``onset``, and then brakes to standstill or drives up to the limit. The acceleration is NaN
-    if it was not constant.
+    The vehicle coasts until ``onset``. It then brakes until it is at rest, or drives up to the speed limit. If the
+    acceleration changes during the motion, the returned acceleration is NaN.
 
     Args:
         speed: present speed, m/s, at least 0.
@@ -196,9 +198,10 @@ def solo_motion(
 
 @compiled
 def stopping_distance(speed: float, latency_left: float, capacity: float) -> float:
-    """Return the distance (m) to rest under full braking after the remaining latency: ``v tau + v^2 / (2 a)``.
+    """Return the distance (m) until a vehicle is at rest: ``v tau`` in the remaining latency plus ``v^2 / (2 a)``.
 
-    The distance is 0 if the vehicle does not move forward.
+    The vehicle coasts during the remaining latency and then brakes fully. If it does not move forward, the distance is
+    0.
 
     Args:
         speed: present speed v, m/s.
@@ -212,10 +215,12 @@ def stopping_distance(speed: float, latency_left: float, capacity: float) -> flo
 
 @compiled
 def ramped_stopping_distance(speed: float, latency_left: float, capacity: float, rate: float) -> float:
-    """Return the distance (m) to rest under full braking with brakes that build up from 0 at a constant rate.
+    """Return the distance (m) until a vehicle is at rest under full braking, if its brakes build up from 0.
 
-    The distance is ``v tau + v a / (2 r) - a^3 / (24 r^2) + v^2 / (2 a)``. If the vehicle stops before its brakes reach
-    full force, ``v < a^2 / (2 r)``, the distance is ``v tau + (2 / 3) v sqrt(2 v / r)``.
+    After the remaining latency, the brakes build up at a constant rate. The distance is
+    ``v tau + v a / (2 r) - a^3 / (24 r^2) + v^2 / (2 a)``. If ``v < a^2 / (2 r)``, the vehicle stops before its brakes
+    reach full force, and the distance is ``v tau + (2 / 3) v sqrt(2 v / r)``. If the vehicle does not move forward, the
+    distance is 0.
 
     Args:
         speed: present speed v, m/s.
@@ -235,7 +240,9 @@ def ramped_stopping_distance(speed: float, latency_left: float, capacity: float,
 
 @compiled
 def stopping_distances(speed: Floats, latency_left: Floats, capacity: Floats, rate: Floats) -> Floats:
-    """Return the distance to rest under full braking of n vehicles, [n] m; see ``ramped_stopping_distance``.
+    """Return the distance until each of n vehicles is at rest under full braking, [n] m.
+
+    The distance of each vehicle is computed by ``ramped_stopping_distance``.
 
     Args:
         speed: present speeds, [n] m/s.

@@ -5,27 +5,28 @@ With the sampling period h, one step of a vehicle with command u, from sample n 
     x(n + 1) = x(n) + h f(n) + h^2 / 2 u(n)
     v(n + 1) = f(n) + h u(n)
 
-where f(n) is the vehicle's speed after the impacts of sample n. If at a sample the gap of a pair is at most 0 and
-closes, the pair exchanges velocity by the paper's eq. (13). In the paper, f3 is the impact of Vehicles 2 and 3, and f1
-the impact of Vehicles 1 and 2. For Vehicle 2, f is f1 applied after f3: first the rear impact, then the front impact
-with the changed speed. The speed of the other vehicle of each pair changes at the same time.
+where f(n) is the vehicle's speed after the impacts of sample n. If at a sample the gap of a pair is at most 0 and its
+closing speed is above 0, the speeds of the pair change by the paper's eq. (13). In the paper, f3 is the impact of
+Vehicles 2 and 3, and f1 the impact of Vehicles 1 and 2. For Vehicle 2, f is f1 applied after f3: first the impact with
+Vehicle 3, then the impact with Vehicle 1, with the speed that the first impact has changed. Each impact changes the
+speeds of both its vehicles.
 
 The paper leaves some points open. This map resolves them as follows:
 
-* f1 uses the state that f3 has changed, so the front impact has the changed closing speed. Its harm is the square of
-  this speed. The paper's formula of J_harm uses the speeds before both impacts, which makes a difference only if both
-  pairs have an impact at the same sample.
-* The paper's formulas of f1 and f3 also act on overlapping vehicles that are separating, and would pull them together
-  again. The text below eq. (13) requires a positive relative velocity. This map therefore exchanges velocities and
-  counts harm only if the relative velocity is positive.
+* f1 uses the state that f3 has changed. The closing speed of the front impact, and its harm (the square of this closing
+  speed), therefore depend on f3. The paper's formula of J_harm uses the speeds before both impacts. This makes a
+  difference only if both pairs have an impact at the same sample.
+* The paper's formulas of f1 and f3 also change the speeds of overlapping vehicles that are separating, and would pull
+  these vehicles together again. The paper's text below eq. (13) requires a positive relative velocity (closing speed).
+  This map therefore changes speeds and counts harm only if the relative velocity is positive.
 * Samples are at ``tau_2 + n h``, where tau_2 is the latency of Vehicle 2. Before its first sample a world moves
-  exactly, and no impact is detected, because the paper assumes that none happens before.
-* The command of a step is the command in force at its first sample (zero-order hold). If the latency of a vehicle ends
-  between two samples, its command takes effect at the later sample.
+  exactly, and no impact is detected, because the paper assumes that no impact happens before this sample.
+* The command of a step is the command in force at the sample that begins the step (zero-order hold). If the latency of
+  a vehicle ends between two samples, its command takes effect at the later sample.
 * In the paper ``0 <= v <= v_max`` is a constraint on u and not part of the map. This map limits the command of every
   vehicle so that the vehicle's speed satisfies the constraint at the next sample. An impact can leave a negative speed.
-  Setting it to 0 would violate conservation of momentum, so the map does not change the negative speed, and the brakes
-  bring it back to 0.
+  Setting a negative speed to 0 would violate conservation of momentum. The map therefore keeps the negative speed, and
+  the brakes bring it back to 0.
 
 The paper defines the map for N = 3. For any N, this map resolves each pair once per sample, from the rear pair to the
 front pair. A gap is negative while the vehicles of the pair overlap; nothing pushes the vehicles apart. Source: the
@@ -57,7 +58,7 @@ _ON_SAMPLE = 1e-6  # part of a step: times this close count as one sample, becau
 def exchange(
     front_mps: float, rear_mps: float, front_t: float, rear_t: float, restitution: float
 ) -> tuple[float, float]:
-    """Return the speeds of a pair (front, rear) after its impact, by the paper's eq. (13), in m/s.
+    """Return the speeds (m/s) of the front and the rear vehicle of a pair after its impact, by the paper's eq. (13).
 
     With the closing speed w = v_{i+1} - v_i: ``v_i+ = v_i + m_{i+1} (1 + e) w / (m_i + m_{i+1})`` and ``v_{i+1}+ =
     v_{i+1} - m_i (1 + e) w / (m_i + m_{i+1})``.
@@ -67,7 +68,7 @@ def exchange(
         rear_mps: speed v_{i+1} of the rear vehicle, m/s.
         front_t: mass m_i of the front vehicle, t.
         rear_t: mass m_{i+1} of the rear vehicle, t.
-        restitution: coefficient of restitution e.
+        restitution: coefficient of restitution e, in [0, 1].
 
     """
     impulse = (1.0 + restitution) * (rear_mps - front_mps) / (front_t + rear_t)
@@ -81,16 +82,16 @@ def exchange_at_sample(
 ) -> None:  # fmt: skip
     """Apply the impacts of world ``k`` at a sample, from the rear pair to the front pair, and add their harm.
 
-    Harm is computed as in ``advance``: it is the squared closing speed just before the impact, and an impact with a
-    closing speed of at most ``TOUCH_SPEED_MPS`` is a touch without harm.
+    As in ``advance``, the harm of an impact is the squared closing speed just before it. Contact with a closing speed
+    of at most ``TOUCH_SPEED_MPS`` is a touch, which does no harm.
 
     Args:
-        k: row of the world in all arrays.
+        k: index of the world in all arrays.
         gaps: gaps of all pairs, [n, P] m.
         speeds: speeds of all vehicles, [n, N] m/s; updated.
         mass: masses of all vehicles, [n, N] t.
         restitution: coefficient of restitution of this world.
-        hit: whether a pair has had an impact, [n, P]; updated.
+        hit: whether each pair has had an impact, [n, P]; updated.
         first_harm: first-impact harm, [n, P] m2/s2; updated.
         total_harm: harm of all impacts, [n, P] m2/s2; updated.
         count: number of impacts, [n, P]; updated.
@@ -117,9 +118,9 @@ def exchange_at_sample(
 def held_motion(speed: float, command: float, limit: float, step: float) -> tuple[float, float]:
     """Return speed (m/s) and distance (m) after a step of constant command: ``v + h u`` and ``h v + h^2 u / 2``.
 
-    First, the command u is limited so that the speed does not go beyond standstill or the speed limit. The distance is
-    computed as h times the mean of the speeds at the start and the end of the step, which is the same for constant u.
-    Brakes act against the motion.
+    The command u is first limited so that the speed does not go beyond 0 or the speed limit within the step. The
+    distance is computed as h times the mean of the speeds at the start and the end of the step. For constant u this is
+    equal to the formula above. Brakes act against the motion, so they also bring a negative speed back to 0.
 
     Args:
         speed: speed v at the start, m/s; may be negative after an impact.
@@ -153,10 +154,10 @@ def held_speeds(speeds: Floats, command: Floats, limit: Floats, step: float) -> 
 def move_to_grid(
     k: int, duration: float, time: float, gaps: Floats, speeds: Floats, command: Floats, latency: Floats, limit: Floats
 ) -> None:
-    """Move world ``k`` exactly and without impacts, at a time before its first sample. Updates ``gaps`` and ``speeds``.
+    """Move world ``k`` exactly and without impacts, at a time before its first sample.
 
     Args:
-        k: row of the world in all arrays.
+        k: index of the world in all arrays.
         duration: length of the motion, s.
         time: present time, s.
         gaps: gaps of all pairs, [n, P] m; updated.
@@ -183,11 +184,12 @@ def sample_worlds(
 ) -> None:  # fmt: skip
     """Advance every world in place by the paper's fixed-step map, from sample ``first`` to sample ``last``.
 
-    Sample 0 is at the latency of Vehicle 2. Arguments that are not listed are fields of ``Worlds`` and ``Vehicles``
-    under short names; ``gaps``, ``speeds``, ``time`` and ``hit`` are updated.
+    Sample 0 is at the time at which the latency of Vehicle 2 has elapsed. Arguments that are not listed are fields of
+    ``Worlds`` and ``Vehicles`` under short names, for example ``gaps`` for ``gaps_m``. The function updates ``gaps``,
+    ``speeds``, ``time`` and ``hit``.
 
     - ``command``: commands, [n, N] m/s2.
-    - ``until``: end times, [n] s; used only in a world that ends before sample 0.
+    - ``until``: end times, [n] s; used only for a world whose end time is before sample 0.
     - ``step``: sampling period, s.
     - ``first``: number of the sample at which each world starts, [n]; -1 if it starts before sample 0.
     - ``last``: number of the sample at which each world ends, [n]; -1 if it ends before sample 0.
@@ -222,24 +224,24 @@ def advance_sampled(
 ) -> tuple[Worlds, Impacts]:
     """Advance ``worlds`` by the paper's fixed-step map under constant commands; return new worlds and impacts.
 
-    The first sample is at the latency of Vehicle 2; samples are ``step_s`` apart. A world ends at its first sample at
-    or after ``until_s``, or at ``until_s`` itself if this is before its first sample. Impacts of the last sample are
-    left to the next call, so that the result can be passed to this function again. The returned state is the paper's
-    s(n), the state before the impacts of the last sample. ``Impacts.rows`` is None. The result of a world does not
-    depend on the other worlds. Inputs are not changed.
+    The first sample is at the time at which the latency of Vehicle 2 has elapsed; samples are ``step_s`` apart. A world
+    ends at the first of its samples at or after ``until_s``, or at ``until_s`` itself if this is before the first
+    sample. The returned state is the paper's s(n), the state before the impacts of the last sample. The next call
+    applies these impacts, so the result can be passed to this function again. ``Impacts.rows`` is None. The result of a
+    world does not depend on the other worlds.
 
-    Gaps of the result may be negative. Worlds with negative gaps must be advanced with this function and not with
-    ``advance``.
+    Gaps of the result may be negative. Advance worlds with negative gaps with this function and not with ``advance``.
 
     Args:
-        worlds: n worlds of N vehicles.
-        command_mps2: commanded accelerations, [n, N] m/s2; a command has no effect before the vehicle's latency.
-        until_s: absolute end time, one number or [n], s.
+        worlds: n worlds of N vehicles; they are not changed.
+        command_mps2: commanded accelerations, [n, N] m/s2; a command has no effect before the vehicle's latency has
+            elapsed.
+        until_s: end time since the alert, one number or [n], s.
         step_s: sampling period h, s.
 
-    Raises ``InvalidInput`` for a command beyond a vehicle's capacity, an end before a world's time, a step below 1e-6
-    s, a world whose time is between two samples, negative speeds before the first sample, brakes that build up, a
-    vehicle that follows a fixed sequence of commands, or an obstacle ahead.
+    Raises ``InvalidInput`` for a command beyond a vehicle's capacity, an ``until_s`` before the present time of a
+    world, a ``step_s`` below 1e-6 s, a world whose present time is between two samples, negative speeds before the
+    first sample, brakes that build up, a vehicle that follows a fixed sequence of commands, or an obstacle ahead.
 
     """
     if worlds.obstacle_ahead.any():
@@ -267,7 +269,7 @@ def sample_on(worlds: Worlds, command: Floats, until: Floats, step_s: float) -> 
     Args:
         worlds: n worlds of N vehicles; updated.
         command: commanded accelerations, [n, N] m/s2.
-        until: absolute end times, [n] s.
+        until: end times since the alert, [n] s.
         step_s: sampling period, s.
 
     """
@@ -286,7 +288,7 @@ def sample_on(worlds: Worlds, command: Floats, until: Floats, step_s: float) -> 
 
 
 def _refuse_unsampled(worlds: Worlds, until: Floats, step_s: float) -> None:
-    """Raise ``InvalidInput`` for a step length, an end time or a state that the fixed-step map does not cover.
+    """Raise ``InvalidInput`` for a sampling period, an end time or a state that the fixed-step map does not allow.
 
     ``until``: end times, [n] s; ``step_s``: sampling period, s.
     """

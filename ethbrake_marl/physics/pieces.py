@@ -1,7 +1,7 @@
-"""Braking profiles: after its latency, a vehicle follows a fixed sequence of commands (*brakes in pieces*).
+"""Braking profiles: after its latency, a vehicle follows a fixed sequence of commands (it *brakes in pieces*).
 
-A *piece* is a time interval in which the command of this vehicle is constant. Worlds with such vehicles are advanced by
-the kernels for brakes that build up (``physics.build_up``); the rates of build-up may be infinite.
+A *piece* is a time interval in which the command of such a vehicle is constant. The functions for brakes that build up
+(``physics.build_up``) advance worlds with such vehicles, even if all brakes act at once.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from ethbrake_marl.physics.state import Floats
 def begin_piece(table: Floats, i: int, now: float) -> None:
     """Set the command of vehicle ``i`` to the command of its piece (interval of constant command) at the time ``now``.
 
-    The function also writes the time at which the vehicle's next piece begins (row NEXT_PIECE). Times are in seconds
-    from the start of the segment. ``table``: one world in the layout of ``physics.rows``.
+    The function also writes the time at which the vehicle's next piece begins into the table (row NEXT_PIECE). Both
+    times are in seconds from the start of the segment. ``table``: one world in the layout of ``physics.rows``.
     """
     count = (table.shape[0] - ROW.PIECES) // 2
     table[ROW.NEXT_PIECE, i] = math.inf
@@ -48,7 +48,7 @@ def pieces_to_come(table: Floats) -> bool:
 def force_at(table: Floats, i: int, command: float, latency_s: float, time_s: float) -> float:
     """Return the force (m/s2) of a vehicle at the end of a segment.
 
-    The force is the acceleration by brakes or engine; before the latency has elapsed the command counts as 0.
+    The force is the acceleration by brakes or engine. Until the latency has elapsed, 0 replaces the command.
 
     Args:
         table: the world at the end of the segment, in the layout of ``physics.rows``.
@@ -67,15 +67,16 @@ def force_at(table: Floats, i: int, command: float, latency_s: float, time_s: fl
 
 @compiled
 def force_now(force: float, wanted: float, brake_rate: float, release_rate: float) -> float:
-    """Return the force (m/s2) just after a command takes effect; it equals the command if the force can jump.
+    """Return a vehicle's force (m/s2) just after a command takes effect.
 
-    The force is the acceleration by brakes or engine. The force jumps only if its rate of change is infinite.
+    The force is the acceleration by brakes or engine. If its rate of change towards the command is infinite, the result
+    is the command. If this rate is finite, the force is unchanged.
 
     Args:
         force: force just before the command takes effect, m/s2.
-        wanted: the command, m/s2.
-        brake_rate: rate at which the force falls, m/s3.
-        release_rate: rate at which the force rises, m/s3.
+        wanted: command, m/s2; negative brakes.
+        brake_rate: rate at which the force falls to a lower command, m/s3; may be infinite.
+        release_rate: rate at which the force rises to a higher command, m/s3; may be infinite.
 
     """
     return wanted if math.isinf(brake_rate if wanted < force else release_rate) else force

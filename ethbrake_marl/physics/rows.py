@@ -1,7 +1,8 @@
-"""The table of one world on which the compiled kernels work: a row per quantity, a column per vehicle or pair.
+"""The table of one world on which the compiled functions work: a row per quantity, a column per vehicle or pair.
 
 The constants of ``ROW`` name the rows: ``table[ROW.SPEED, i]`` is the speed of vehicle i. In a row for pairs, column p
-is the pair (vehicle p, vehicle p + 1). An obstacle ahead is treated as a vehicle in column 0.
+belongs to the pair (vehicle p, vehicle p + 1). An obstacle ahead is the vehicle in column 0; vehicle i then is in
+column i + 1.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from ethbrake_marl.physics.state import Floats, Ints
 
 
 class _Rows(NamedTuple):
-    """Row numbers of the table of one world: quantities of its vehicles, its pairs and its pooled blocks.
+    """Row numbers of the table of one world: quantities of its vehicles, its pairs and its *blocks*.
 
     A *block* consists of touching vehicles that get one common speed or acceleration. The *force* of a vehicle is the
     acceleration that its brakes or engine alone would cause.
@@ -92,7 +93,7 @@ ROW = _Rows()
 
 
 class _Flags(NamedTuple):
-    """Status codes of a world after a kernel has advanced it."""
+    """Status codes of one world after its motion: an impact, the end of the segment, or a failure."""
 
     IMPACT: int = 0  # a round of impacts was resolved; the segment goes on
     DONE: int = 1  # the end of the segment is reached
@@ -104,8 +105,8 @@ class _Flags(NamedTuple):
 
         Args:
             status: status of each world, [n].
-            from_s: start of each world's segment, [n] s, for the message.
-            until_s: end of each world's segment, [n] s, for the message.
+            from_s: start of each world's segment, [n] s, for the error message.
+            until_s: end of each world's segment, [n] s, for the error message.
 
         """
         reasons = {
@@ -141,7 +142,7 @@ LISTED = _Listed()
 
 @compiled(bare=True)
 def builds_up(table: Floats) -> bool:
-    """Return whether some vehicle's brakes build up (finite rate) or follow a fixed sequence of commands.
+    """Return whether the brakes of some vehicle build up at a finite rate or follow a fixed sequence of commands.
 
     ``table``: one world in the layout of ``_Rows``.
     """
@@ -150,9 +151,10 @@ def builds_up(table: Floats) -> bool:
 
 @compiled
 def rows_for(pieces: int) -> int:
-    """Return the number of rows of a table for vehicles that follow K pieces each; ``pieces`` is 2 K.
+    """Return the number of rows of a table for vehicles that follow K commands, one after the other.
 
-    A piece is a time interval of constant command. If ``pieces`` is 0, the result is ROW.OF_BUILD_UP.
+    ``pieces`` is 2 K, the number of starts and commands. If ``pieces`` is 0, no vehicle follows a fixed sequence of
+    commands, and the result is ROW.OF_BUILD_UP.
     """
     return ROW.PIECES + pieces if pieces > 0 else ROW.OF_BUILD_UP
 
@@ -161,14 +163,14 @@ def rows_for(pieces: int) -> int:
 def place_rates(table: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats) -> None:
     """Write brake rates, release rates and sequences of commands of one world's vehicles into its table.
 
-    A piece is one interval of a fixed sequence of commands. If all rates are infinite and no vehicle follows a fixed
-    sequence of commands, the entry BUILDS_UP is set to 0, and forces are not used.
+    If all rates are infinite and no vehicle follows a fixed sequence of commands, the function sets the entry BUILDS_UP
+    to 0, and the rows of forces are not used. In all other cases, the function sets BUILDS_UP to 1.
 
     Args:
         table: table to fill, [rows_for(2 K), N or N + 1]; with N + 1 columns, column 0 is an obstacle.
-        brake_rate: rate at which each vehicle's force falls, [N] m/s3; infinite if it changes at once.
-        release_rate: rate at which each vehicle's force rises, [N] m/s3; infinite if it changes at once.
-        pieces: start (s) and command (m/s2) of each piece, [N, 2 K], as in ``Vehicles.pieces``.
+        brake_rate: rate at which each vehicle's force falls, [N] m/s3; infinite if the force falls at once.
+        release_rate: rate at which each vehicle's force rises, [N] m/s3; infinite if the force rises at once.
+        pieces: starts (s) and commands (m/s2) of each vehicle's K commands, [N, 2 K], as in ``Vehicles.pieces``.
 
     """
     at, least = table.shape[1] - brake_rate.shape[0], math.inf
@@ -192,7 +194,7 @@ def place_forces(
     """Write brake and release rates, sequences of commands and present forces of one world's vehicles into its table.
 
     ``force``: present acceleration by brakes or engine, [N] m/s2. The other arguments are the same as in
-    ``place_rates``. Forces are written only if the entry BUILDS_UP of the table is 1.
+    ``place_rates``. If ``place_rates`` sets the entry BUILDS_UP to 0, the function writes no forces.
     """
     place_rates(table, brake_rate, release_rate, pieces)
     if table[ROW.BUILDS_UP, 0] == 1.0:
@@ -202,10 +204,10 @@ def place_forces(
 
 @compiled
 def place_obstacle(table: Floats, gap: float, hit: float) -> None:
-    """Write an obstacle into column 0 of a new table; its speed and command stay 0.
+    """Write an obstacle into column 0 of a new table; speed and command of the obstacle stay 0.
 
     Args:
-        table: table to fill.
+        table: table of one world to fill, in the layout of ``physics.rows``.
         gap: gap from the obstacle to Vehicle 1, m.
         hit: 1 if Vehicle 1 has already had an impact with the obstacle, else 0.
 

@@ -1,4 +1,4 @@
-"""Compiled kernels that advance one world through a segment (an interval of constant commands), from event to event."""
+"""Compiled motion of one world through a segment (an interval of constant commands), from event to event."""
 
 from __future__ import annotations
 
@@ -26,16 +26,18 @@ def advance_table(
 ) -> tuple[int, int]:
     """Advance one world through a segment; return the number of recorded impacts and a status (DONE if successful).
 
-    The harm of the segment is written to the rows FIRST_HARM, TOTAL_HARM and COUNT.
+    The function writes the harm of the segment to the rows FIRST_HARM and TOTAL_HARM, and the number of impacts to row
+    COUNT.
 
     Args:
         table: the world in the layout of ``physics.rows``; it is advanced.
         restitution: coefficient of restitution of every impact.
         duration: length of the segment, s.
-        start_s: absolute time at the start of the segment, s, for ``rows``.
-        world: index of the world; selects the entries of ``rows``.
-        rows: array of impacts, [capacity, LISTED.WIDTH]; impacts beyond its capacity are only counted.
-        recorded: number of impacts before this segment.
+        start_s: absolute time at the start of the segment, s; used to write the times of impacts into ``rows``.
+        world: index of the world, written into ``rows``.
+        rows: array to which the impacts are written, [capacity, LISTED.WIDTH]; if it is full, further impacts are only
+            counted.
+        recorded: number of impacts that were recorded before this segment.
 
     """
     if builds_up(table):
@@ -62,9 +64,10 @@ def _advance(
     table: Floats, restitution: float, duration: float, start_s: float, world: int, rows: Floats, recorded: int,
     building: bool,
 ) -> tuple[int, int]:  # fmt: skip
-    """Do the work of ``advance_table`` for brakes that act at once or build up; arguments and result are the same.
+    """Do the work of ``advance_table`` for brakes that act at once or build up, with the same arguments and result.
 
-    Callers pass ``building`` (whether brakes build up) as a constant, so only the code for this case is compiled.
+    The argument ``building`` says whether brakes build up. Callers pass a constant, so numba compiles only the code for
+    the value that they pass.
     """
     for p in range(table.shape[1] - 1):
         table[ROW.FIRST_HARM, p] = 0.0
@@ -87,13 +90,14 @@ def move_apart(table: Floats, duration: float, building: bool) -> bool:
     """Move a world to the end of the segment and return True, or return False if two vehicles may touch.
 
     If the result is False, the world has not moved. If both vehicles of a pair have constant accelerations, the time of
-    their contact is computed exactly. Otherwise the function uses a bound: without contact speeds are monotone within a
-    segment of length T, so a gap shrinks by at most ``(max rear speed - min front speed) T``.
+    their contact is computed exactly. In other cases the function uses a bound. Without contact, the speed of a vehicle
+    only rises or only falls within a segment of length T. A gap therefore shrinks by at most
+    ``(max rear speed - min front speed) T``.
 
     Args:
         table: the world in the layout of ``physics.rows``.
         duration: length T of the segment, s.
-        building: whether brakes build up, see ``builds_up``.
+        building: result of ``builds_up``: whether brakes build up or follow a fixed sequence of commands.
 
     """
     if building:
@@ -131,7 +135,7 @@ def start_events(table: Floats, building: bool) -> None:
 
     Args:
         table: the world in the layout of ``physics.rows``.
-        building: whether brakes build up, see ``builds_up``.
+        building: result of ``builds_up``: whether brakes build up or follow a fixed sequence of commands.
 
     """
     for i in range(table.shape[1]):
@@ -145,15 +149,15 @@ def start_events(table: Floats, building: bool) -> None:
 def to_next_impact(table: Floats, restitution: float, now: float, duration: float, building: bool) -> tuple[int, float]:
     """Move a world to its next impacts and resolve them, or move it to the end of the segment.
 
-    Returns a status and the time reached (s). The status is IMPACT (call the function again), DONE, or the code of the
-    check that failed.
+    Returns a status code of ``FLAG`` and the time reached (s, from the start of the segment). The status is IMPACT if
+    impacts were resolved (then call the function again), DONE at the end of the segment, or the code of a failure.
 
     Args:
         table: the world in the layout of ``physics.rows``; it is advanced.
         restitution: coefficient of restitution of every impact.
         now: present time, counted from the start of the segment, s.
         duration: length of the segment, s.
-        building: whether brakes build up, see ``builds_up``.
+        building: result of ``builds_up``: whether brakes build up or follow a fixed sequence of commands.
 
     """
     for _ in range(BOUND.MOST_EVENTS):
@@ -169,15 +173,16 @@ def to_next_impact(table: Floats, restitution: float, now: float, duration: floa
 
 @compiled(bare=True)
 def to_next_event(table: Floats, now: float, duration: float, building: bool) -> tuple[bool, float]:
-    """Move a world to its next event or the end of the segment; return whether it succeeded, and the time reached (s).
+    """Move a world to its next event or the end of the segment; return whether this succeeded, and the new time (s).
 
-    The first result is False if a gap became negative, which means that a contact was missed.
+    The first result is False if a gap became negative, which means that a contact was missed. The time is counted from
+    the start of the segment.
 
     Args:
         table: the world in the layout of ``physics.rows``; it is advanced.
         now: present time, counted from the start of the segment, s.
         duration: length of the segment, s.
-        building: whether brakes build up, see ``builds_up``.
+        building: result of ``builds_up``: whether brakes build up or follow a fixed sequence of commands.
 
     """
     if building and not built_up(table):
@@ -197,13 +202,14 @@ def to_next_event(table: Floats, now: float, duration: float, building: bool) ->
 def begin_commands(table: Floats, now: float, passed: float, building: bool) -> None:
     """Put into effect the commands that begin between ``now`` and ``now + passed``.
 
-    The function does the same for the next command of each vehicle that follows a fixed sequence of commands.
+    If a vehicle follows a fixed sequence of commands, and its next command begins in this interval, the function puts
+    this command into effect.
 
     Args:
         table: the world in the layout of ``physics.rows``.
-        now: time counted from the start of the segment, s.
+        now: start of the interval, counted from the start of the segment, s.
         passed: length of the interval, s.
-        building: whether brakes build up, see ``builds_up``.
+        building: result of ``builds_up``: whether brakes build up or follow a fixed sequence of commands.
 
     """
     for i in range(table.shape[1]):

@@ -10,7 +10,7 @@ L    learners
 F    features of an observation
 ===  =========================================================
 
-Worlds store gaps and speeds. Absolute positions would lose precision as the line moves on.
+Worlds store gaps and not absolute positions, because positions would lose precision as the line moves on.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def as_road_allows(quantities: Mapping[str, Floats], friction: Floats) -> dict[s
     """Return a copy of ``quantities`` with braking and driving capacities limited to ``friction * GRAVITY_MPS2``.
 
     ``quantities`` maps field names such as ``braking_capacity_mps2`` to arrays; ``friction`` broadcasts to their shape.
-    All other entries are unchanged.
+    Entries other than capacities are unchanged.
     """
     most = friction * GRAVITY_MPS2
     return {key: np.minimum(value, most) if key in _ON_ROADS else value for key, value in quantities.items()}
@@ -52,7 +52,7 @@ def as_road_allows(quantities: Mapping[str, Floats], friction: Floats) -> dict[s
 
 @dataclass(frozen=True, slots=True)
 class Vehicles:
-    """Parameters of the vehicles: everything that does not change during an episode."""
+    """Parameters of the vehicles of ``n`` worlds; the parameters do not change during an episode."""
 
     braking_capacity_mps2: Floats  # [n, N] largest deceleration, > 0
     driving_capacity_mps2: Floats  # [n, N] largest forward acceleration, >= 0
@@ -78,7 +78,7 @@ class Vehicles:
         return f"Vehicles({count_of(n, 'world')} of {N}, masses {_span(self.mass_t)} t)"
 
     def take(self, rows: ArrayLike) -> Vehicles:
-        """Return a copy of the vehicles in the worlds selected by ``rows`` (indices or a mask [n])."""
+        """Return a copy of the parameters of the worlds that ``rows`` selects (indices, or a mask [n])."""
         index = np.asarray(rows)
         return _combined(lambda column: np.ascontiguousarray(column[index]), self)
 
@@ -96,11 +96,11 @@ class Vehicles:
         pieces: Floats | None = None,
         harm_weight: Floats | None = None,
     ) -> Vehicles:
-        """Return parameters of vehicles without a V2X channel: each vehicle knows everything from its own latency on.
+        """Return parameters of vehicles without a V2X channel: each knows everything once its latency has elapsed.
 
-        Arguments are arrays as in the fields of this class: capacities, latency, mass (t) and speed limit are [n, N],
-        ``restitution`` is [n], rates are [n, N]. If a rate is None, commands take full effect at once. If ``pieces`` is
-        None, no vehicle follows a fixed sequence of commands. If ``harm_weight`` is None, every weight of harm is 1.
+        Shapes and units are as in the fields of this class. If a rate is None, the acceleration reaches a new command
+        at once. If ``pieces`` is None, no vehicle follows a fixed sequence of commands. If ``harm_weight`` is None,
+        every weight of harm is 1.
         """
         known = cls.known_at_once(latency_s)
         at_once = np.full(mass_t.shape, np.inf)
@@ -116,8 +116,8 @@ class Vehicles:
     def known_at_once(latency_s: Floats) -> Floats:
         """Return the field ``known_from_s`` [n, N, N] of vehicles without a V2X channel, from their latencies [n, N] s.
 
-        Vehicle i acts on news of every vehicle from its own latency on. The result is a read-only view of
-        ``latency_s``; its last axis has stride 0, so it takes no memory.
+        Without a channel vehicle i acts on news of every vehicle once its own latency has elapsed. The result is a
+        read-only view of ``latency_s``; the last axis has stride 0, so the result takes no memory of its own.
         """
         latency = np.ascontiguousarray(latency_s, np.float64)
         (n, N), size = latency.shape, latency.itemsize
@@ -137,13 +137,12 @@ class Vehicles:
         return np.asarray(np.isfinite(self.pieces).any(axis=(1, 2)))
 
     def piece_commands(self, command_mps2: Floats, time_s: Floats) -> Floats:
-        """Return the commands of all vehicles, [n, N] m/s2; vehicles with a braking profile get its present command.
+        """Return the commands of all vehicles at ``time_s``, [n, N] m/s2, with the commands of their braking profiles.
 
-        A piece is a time interval of constant command.
+        A vehicle that follows a braking profile (a fixed sequence of commands) gets the profile's command of this time.
 
         Args:
-            command_mps2: commands of all vehicles, [n, N] m/s2; returned unchanged for vehicles without a braking
-                profile.
+            command_mps2: commands of all vehicles, [n, N] m/s2; used for vehicles without a braking profile.
             time_s: absolute time in each world, [n] s.
 
         """
@@ -157,9 +156,9 @@ class Vehicles:
     def hide_from(self, vehicle: int) -> Bools:
         """Return whether a channel hides part of the line from ``vehicle`` (index from 0) at its first decision, [n].
 
-        The channel hides something if information about another vehicle has not arrived yet. It also hides something if
-        the channel delays another vehicle beyond that vehicle's own latency, because messages contain only the own
-        latency. If there is no channel, nothing is hidden.
+        The channel hides something if information about another vehicle has not arrived yet. The channel also hides
+        something if it extends the latency of another vehicle, because messages report that vehicle's latency without
+        the extension. If there is no channel, the result is False.
         """
         late = self.latency_s > self.own_latency_s
         hidden = (self.known_from_s[:, vehicle] > self.latency_s[:, [vehicle]]) | late
@@ -168,7 +167,7 @@ class Vehicles:
 
     @property
     def is_known_at_once(self) -> bool:
-        """Whether every vehicle knows everything from its own latency on, as without a V2X channel."""
+        """Whether every vehicle knows everything once its own latency has elapsed, as without a V2X channel."""
         if self._is_view:
             return True
         own, latency = self.own_latency_s, self.latency_s
@@ -228,26 +227,26 @@ class Worlds:
         return int(self.speeds_mps.shape[1])
 
     def _each(self, change: Callable[..., NDArray[Any]], *others: Worlds) -> Worlds:
-        """Return new worlds whose fields are ``change(field of self, field of others[0], ...)``.
+        """Return new worlds with ``change`` applied to each field: ``change(field of self, field of others[0], ...)``.
 
-        ``change`` takes one array per batch and returns one array: it selects or joins rows.
+        ``change`` is called with one array per batch of worlds. It returns one array, with selected or joined rows.
         """
         parts = (self, *others)
         columns = (change(*(getattr(w, name) for w in parts)) for name in _OF_WORLDS)
         return Worlds(_combined(change, *(w.vehicles for w in parts)), *columns)
 
     def copy(self) -> Worlds:
-        """Return a copy in new memory; ``vehicles`` are shared, because they do not change."""
+        """Return a copy of the state in new memory; the copy shares ``vehicles``, which do not change."""
         return Worlds(self.vehicles, *(getattr(self, name).copy() for name in _OF_WORLDS))
 
     def take(self, rows: ArrayLike) -> Worlds:
-        """Return a copy of the worlds selected by ``rows`` (indices or a mask [n])."""
+        """Return a copy of the worlds that ``rows`` selects (indices, or a mask [n])."""
         index = np.asarray(rows)
         return self._each(lambda column: np.ascontiguousarray(column[index]))
 
     @staticmethod
     def concatenate(parts: Sequence[Worlds]) -> Worlds:
-        """Join the batches ``parts``, all with the same number of vehicles, into one batch, in this order."""
+        """Join the batches ``parts`` into one batch, in this order; all must have the same number of vehicles."""
         parts = _alike(parts)
         return parts[0]._each(lambda *columns: np.concatenate(columns), *parts[1:])
 
@@ -271,7 +270,7 @@ class Worlds:
         command_mps2: ArrayLike = 0.0,
         pair_hit: ArrayLike = False,
     ) -> Worlds:
-        """Return these worlds with another state at a later time, for example from another simulator.
+        """Return these worlds with a new state at a later time, for example a state from another simulator.
 
         >>> import ethbrake_marl as eb
         >>> alert = eb.load_scenario("paper-random").sample(2, seed=7).worlds
@@ -306,7 +305,7 @@ class Worlds:
         """Return these worlds on a road with this ``friction`` [n]; capacities are at most ``friction * GRAVITY_MPS2``.
 
         ``dry``: new capacities on a dry road, a dictionary from field name to [n, N] m/s2, for example
-        ``{"braking_capacity_mps2": array}``. The other capacities on a dry road do not change.
+        ``{"braking_capacity_mps2": array}``. Capacities on a dry road that ``dry`` does not contain stay as they are.
         """
         on_dry = {name: self.dry(name) for name in _ON_ROADS} | dict(dry or {})
         vehicles = replace(self.vehicles, **as_road_allows(on_dry, friction[:, np.newaxis]))
@@ -320,7 +319,7 @@ class Worlds:
         return self.road[:, 0] if self.road.shape[1] else np.full(self.n, np.inf)
 
     def dry(self, name: str) -> Floats:
-        """Return the field ``name`` of ``vehicles``, [n, N]; for a capacity, return its value on a dry road."""
+        """Return the field ``name`` of ``vehicles``, [n, N]; for a capacity, return the capacity on a dry road."""
         value: Floats = getattr(self.vehicles, name)
         if self.road.shape[1] and name in _ON_ROADS:
             begin = 1 + self.N * _ON_ROADS.index(name)
@@ -328,11 +327,12 @@ class Worlds:
         return value
 
     def play_pieces(self, pieces: Mapping[int, Sequence[tuple[float, float]]]) -> Worlds:
-        """Return these worlds, in which some vehicles follow a braking profile, that is, a fixed sequence of commands.
+        """Return these worlds with the vehicles in ``pieces`` following a braking profile.
 
-        ``pieces`` maps a vehicle (index from 0) to its profile, a sequence of pairs (start, deceleration). The start of
-        an interval is in s after the vehicle's latency, and 0 for the first interval; the deceleration is in m/s2. A
-        vehicle whose profile has a single interval is treated as a vehicle without a profile.
+        A braking profile is a fixed sequence of commands. ``pieces`` maps a vehicle (index from 0) to a sequence of
+        pairs (start, deceleration), one for each command. The start is in s after the vehicle's latency; the first
+        start is 0. The deceleration is in m/s2. If the sequence of a vehicle has a single pair, the vehicle gets no
+        profile.
         """
         several = {i: np.array(each, np.float64) for i, each in pieces.items() if len(each) > 1}
         if not several and not self.vehicles.pieces.shape[2]:
@@ -346,8 +346,8 @@ class Worlds:
     def refuse_build_up(self, who: str) -> None:
         """Raise ``InvalidInput`` if some vehicle has a finite brake or release rate, or follows a braking profile.
 
-        Callers use this check if their results are not exact in such worlds. ``who``: name of the caller in the
-        message.
+        Functions whose results are not exact in such worlds call this check. ``who``: name of the calling function in
+        the error message.
         """
         slow = self.vehicles.build_up
         if self.vehicles.in_pieces.any():
@@ -362,10 +362,10 @@ class Worlds:
             )
 
     def first_decision_s(self, deciders: Sequence[int]) -> Floats:
-        """Return the time of the first decision, [n] s: the least latency of the ``deciders``, at least ``time_s``.
+        """Return the time of the first decision, [n] s: the least latency of ``deciders``, or ``time_s`` if later.
 
-        ``deciders`` are the indices (from 0) of the vehicles that choose their commands. Without deciders the result is
-        ``time_s``.
+        ``deciders`` are the indices (from 0) of the vehicles that choose their commands. If ``deciders`` is empty, the
+        result is ``time_s``.
         """
         if len(deciders) == 0:
             return self.time_s.copy()
@@ -415,13 +415,13 @@ class Worlds:
         )
 
     def with_post_ahead(self, duration_s: Floats) -> Worlds:
-        """Return these worlds with an obstacle in each; added obstacles are out of reach for ``duration_s`` [n].
+        """Return these worlds with an obstacle added where there is none, out of reach for ``duration_s`` [n].
 
-        The gap to an added obstacle shows how far Vehicle 1 travels, which worlds do not store. An added obstacle
-        changes no motion, because it is farther away than ``T sqrt(2 E / m_1)``. This is the distance that Vehicle 1,
-        of mass m_1, would travel in the duration T if it had all the energy E that the line can ever have. Impacts and
-        brakes only remove energy. A vehicle of mass m that drives at the speed v with the acceleration a adds at most
-        the energy ``m a v`` per second, and only up to the speed limit.
+        The change of the gap to an added obstacle is the distance that Vehicle 1 travels, which worlds do not store. An
+        added obstacle changes no motion, because its gap is larger than ``T sqrt(2 E / m_1)``. This is the distance
+        that Vehicle 1, of mass m_1, would travel in the duration T if it had all the energy E that the line can have
+        within T. Impacts and brakes only remove energy. A vehicle of mass m that drives at the speed v with the
+        acceleration a adds at most the energy ``m a v`` per second, and only up to the speed limit.
         """
         vehicles = self.vehicles
         driving = vehicles.driving_capacity_mps2 * vehicles.speed_limit_mps * duration_s[:, np.newaxis]
@@ -431,10 +431,10 @@ class Worlds:
 
 
 def _alike(parts: Sequence[Worlds]) -> Sequence[Worlds]:
-    """Return the batches ``parts`` with equal numbers of columns, so that they can be joined.
+    """Return the batches ``parts`` with arrays of equal width, so that they can be joined.
 
-    All batches get columns for equally long fixed sequences of commands (``Vehicles.pieces``). If the friction of the
-    road is modelled in some batches, the other batches get infinite friction.
+    In all batches the array ``Vehicles.pieces`` (fixed sequences of commands) gets the width of the widest. If some
+    batches model the friction of the road, the other batches get infinite friction.
     """
     most = max(part.vehicles.pieces.shape[2] for part in parts)
     if any(part.vehicles.pieces.shape[2] < most for part in parts):
@@ -447,9 +447,10 @@ def _alike(parts: Sequence[Worlds]) -> Sequence[Worlds]:
 
 
 def _padded(pieces: Floats, most: int) -> Floats:
-    """Return ``pieces`` [n, N, 2 K] with added empty pieces (infinite entries), [n, N, most].
+    """Return ``pieces`` [n, N, 2 K] with infinite entries added, so that the result is [n, N, most].
 
-    ``most`` is even: each piece has a start and a command.
+    A piece is a time interval of constant command; its two entries are the start and the command. Infinite entries mean
+    that there is no such piece. ``most`` is even.
     """
     n, N, width = pieces.shape
     halves = pieces.reshape(n, N, 2, width // 2)
@@ -468,7 +469,7 @@ def _unwritable(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def _span(values: Floats) -> str:
-    """Format the smallest and the largest value; only one number if they are equal; ``none`` if there are no values."""
+    """Format the smallest and the largest value; one number if they are equal, ``none`` if there are no values."""
     if not values.size:
         return "none"
     low, high = float(values.min()), float(values.max())
@@ -476,10 +477,11 @@ def _span(values: Floats) -> str:
 
 
 def _combined(change: Callable[..., NDArray[Any]], *parts: Vehicles) -> Vehicles:
-    """Return new vehicles whose fields are ``change(field of the first part, field of the second part, ...)``.
+    """Return new vehicles with ``change`` applied to each field: ``change(field of parts[0], field of parts[1], ...)``.
 
-    ``change`` takes one array per part and returns one array: it selects or joins rows. If no part has a channel,
-    ``latency_s``, ``own_latency_s`` and ``known_from_s`` share one memory in the result, as in ``at_once``.
+    ``change`` is called with one array per entry of ``parts``. It returns one array, with selected or joined rows. If
+    no entry of ``parts`` has a V2X channel, ``latency_s``, ``own_latency_s`` and ``known_from_s`` of the result share
+    memory, as in ``at_once``.
     """
     at_once = all(part._is_view for part in parts)
     columns = [
@@ -502,8 +504,9 @@ def sum_rows(values: Floats) -> Floats:
 def real_numbers(value: ArrayLike) -> Floats:
     """Return ``value`` as float64, without a copy if it is a float64 array already.
 
-    Raises ``ValueError``, with the reason as its text, for a value that is not numeric. This includes values that numpy
-    would convert: booleans, masked entries, texts, and tensors that need gradients or are on another device.
+    Raises ``ValueError``, with the reason as its text, for a value that is not numeric. The function also refuses some
+    values that numpy would convert: booleans, masked entries, texts, and tensors that need gradients or are on another
+    device.
     """
     if type(value) is np.ndarray and value.dtype.kind in "fiu":
         return np.asarray(value, np.float64)
@@ -531,7 +534,7 @@ def real_numbers(value: ArrayLike) -> Floats:
 
 
 def checked_numbers(name: str, value: ArrayLike) -> Floats:
-    """Return ``value`` as a float64 array; raise ``InvalidInput`` with ``name`` and the value if it is not numeric."""
+    """Return ``value`` as a float64 array; if it is not numeric, raise ``InvalidInput`` with ``name`` and the value."""
     try:
         return real_numbers(value)
     except ValueError as error:
@@ -554,7 +557,7 @@ def make_worlds(
     friction: ArrayLike | None = None,
     harm_weight: ArrayLike = 1.0,
 ) -> Worlds:
-    """Build and check worlds at ``t = 0``; every parameter is broadcast to its full shape.
+    """Build and check worlds at ``t = 0``; every argument is broadcast to its full shape.
 
     Args:
         gaps_m: gaps, bumper to bumper, [n, P], [P] or one number, m.
@@ -570,10 +573,10 @@ def make_worlds(
         release_rate_mps3: rate at which a vehicle's acceleration rises to a higher command, m/s3, broadcast to [n, N];
             inf: the acceleration rises at once.
         obstacle_gap_m: gap from Vehicle 1 to an obstacle ahead, m, broadcast to [n]; None: no obstacle.
-        friction: friction coefficient of the road, broadcast to [n]; it limits capacities to
+        friction: friction coefficient of the road, broadcast to [n]; braking and driving capacities are at most
             ``friction * GRAVITY_MPS2``. None: no limit.
-        harm_weight: weight of each vehicle's harm in the objective ``preference``, at least 0, and at least
-            ``LEAST_WEIGHT`` for one vehicle, broadcast to [n, N].
+        harm_weight: weight of each vehicle's harm in the objective ``preference``, at least 0, broadcast to [n, N]; in
+            each world the weight of one vehicle or more must be at least ``LEAST_WEIGHT``.
 
     Raises ``InvalidInput``, with the field, its first invalid entry and the valid range, for an invalid value.
 
@@ -637,13 +640,13 @@ def _full(
     """Return a new array with ``value`` broadcast to ``shape``; raise ``InvalidInput`` for an entry out of range.
 
     Args:
-        name: name of the field, for the message.
-        value: number or array.
+        name: name of the field, for the error message.
+        value: number or array to broadcast.
         shape: shape of the result.
         low: smallest valid entry.
         high: largest valid entry.
-        open_low: whether ``low`` itself is invalid.
-        finite: whether infinite entries are invalid.
+        open_low: True if an entry equal to ``low`` is invalid.
+        finite: True if an infinite entry is invalid.
 
     """
     numbers = checked_numbers(name, value)

@@ -23,14 +23,15 @@ _CAPACITY = 64
 def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) -> int:
     """Write the state at the start of each interval of constant jerk into ``rows``; return the number of intervals.
 
-    The state consists of time, gaps, speeds, accelerations and jerks. Intervals that do not fit into ``rows`` are only
-    counted. The number is negative if a contact was missed.
+    The state consists of time, gaps, speeds, accelerations and jerks. If ``rows`` is full, further intervals are only
+    counted. If a contact was missed, the returned number is negative.
 
     Args:
-        table: one world in the layout of ``physics.rows``; it is advanced.
+        table: one world in the layout of ``physics.rows``; updated.
         restitution: coefficient of restitution of every impact.
         duration: length of the segment, s.
-        rows: result, [capacity, 1 + P + 3 N].
+        rows: result, one row per interval, [capacity, 1 + P + 3 N]: time (s), gaps (m), speeds (m/s), accelerations
+            (m/s2) and jerks (m/s3).
 
     """
     vehicles, building = table.shape[1], builds_up(table)
@@ -69,9 +70,9 @@ def segment_pieces(worlds: Worlds, command_mps2: Floats, until_s: Floats) -> lis
         command_mps2: commanded accelerations, [n, N] m/s2.
         until_s: end of each segment, [n] s.
 
-    Returns one array [k, 1 + N + 3 N] per world, with a row per interval. The columns are: absolute time at which the
-    interval begins (s), distance that Vehicle 1 has travelled since the segment began (m), N - 1 gaps (m), N speeds
-    (m/s), N accelerations (m/s2) and N jerks (m/s3).
+    Returns one array [k, 1 + N + 3 N] per world, with one row per interval of constant jerk. The columns are: absolute
+    time at which the interval begins (s), distance that Vehicle 1 has travelled since the segment began (m), N - 1 gaps
+    (m), N speeds (m/s), N accelerations (m/s2) and N jerks (m/s3).
 
     """
     v, N, durations = worlds.vehicles, worlds.N, until_s - worlds.time_s
