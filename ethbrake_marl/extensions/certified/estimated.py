@@ -2,18 +2,19 @@
 
 A vehicle is *known* if its message has arrived or it is in sight. The estimate combines these sources:
 
-* From a known vehicle: its capacities, mass and own latency, and the newest state that was received from it. The state
-is extrapolated to the present: the vehicle follows its script from the time of the state on if a command was in force
-then, otherwise it coasts until the time at which it is expected to react. * For a vehicle that is not known: the
-scenario. Each quantity is the median of its distribution, or a chosen value of
+* A known vehicle: its capacities, mass and own latency, and the newest state that was received from it. The estimate
+  extrapolates this state to the present. If a command was in force at the time of the state, the vehicle is assumed to
+  follow its script from this time on. If not, the vehicle is assumed to coast until the time at which it is expected to
+  react.
+* The scenario, for a vehicle that is not known. Each quantity is the median of its distribution, or a chosen value of
   its range. The vehicle is assumed to follow its script from the alert on.
-* For a known vehicle whose messages lack some quantity (``v2x: tells``): the scenario, for this quantity only. A
-received place is used only together with the speed, and a received command only together with both. A received intent
-(announced command) is not used, because the script already predicts what the vehicle does. * From the vehicle itself:
-measurements of its own state, its distance since the alert, and its impacts with known
+* The scenario, for each quantity that the messages of a known vehicle lack (``v2x: tells``). A received place is used
+  only if the speed was received, too. A received command is used only if place and speed were received, too. A received
+  intent (announced command) is not used, because the script already predicts what the vehicle does.
+* The estimating vehicle itself: measurements of its own state, its distance since the alert, and its impacts with known
   neighbours.
 
-The estimate reads nothing else of the true world, so information that was not received cannot change it.
+The estimate reads nothing else of the true world, so information that was not received cannot change the estimate.
 """
 
 from __future__ import annotations
@@ -162,8 +163,9 @@ class Ranges:
         """Return the ranges that ``scenario`` declares for all vehicles, for the estimates of the vehicle with index
         ``vehicle``.
 
-        ``others`` are the scripts of the other vehicles by index; None: the scripts of the scenario. Raises
-        ``InvalidInput`` for a mixture of scenarios, because an unknown vehicle could belong to any of them.
+        ``others`` has the scripts of the other vehicles; the keys are vehicle indices. If ``others`` is None, the
+        scripts of the scenario are used. Raises ``InvalidInput`` for a mixture of scenarios, because an unknown vehicle
+        could belong to any of them.
         """
         if scenario.members:
             names = ", ".join(member.name for member in scenario.members)

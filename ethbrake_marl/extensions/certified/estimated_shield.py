@@ -79,7 +79,7 @@ class EstimatedShield:
         robust: worlds in which actions are certified. None: the world with the median of every unknown quantity.
             ``corners``: also all corners of the ranges; more than ``MOST_CORNERS`` corners raise ``InvalidInput``.
             ``interior``: all worlds of the box between the corners, certified only once, at the first decision.
-        others: scripts of the other vehicles by index; None: the scripts of the scenario.
+        others: scripts of the other vehicles; the keys are vehicle indices. None: the scripts of the scenario.
 
     """
 

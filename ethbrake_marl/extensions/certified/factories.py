@@ -23,7 +23,7 @@ def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings
 
     Args:
         policy: the agent to shield.
-        argument: ``corners``, ``interior``, or None for ``corners``.
+        argument: which worlds of the box to certify: ``corners`` or ``interior``; None means ``corners``.
         settings: scenario, uncertainty and harm count; the agent's spec appears in error messages.
 
     """
@@ -43,8 +43,9 @@ def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: 
 
     Args:
         policy: the agent to shield.
-        argument: ``corners``, ``interior``, or None for ``corners``.
-        settings: scenario and harm count; the agent's spec appears in error messages.
+        argument: which worlds of the box to certify: ``corners`` or ``interior``; None means ``corners``.
+        settings: settings of the agent: its scenario, its harm count, and its spec (the text that asked for the agent)
+            for error messages.
 
     """
     where = f"agent {settings.spec!r}"
@@ -62,7 +63,8 @@ def shield_steps_as_estimated(policy: Driver, argument: str | None, settings: Ag
     Args:
         policy: the agent to shield.
         argument: not used.
-        settings: scenario and harm count; the agent's spec appears in error messages.
+        settings: settings of the agent: its scenario, its harm count, and its spec (the text that asked for the agent)
+            for error messages.
 
     """
     scenario = settings.needed_scenario()

@@ -85,8 +85,9 @@ class RobustOptions(ShieldOptions):
     ) -> Any:
         """Return a new shield for ``vehicle``, before any episode.
 
-        ``vehicle`` is an index, or several indices for modes that shield several vehicles. ``others`` are the scripts
-        of the other vehicles by index; None: the scripts of the scenario.
+        ``vehicle`` is an index, or several indices for modes that shield several vehicles. ``others`` has the scripts
+        of the other vehicles; the keys are vehicle indices. If ``others`` is None, the scripts of the scenario are
+        used.
         """
         if self.estimated:
             assert isinstance(vehicle, int)

@@ -102,10 +102,12 @@ def keep_rough(cell: Cell, path: Path, worst: float, out: Floats) -> float:
     The rough bound (``rough_harm``) uses only the largest speeds that are still possible.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
-        worst: largest harm recorded so far, m2/s2.
-        out: [W] receives the affine form of the harm if this harm is the largest so far.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
+        worst: largest harm recorded before this call, m2/s2.
+        out: array [W]; if the function records a new largest harm, it writes this harm here as an affine form (centre,
+            slopes, remainder).
 
     """
     return keep_with(np.zeros(cell.speed.shape[1]), rough_harm(cell, path, -1), worst, out)
@@ -121,14 +123,18 @@ def branch(
     path on the stack. If that path cannot be simulated, a rough bound (``rough_harm``) is recorded instead.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
-        stack: paths that still have to be simulated; the function adds new paths.
-        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
+        stack: paths (sets of worlds with the same impacts so far) that still have to be simulated; the function may add
+            paths.
+        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
+            ``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        how: closing speed and time of the contact (from ``approach``).
-        worst: largest harm recorded so far, m2/s2.
-        out: [W] receives the affine form of the harm if this harm is the largest so far.
+        how: closing speed and time of the contact of pair ``p``, as ``approach`` returns them.
+        worst: largest harm recorded before this call, m2/s2.
+        out: array [W]; if the function records a new largest harm, it writes this harm here as an affine form (centre,
+            slopes, remainder).
 
     """
     P = cell.gap.shape[0]
@@ -180,13 +186,15 @@ def closing_after(cell: Cell, path: Path, motion: Motion, p: int, speed: Floats,
     cannot have contact.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
-        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
+        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
+            ``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         speed: closing speed at the impact of pair ``p`` as an affine form [W], m/s.
         time: time of the impact of pair ``p`` as an affine form [W], s after the start of the piece.
-        length: length of the piece, s.
+        length: duration of the piece (time interval of constant command), s.
 
     """
     N, other = cell.speed.shape[0], 1 - p
@@ -217,12 +225,15 @@ def strike(
     (``thrown_back``).
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
-        stack: paths that still have to be simulated; the function adds new paths.
-        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
+        stack: paths (sets of worlds with the same impacts so far) that still have to be simulated; the function may add
+            paths.
+        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
+            ``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        how: closing speed and time of the contact (from ``approach``).
+        how: closing speed and time of the contact of pair ``p``, as ``approach`` returns them.
         speed: closing speed at the impact as an affine form [W] (centre, slopes, remainder), m/s.
         harm: harm including this impact as an affine form [W], m2/s2.
 
@@ -298,11 +309,13 @@ def may_only_touch(cell: Cell, path: Path, motion: Motion, p: int, how: Approach
     This is possible only if a command changes or an acceleration builds up.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
-        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
+        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
+            ``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        how: closing speed and time of the contact (from ``approach``).
+        how: closing speed and time of the contact of pair ``p``, as ``approach`` returns them.
 
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
@@ -329,10 +342,11 @@ def may_turn(cell: Cell, motion: Motion, p: int, piece: int) -> bool:
     The front vehicle's acceleration may fall, or the rear vehicle's acceleration may rise.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
+            ``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        piece: index of the piece, 0 to J - 1.
+        piece: index of the piece (time interval of constant command), from 0 to J - 1.
 
     """
     return may_move(cell, motion, p, piece, 0) or may_move(cell, motion, p + 1, piece, 1)
@@ -343,10 +357,11 @@ def may_move(cell: Cell, motion: Motion, i: int, piece: int, which: int) -> bool
     """Return whether brake build-up may lower (``which`` 0) or raise (``which`` 1) an acceleration within a piece.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
+            ``move_alone``).
         i: index of the vehicle.
-        piece: index of the piece, 0 to J - 1.
+        piece: index of the piece (time interval of constant command), from 0 to J - 1.
         which: 0 or 1.
 
     """
@@ -364,12 +379,15 @@ def touch_only(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, len
     stack covers the worlds in which this happens. Returns False if the stack is full.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
-        stack: paths that still have to be simulated; the function adds new paths.
-        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
+        stack: paths (sets of worlds with the same impacts so far) that still have to be simulated; the function may add
+            paths.
+        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
+            ``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        length: length of the piece, s.
+        length: duration of the piece (time interval of constant command), s.
 
     """
     size = stack.size[0]
@@ -398,11 +416,13 @@ def thrown_back(cell: Cell, path: Path, motion: Motion, p: int, how: Approach, s
     motion cannot lead to an impact.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
-        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
+        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
+            ``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        how: closing speed and time of the contact (from ``approach``).
+        how: closing speed and time of the contact of pair ``p``, as ``approach`` returns them.
         speed: closing speed at the impact as an affine form [W] (centre, slopes, remainder), m/s.
 
     """
@@ -424,9 +444,9 @@ def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float
     the search then stopped early.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        stack: working memory for paths (each a set of worlds with the same impacts).
-        motion: working memory for the motion of each vehicle.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        stack: memory that the search overwrites; it stores the paths (sets of worlds with the same impacts so far).
+        motion: memory that the function overwrites; it stores the motion of each vehicle in the present piece.
         out: [W] receives the affine form of the largest harm, whose largest value is the bound.
         most: harm above which the search stops, m2/s2.
 
@@ -460,13 +480,15 @@ def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, o
     The function records the harm of the path, and of each path that branches off and needs no further simulation.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece; changed in
-            place.
-        stack: paths that still have to be simulated; the function adds new paths.
-        motion: working memory for the motion of each vehicle.
-        worst: largest harm recorded so far, m2/s2.
-        out: [W] receives the affine form of the harm if this harm is the largest so far.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command); the function updates this state in place.
+        stack: paths (sets of worlds with the same impacts so far) that still have to be simulated; the function may add
+            paths.
+        motion: memory that the function overwrites; it stores the motion of each vehicle in the present piece.
+        worst: largest harm recorded before this call, m2/s2.
+        out: array [W]; if the function records a new largest harm, it writes this harm here as an affine form (centre,
+            slopes, remainder).
 
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
@@ -498,9 +520,11 @@ def may_meet_unseen(cell: Cell, path: Path, motion: Motion) -> bool:
     The vehicles of such a pair must separate before they can have an impact.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
-        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
+        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
+            ``move_alone``).
 
     """
     P = cell.gap.shape[0]
@@ -520,13 +544,16 @@ def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out
     stack (``branch``). Returns the largest recorded harm, m2/s2.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece; changed in
-            place.
-        stack: paths that still have to be simulated; the function adds new paths.
-        motion: motion of each vehicle in the present piece; changed in place.
-        worst: largest harm recorded so far, m2/s2.
-        out: [W] receives the affine form of the harm if this harm is the largest so far.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command); the function updates this state in place.
+        stack: paths (sets of worlds with the same impacts so far) that still have to be simulated; the function may add
+            paths.
+        motion: motion of each vehicle in the present piece (time interval of constant command); the function changes it
+            in place.
+        worst: largest harm recorded before this call, m2/s2.
+        out: array [W]; if the function records a new largest harm, it writes this harm here as an affine form (centre,
+            slopes, remainder).
 
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
@@ -577,10 +604,11 @@ def go_on(cell: Cell, path: Path, motion: Motion) -> bool:
     an impact in this piece.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece; changed in
-            place.
-        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command); the function updates this state in place.
+        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
+            ``move_alone``).
 
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]

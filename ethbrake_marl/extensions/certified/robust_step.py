@@ -38,7 +38,7 @@ class RobustShield(StepShield):
             ``begin``.
         robust: worlds to certify: ``corners`` or ``interior``.
         harm_count: impacts that count: ``first`` (first impact of each pair) or ``total`` (every impact).
-        others: scripts of the other vehicles by index; None: the scripts of the scenario.
+        others: scripts of the other vehicles; the keys are vehicle indices. None: the scripts of the scenario.
         settings: further keyword arguments of ``StepShield``.
 
     Raises ``InvalidInput`` in three cases: where ``StepShield`` raises it, if an uncertainty is combined with several

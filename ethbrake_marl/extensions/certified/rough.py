@@ -48,8 +48,9 @@ def rough_harm(cell: Cell, path: Path, hit: int) -> float:
     The bound uses only the largest speeds that the vehicles can still reach.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
         hit: index of a further pair that is treated as if it had already had its impact already; -1: only the pairs
             marked in the path.
 
@@ -72,7 +73,7 @@ def rough_rest(cell: Cell, own: Floats, backwards: float, since: float, path: Pa
     """Return an upper bound (m2/s2) on the sum of squared closing speeds of all first impacts that are still to come.
 
     Args:
-        cell: a box of uncertain worlds, as affine forms.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
         own: [N] largest speed that each vehicle can reach without an impact, m/s.
         backwards: largest backward speed of any vehicle now, m/s.
         since: present time, s after the first decision.

@@ -66,7 +66,7 @@ def pressing_together(motion: Motion, p: int) -> tuple[float, float]:
     """Return the smallest and the largest closing acceleration (m/s2) of pair ``p`` if the commands of both vehicles
     act.
 
-    ``motion`` is the motion of all vehicles in the present piece (time interval of constant command).
+    ``motion`` has the motion of all vehicles in the present piece (time interval of constant command).
     """
     vague = motion.vague[p] + motion.vague[p + 1]
     least = low(motion.pull[p + 1]) - high(motion.pull[p]) - vague
@@ -112,7 +112,7 @@ def stray(cell: Cell, touch: Floats, p: int) -> float:
     faster.)
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
         touch: [TOUCH_WIDTH] state of the pair in contact, a row of ``Path.touch``.
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
 
@@ -126,8 +126,9 @@ def blur(cell: Cell, path: Path, p: int, side: int) -> float:
     of mass.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         side: 0 for the front vehicle of the pair, 1 for the rear one.
 
@@ -154,12 +155,13 @@ def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float)
     vehicles as one body, or as two if they separate.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece; changed in
-            place.
-        motion: motion of each vehicle in the present piece; changed in place.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command); the function updates this state in place.
+        motion: motion of each vehicle in the present piece (time interval of constant command); the function changes it
+            in place.
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        length: length of the piece, s.
+        length: duration of the piece (time interval of constant command), s.
 
     """
     touch, front, rear = path.touch[p], p, p + 1
@@ -198,9 +200,9 @@ def dip_of(cell: Cell, vague: float, length: float) -> float:
     piece. The speed falls below this value only if the vehicle's acceleration changes its sign within the piece.
 
     Args:
-        cell: a box of uncertain worlds, as affine forms.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
         vague: largest deviation of the acceleration from its mean, m/s2.
-        length: length of the piece (time interval of constant command), s.
+        length: duration of the piece (time interval of constant command), s.
 
     """
     return 0.5 * vague * length if cell.moving else 0.0
@@ -210,7 +212,7 @@ def dip_of(cell: Cell, vague: float, length: float) -> float:
 def own_pulls(motion: Motion, p: int) -> tuple[float, float]:
     """Return the smallest and the largest acceleration (m/s2) that the two vehicles of pair ``p`` command in a piece.
 
-    ``motion`` is the motion of all vehicles in the piece (time interval of constant command).
+    ``motion`` has the motion of all vehicles in the piece (time interval of constant command).
     """
     weakest = min(low(motion.pull[p]) - motion.vague[p], low(motion.pull[p + 1]) - motion.vague[p + 1])
     return weakest, max(high(motion.pull[p]) + motion.vague[p], high(motion.pull[p + 1]) + motion.vague[p + 1])
@@ -221,13 +223,13 @@ def creep(cell: Cell, touch: Floats, p: int, slowest: float, weakest: float, har
     """Update the state of a pair in contact for worlds in which one of its vehicles may stand or move backwards.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        touch: [TOUCH_WIDTH] state of the pair in contact, a row of ``Path.touch``; changed in place.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        touch: [TOUCH_WIDTH] state of the pair in contact (a row of ``Path.touch``); the function changes it in place.
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         slowest: smallest speed of the centre of mass in the piece, m/s.
         weakest: smallest acceleration that either vehicle commands, m/s2.
         hardest: largest acceleration that either vehicle commands, m/s2.
-        length: length of the piece, s.
+        length: duration of the piece (time interval of constant command), s.
 
     """
     largest = max(
@@ -256,12 +258,13 @@ def come_to_rest(cell: Cell, path: Path, motion: Motion, p: int, length: float) 
     the rear vehicle's speed.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece; changed in
-            place.
-        motion: motion of each vehicle in the present piece; changed in place.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command); the function updates this state in place.
+        motion: motion of each vehicle in the present piece (time interval of constant command); the function changes it
+            in place.
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        length: length of the piece, s.
+        length: duration of the piece (time interval of constant command), s.
 
     """
     touch = path.touch[p]
@@ -282,12 +285,13 @@ def part(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
     both vehicles move alone.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece; changed in
-            place.
-        motion: motion of each vehicle in the present piece; changed in place.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command); the function updates this state in place.
+        motion: motion of each vehicle in the present piece (time interval of constant command); the function changes it
+            in place.
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        length: length of the piece, s.
+        length: duration of the piece (time interval of constant command), s.
 
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
@@ -323,12 +327,12 @@ def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length:
     shorter, and their speeds smaller.)
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        touch: [TOUCH_WIDTH] state of the pair in contact, a row of ``Path.touch``; changed in place.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        touch: [TOUCH_WIDTH] state of the pair in contact (a row of ``Path.touch``); the function changes it in place.
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         least: smallest closing acceleration, m/s2.
         most: largest closing acceleration, m/s2.
-        length: length of the piece, s.
+        length: duration of the piece (time interval of constant command), s.
         vague: largest deviation of the acceleration from its mean, m/s2.
 
     """
@@ -364,7 +368,7 @@ def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: fl
     decreases from impact to impact. Otherwise they span only the accelerations of the new phase.
 
     Args:
-        touch: state of the pair in contact, a row of ``Path.touch``; changed in place.
+        touch: [TOUCH_WIDTH] state of the pair in contact (a row of ``Path.touch``); the function changes it in place.
         e: coefficient of restitution.
         softest: smallest closing acceleration of both phases, m/s2.
         hardest: largest closing acceleration of both phases, m/s2.
@@ -395,7 +399,7 @@ def settle(touch: Floats, e: float) -> None:
     backwards.
 
     Args:
-        touch: state of the pair in contact, a row of ``Path.touch``; changed in place.
+        touch: [TOUCH_WIDTH] state of the pair in contact (a row of ``Path.touch``); the function changes it in place.
         e: coefficient of restitution.
 
     """
@@ -416,11 +420,12 @@ def is_blurred(path: Path, motion: Motion, N: int, p: int, length: float) -> boo
     Such a pair is treated as in contact from the start of the piece.
 
     Args:
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
         motion: motion of each vehicle in the present piece (time interval of constant command).
         N: number of vehicles.
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        length: length of the piece, s.
+        length: duration of the piece (time interval of constant command), s.
 
     """
     if motion.rest[p] != MOVES or motion.rest[p + 1] != MOVES:
