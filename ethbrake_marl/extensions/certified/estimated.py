@@ -81,8 +81,8 @@ class Told(NamedTuple):
 
     @classmethod
     def to(cls, worlds: Worlds, vehicle: int) -> Told:
-        """Return the information that the vehicle with index ``vehicle`` has received in ``worlds`` by their present
-        time.
+        """Return the information that the vehicle with index ``vehicle`` has received in ``worlds`` up to the present
+        time of these worlds.
         """
         n, N = worlds.speeds_mps.shape
         known = worlds.vehicles.known_from_s[:, vehicle] <= worlds.time_s[:, np.newaxis]
@@ -145,10 +145,10 @@ def _places_of(worlds: Worlds, vehicle: int) -> Floats:
 class Ranges:
     """Ranges that a scenario declares for quantities of the vehicles that the estimating vehicle does not know.
 
-    Keys of the mappings: ``place`` (position relative to the estimating vehicle at the alert, m), ``speeds_mps``,
-    ``braking_capacity_mps2``, ``mass_t``, ``latency_s`` (latency without the delay of the alert message, s) and
-    ``news_s`` (time at which a vehicle has received the alert and may react, s; 0 without a channel). Each mapping has
-    an array [N] for each key.
+    Keys of the mappings ``middle``, ``low`` and ``high``: ``place`` (position relative to the estimating vehicle at the
+    alert, m), ``speeds_mps``, ``braking_capacity_mps2``, ``mass_t``, ``latency_s`` (latency without the delay of the
+    alert message, s) and ``news_s`` (time at which a vehicle has received the alert and may react, s; 0 without a
+    channel). For each key, a mapping has an array [N] with one value for each vehicle.
     """
 
     vehicle: int  # index of the estimating vehicle
@@ -160,8 +160,8 @@ class Ranges:
 
     @classmethod
     def of(cls, scenario: Scenario, vehicle: int, others: Mapping[int, Script] | None = None) -> Ranges:
-        """Return the ranges that ``scenario`` declares for all vehicles, for the estimates of the vehicle with index
-        ``vehicle``.
+        """Return the ranges that ``scenario`` declares for all vehicles. The vehicle with index ``vehicle`` uses them
+        for its estimates.
 
         ``others`` has the scripts of the other vehicles; the keys are vehicle indices. If ``others`` is None, the
         scripts of the scenario are used. Raises ``InvalidInput`` for a mixture of scenarios, because an unknown vehicle
@@ -201,9 +201,10 @@ class Ranges:
         the range.
 
         Args:
-            share: position in the range for some pairs (quantity, vehicle index): 0 is the smallest value, 1 the
-                largest. Other vehicles get the median. None: all vehicles get the median.
-            key: the quantity, a key of ``middle``.
+            share: for some pairs (quantity, vehicle index), the position of the value in its range: 0 is the smallest
+                value, 1 the largest. A vehicle without such a position gets the median. If ``share`` is None, all
+                vehicles get the median.
+            key: name of the quantity; must be a key of ``middle``.
 
         """
         value = self.middle[key].copy()
@@ -214,7 +215,7 @@ class Ranges:
 
     @property
     def uncertain(self) -> tuple[tuple[str, int], ...]:
-        """Uncertain numbers of the other vehicles, as pairs (quantity, vehicle index).
+        """The numbers of the other vehicles that are uncertain, as pairs (quantity, vehicle index).
 
         A number is uncertain if the scenario declares a range for it instead of one value.
         """
@@ -232,11 +233,12 @@ class Ranges:
 
         Args:
             worlds: the true worlds; only the information that the vehicle received is read.
-            way_m: [n] the vehicle's own distance since the alert, m.
-            share: position in the range, 0 to 1, for some pairs (quantity, vehicle index); all other quantities get
-                their median. None: the median of every quantity.
+            way_m: [n] distance that the estimating vehicle has travelled since the alert, m.
+            share: for some pairs (quantity, vehicle index), the position of the value in its range: 0 is the smallest
+                value, 1 the largest. All other values are medians. If ``share`` is None, every value is a median.
             foretold: the predicted present worlds, including impacts, and a mask [n, N]: True for a vehicle whose
-                predicted state replaces the state in its last message. None: no prediction.
+                predicted state replaces the state in its last message. If ``foretold`` is None, the estimate uses no
+                prediction.
 
         """
         worlds.refuse_build_up(":estimated")
@@ -299,9 +301,9 @@ def _places(ahead_m: Floats, behind_m: Floats, vehicle: int) -> Floats:
     behind negative.
 
     Args:
-        ahead_m: [P] gaps for the pairs in front of the vehicle, m.
-        behind_m: [P] gaps for the pairs behind the vehicle, m.
-        vehicle: index of the vehicle at position 0.
+        ahead_m: [P] gaps of the pairs, m; the function uses them only in front of ``vehicle``.
+        behind_m: [P] gaps of the pairs, m; the function uses them only behind ``vehicle``.
+        vehicle: index of the vehicle whose position is 0.
 
     """
     front = np.cumsum(ahead_m[:vehicle][::-1])[::-1]
@@ -309,12 +311,14 @@ def _places(ahead_m: Floats, behind_m: Floats, vehicle: int) -> Floats:
 
 
 def _in_order(place: Floats, known: Bools, vehicle: int) -> Floats:
-    """Correct estimated positions so that no vehicle is ahead of its predecessor, and return the positions, [n, N] m.
+    """Correct estimated positions so that no vehicle is ahead of the vehicle in front of it; return the positions, [n,
+    N] m.
 
     Args:
-        place: [n, N] position of each vehicle relative to ``vehicle``, m; changed in place.
-        known: [n, N] True for vehicles whose position is certain; their position is not changed.
-        vehicle: index of the vehicle at position 0.
+        place: [n, N] position of each vehicle relative to ``vehicle``, m; the function changes this array in place.
+        known: [n, N] True for vehicles whose position is certain; the function does not change the position of these
+            vehicles.
+        vehicle: index of the vehicle whose position is 0.
 
     """
     N = place.shape[1]
