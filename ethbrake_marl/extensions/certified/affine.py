@@ -131,9 +131,9 @@ def linear(x: Floats, slope: float, start: float, error: float) -> Floats:
 def square_root(x: Floats) -> Floats:
     """Return an affine form [W] (centre, slopes, remainder) that encloses the square root of ``x`` where ``x >= 0``.
 
-    ``high(x)`` must be at least 0. In worlds with negative ``x`` the result has no meaning. On an interval [a, b] the
-    square root lies between two parallel lines: its chord, with slope 1 / (sqrt(a) + sqrt(b)), and the tangent with
-    this slope.
+    The largest value of ``x`` in the box, ``high(x)``, must be at least 0. In worlds with negative ``x`` the result has
+    no meaning. On an interval [a, b] the square root lies between two parallel lines: its chord, with slope 1 /
+    (sqrt(a) + sqrt(b)), and the tangent with this slope.
     """
     least, most = math.sqrt(max(low(x), 0.0)), math.sqrt(high(x))
     if most <= 0.0:
@@ -146,7 +146,8 @@ def square_root(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def reciprocal(x: Floats) -> Floats:
-    """Return an affine form [W] (centre, slopes, remainder) that encloses ``1 / x``. ``low(x)`` must be above 0.
+    """Return an affine form [W] (centre, slopes, remainder) that encloses ``1 / x``. The smallest value of ``x`` in the
+    box, ``low(x)``, must be above 0.
 
     On an interval [a, b] the reciprocal lies between two parallel lines: its chord, with slope -1 / (a b), and the
     tangent with this slope.

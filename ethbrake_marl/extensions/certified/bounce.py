@@ -74,8 +74,8 @@ def stand_still(cell: Cell, pull: Floats, vague: float, left: float, speed: Floa
         pull: mean acceleration after the impact as an affine form [W] (centre, slopes, remainder), m/s2.
         vague: largest deviation of the acceleration from ``pull``, m/s2.
         left: longest time from the impact to the end of the piece (time interval of constant command), s.
-        speed: speed at the end of the piece as an affine form [W], m/s; corrected in place.
-        way: distance travelled in the piece as an affine form [W], m; corrected in place.
+        speed: speed at the end of the piece as an affine form [W], m/s; the function corrects it in place.
+        way: distance travelled in the piece as an affine form [W], m; the function corrects it in place.
 
     """
     least = low(speed)

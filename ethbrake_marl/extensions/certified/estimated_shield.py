@@ -130,7 +130,7 @@ class EstimatedShield:
         return 1 + len(self._corners())
 
     def __copy__(self) -> EstimatedShield:
-        """Return an independent copy. Decisions of the copy do not change the original shield."""
+        """Return an independent copy of the shield. Decisions of the copy do not change the original shield."""
         apart = object.__new__(EstimatedShield)
         apart.__dict__.update(self.__dict__)
         apart.shield = copy.copy(self.shield)

@@ -141,8 +141,9 @@ class RobustOptions(ShieldOptions):
 
 
 def checked_uncertainty(given: object) -> Uncertainty | None:
-    """Return ``given`` as an ``Uncertainty``, or None if ``given`` is None. A text such as ``"gaps_m=0.5"`` is parsed.
-    Raises ``InvalidInput`` if ``given`` is not an ``Uncertainty``, a text or None.
+    """Return ``given`` as an ``Uncertainty``, or None if ``given`` is None. If ``given`` is a text such as
+    ``"gaps_m=0.5"``, the function parses it. Raises ``InvalidInput`` if ``given`` is not an ``Uncertainty``, a text or
+    None.
     """
     if given is None or isinstance(given, Uncertainty):
         return given

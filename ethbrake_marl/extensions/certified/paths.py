@@ -523,7 +523,7 @@ def may_meet_unseen(cell: Cell, path: Path, motion: Motion) -> bool:
     """Return whether a pair that is in contact, but has had no impact yet, may have its first impact in the present
     piece.
 
-    The vehicles of such a pair must separate before they can have an impact.
+    The vehicles of a pair in contact must separate before they can have an impact.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -606,8 +606,8 @@ def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out
 
 @compiled(apart=True)
 def go_on(cell: Cell, path: Path, motion: Motion) -> bool:
-    """Advance the path to the end of the present piece without an impact. Return False if every world of the path has
-    an impact in this piece.
+    """Advance the path to the end of the present piece, for the worlds without an impact in this piece. Return False if
+    every world of the path has an impact in this piece.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.

@@ -1,9 +1,10 @@
 """Step shield for uncertain worlds: it certifies plans in the corners of the box of possible worlds, or in the whole
 box.
 
-The *members* of a world are the worlds in which ``StepShield`` certifies a plan. For this shield the members are the
-reported world and the corners of an ``Uncertainty``. With ``robust="interior"`` the shield also bounds the harm of
-every plan over the whole box between the corners (``enclosure.Boxes``), at the alert and at every decision.
+``StepShield`` certifies each plan in several possible worlds, which are called the *members* of a world. For this
+shield the members are the reported world and the corners of an ``Uncertainty``. With ``robust="interior"`` the shield
+also bounds the harm of every plan over the whole box between the corners (``enclosure.Boxes``), at the alert and at
+every decision.
 """
 
 from __future__ import annotations
@@ -150,7 +151,7 @@ def certify_inside(
     """Return ``decision``, but keep the old plan wherever the new plan is not certified for all worlds of its box.
 
     Args:
-        boxes: smallest and largest value of every number of each world.
+        boxes: box of each world: the smallest and the largest value of each of the world's numbers.
         running: states of the members (the reported worlds and the corners of their boxes) before the decision.
         held: the plans and their bounds from before the decision.
         budget: [n] largest harm that a new plan may have, m2/s2.

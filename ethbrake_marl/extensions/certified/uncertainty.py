@@ -64,7 +64,7 @@ _NUMBER = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """Interval of one quantity, for one vehicle or pair, or for all of them."""
+    """Interval around one reported quantity, for one vehicle or pair, or for all vehicles or pairs."""
 
     quantity: str  # one of QUANTITIES
     half_width: float  # in the quantity's unit, or a share of its value below 1
@@ -135,8 +135,9 @@ class Uncertainty:
         The *box* of a world is the set of all combinations of values in its intervals. The corners are in the order of
         binary numbers, with the first interval as the lowest bit (0: smallest value, 1: largest value). Intervals of
         width 0 add no corners. For friction, eight values replace the two ends of the interval, because friction
-        changes all capacities together and harm may rise or fall with it. Raises ``InvalidInput`` for a vehicle that
-        does not exist, a capacity or mass that may be 0, or more than ``MOST_CORNERS`` corners.
+        changes all capacities together and harm may rise or fall with it. Raises ``InvalidInput`` if an interval names
+        a vehicle that does not exist, if a capacity or mass may be 0, or if there are more than ``MOST_CORNERS``
+        corners.
         """
         sides = self._sides(worlds)
         ends = [_OF_FRICTION if name == "friction" else (0.0, 1.0) for name, *_ in reversed(sides)]
@@ -243,8 +244,8 @@ def parse_uncertainty(text: str) -> Uncertainty:
 
 
 def _values(worlds: Worlds, quantity: str) -> Floats:
-    """Return the reported values of one of ``QUANTITIES``: [n, N], for gaps [n, P], for friction [n, 1]. The returned
-    capacities are those on a dry road.
+    """Return the reported values of one of ``QUANTITIES``. The result has the shape [n, N], for gaps [n, P], for
+    friction [n, 1]. The returned capacities are those on a dry road.
     """
     if quantity.endswith("_rate_mps3"):
         return np.asarray(getattr(worlds.vehicles, quantity), np.float64)
