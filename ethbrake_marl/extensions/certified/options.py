@@ -32,9 +32,9 @@ class RobustOptions(ShieldOptions):
         uncertainty: for mode ``robust``, an interval around each uncertain quantity, such as ``"gaps_m=0.5"``.
         robust: worlds in which mode ``robust`` certifies actions: only the ``corners`` of the intervals (fast), or the
             whole ``interior`` of the intervals.
-        estimated: if True, certify actions in the estimated world, which is computed only from information that the
-            vehicle received. ``estimated=True`` is possible in modes ``step`` and ``robust`` with one learner, and
-            without ``uncertainty``, ``allowance``, ``cap``, ``logging`` and ``shares``.
+        estimated: if True, certify actions in the estimated world, which uses only the information that the vehicle
+            received and the scenario's ranges. ``estimated=True`` is possible in modes ``step`` and ``robust`` with one
+            learner, and without ``uncertainty``, ``allowance``, ``cap``, ``logging`` and ``shares``.
 
     Raises ``InvalidInput`` and ``UnknownName`` as ``eb.ShieldOptions`` does.
 
