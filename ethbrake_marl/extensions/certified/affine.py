@@ -1,18 +1,17 @@
 """Affine arithmetic over a box of worlds, and the motion of single vehicles in the box.
 
 A *box* contains all worlds whose K uncertain numbers lie in given intervals. An *affine form* represents a number that
-differs from world to world. It is an array [W], W = K + 2, for ``c + g_1 e_1 + ... + g_K e_K + r e``: a centre c, one
-slope g_k for each uncertain number, and a remainder r. ``e_k`` in [-1, 1] is the position of the world in the interval
-of uncertain number k; it is the same in all forms. ``e`` in [-1, 1] is an unknown number of its own in each form. If
-two forms depend on the same ``e_k``, these parts cancel in their difference; a difference of two plain intervals would
-be wider.
+differs from world to world. An affine form is an array of W = K + 2 numbers for ``c + g_1 e_1 + ... + g_K e_K + r e``:
+a centre c, one slope g_k for each uncertain number, and a remainder r. ``e_k`` in [-1, 1] is the position of a world in
+the interval of uncertain number k; all forms use the same ``e_k``. ``e`` in [-1, 1] is unknown, and each form has its
+own ``e``. In the difference of two affine forms, parts that depend on the same ``e_k`` cancel. The difference of two
+plain intervals would be wider.
 
-The result of every operation encloses the exact number: for each world of the box, some value of ``e`` makes the form
-equal to that number. The operations ignore floating-point rounding; instead, the speeds and distances are widened by
-``ROUNDING`` once in each piece.
+The result of every operation on affine forms encloses the exact result: for each world of the box, some value of ``e``
+makes the form equal to the exact result. The operations ignore floating-point rounding; instead, the speeds and
+distances are widened by ``ROUNDING`` once in each piece (time interval of constant command).
 
-A *piece* is a time interval in which no command changes. Letters for shapes: ``N`` vehicles, ``P = N - 1`` pairs, ``J``
-pieces.
+Letters for shapes: ``N`` vehicles, ``P = N - 1`` pairs, ``J`` pieces.
 """
 
 from __future__ import annotations
@@ -77,9 +76,9 @@ def negative(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def between(least: float, most: float, width: int) -> Floats:
-    """Return the affine form of an arbitrary number between ``least`` and ``most``.
+    """Return an affine form that encloses every number between ``least`` and ``most``.
 
-    ``width`` is the length W of the form (centre, slopes, remainder).
+    ``width`` is the number W of entries of the form (centre, slopes, remainder).
     """
     out = np.zeros(width)
     out[0], out[-1] = 0.5 * (least + most), 0.5 * (most - least)
@@ -90,7 +89,7 @@ def between(least: float, most: float, width: int) -> Floats:
 def product(x: Floats, y: Floats) -> Floats:
     """Return an affine form [W] (centre, slopes, remainder) that encloses the product of two affine forms.
 
-    The remainder takes up the second-order part of the product.
+    The remainder covers the second-order terms of the product.
     """
     out = np.empty_like(x)
     for k in range(x.shape[0] - 1):
@@ -104,7 +103,7 @@ def product(x: Floats, y: Floats) -> Floats:
 def square(x: Floats) -> Floats:
     """Return an affine form [W] (centre, slopes, remainder) that encloses ``x * x``.
 
-    Its remainder is smaller than the remainder of ``product(x, x)``, because a square is never negative.
+    The remainder of this form is smaller than the remainder of ``product(x, x)``, because a square is never negative.
     """
     out = np.empty_like(x)
     for k in range(x.shape[0] - 1):
@@ -132,9 +131,9 @@ def linear(x: Floats, slope: float, start: float, error: float) -> Floats:
 def square_root(x: Floats) -> Floats:
     """Return an affine form [W] (centre, slopes, remainder) that encloses the square root of ``x`` where ``x >= 0``.
 
-    ``high(x)`` must be at least 0. In worlds with negative ``x`` the result has no meaning. On an interval [a, b] the
-    square root lies between two parallel lines: its chord, with slope 1 / (sqrt(a) + sqrt(b)), and the tangent with
-    this slope.
+    The largest value of ``x`` in the box, ``high(x)``, must be at least 0. In worlds with negative ``x`` the result has
+    no meaning. On an interval [a, b] the square root lies between two parallel lines: its chord, with slope 1 /
+    (sqrt(a) + sqrt(b)), and the tangent with this slope.
     """
     least, most = math.sqrt(max(low(x), 0.0)), math.sqrt(high(x))
     if most <= 0.0:
@@ -147,7 +146,8 @@ def square_root(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def reciprocal(x: Floats) -> Floats:
-    """Return an affine form [W] (centre, slopes, remainder) that encloses ``1 / x``. ``low(x)`` must be above 0.
+    """Return an affine form [W] (centre, slopes, remainder) that encloses ``1 / x``. The smallest value of ``x`` in the
+    box, ``low(x)``, must be above 0.
 
     On an interval [a, b] the reciprocal lies between two parallel lines: its chord, with slope -1 / (a b), and the
     tangent with this slope.
@@ -163,7 +163,8 @@ def reciprocal(x: Floats) -> Floats:
 def positive_part(x: Floats) -> Floats:
     """Return an affine form [W] (centre, slopes, remainder) that encloses ``max(x, 0)``.
 
-    If ``x`` may have both signs, ``max(x, 0)`` lies between its chord and the parallel line through the origin.
+    If ``x`` may have both signs, ``max(x, 0)`` lies between two parallel lines: the chord of this function and the line
+    through the origin.
     """
     least, most = low(x), high(x)
     if least >= 0.0:
@@ -177,11 +178,11 @@ def positive_part(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def cut(x: Floats, least: float, most: float) -> Floats:
-    """Return an affine form [W] (centre, slopes, remainder) for ``x``, whose values are known to be at least ``least``
-    and at most ``most``.
+    """Return an affine form [W] (centre, slopes, remainder) that encloses ``x``, whose values are known to lie between
+    ``least`` and ``most``.
 
-    If the limits make the interval of ``x`` less than half as wide, the result stands for any number in this smaller
-    interval. Otherwise the result is ``x`` itself.
+    If the limits ``least`` and ``most`` make the interval of ``x`` less than half as wide, the result encloses every
+    number of this smaller interval. If they do not, the result is ``x`` itself.
     """
     inside_low, inside_high = max(low(x), least), min(high(x), most)
     if inside_high - inside_low < radius(x):
@@ -207,10 +208,11 @@ TOUCH_WIDTH = 9
 
 
 class Forces(NamedTuple):
-    """Accelerations while brakes or engines build up: affine forms for every vehicle and time interval.
+    """Accelerations while brakes or engines build up gradually: affine forms for every vehicle and time interval.
 
-    Index 0 of the second axis is the time from the alert to the first piece (time interval of constant command). Index
-    j + 1 is piece j. Impacts do not change these accelerations, so they are the same for every sequence of impacts.
+    On the second axis of an array, index 0 is the time from the alert to the first piece (time interval of constant
+    command), and index j + 1 is piece j. Impacts do not change the accelerations, so the arrays are the same for every
+    sequence of impacts.
     """
 
     mean: Floats  # [N, J + 1, W] mean acceleration of the piece, m/s2
@@ -222,8 +224,8 @@ class Forces(NamedTuple):
 
 
 class Cell(NamedTuple):
-    """A box of uncertain worlds as affine forms [W], and the commands in each piece (time interval of constant
-    command).
+    """A box (all worlds whose uncertain numbers lie in given intervals) as affine forms [W], and the commands in each
+    piece (time interval of constant command).
 
     An *affine form* represents a number that differs from world to world: a centre, a slope for each uncertain number
     of the box, and a remainder.
@@ -247,7 +249,7 @@ class Cell(NamedTuple):
 
 
 class Path(NamedTuple):
-    """Those worlds of a box (``Cell``) that had the same impacts and contacts so far, and their present state.
+    """Set of those worlds of a box (``Cell``) that had the same impacts and contacts so far, with their present state.
 
     An affine form [W] represents a number that differs from world to world: a centre, a slope for each uncertain number
     of the box, and a remainder.
@@ -264,10 +266,11 @@ class Path(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Motion of each vehicle through one piece (time interval of constant command), as if it were alone on the road.
+    """Motion of each vehicle through one piece (time interval of constant command), as if the vehicle were alone on the
+    road.
 
-    Each row of an array [N, W] is the affine form of one vehicle: centre, a slope for each uncertain number of the box,
-    remainder.
+    Each row of an array [N, W] is the affine form for one vehicle: a centre, a slope for each uncertain number of the
+    box, and a remainder.
     """
 
     pull: Floats  # [N, W] acceleration by the command, m/s2
@@ -290,13 +293,15 @@ def new_motion(N: int, width: int) -> Motion:
 
 @compiled(apart=True)
 def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
-    """Compute the motion of every vehicle through one piece under its command, as if it were alone on the road.
+    """Compute how every vehicle moves through one piece under its own command, as if the vehicle were alone on the
+    road.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
-        piece: index of the piece, 0 to J - 1.
-        motion: receives the result.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
+        piece: index of the piece (time interval of constant command), from 0 to J - 1.
+        motion: the function writes its results into this object.
 
     """
     for i in range(cell.speed.shape[0]):
@@ -345,18 +350,18 @@ def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
 
 @compiled(apart=True)
 def hold(speed: Floats, i: int, length: float, motion: Motion) -> None:
-    """Widen the motion of vehicle ``i`` in place, because brakes that release gradually may still hold the vehicle at
-    rest.
+    """Widen the affine forms of the motion of vehicle ``i`` in place, because brakes that release gradually may still
+    hold the vehicle at rest.
 
-    The vehicle may stand until its acceleration is above 0. Let u be the size of the negative speed that the formulas
-    would give meanwhile. Then the speed of the vehicle is larger than computed by at most u, and its distance by at
-    most u times the length of the piece.
+    A vehicle that such brakes hold may stand until its acceleration is above 0. Let u be the size of the negative speed
+    that the formulas give for the time of standing. The true speed of the vehicle is larger than the computed speed by
+    at most u. The true distance is larger than the computed distance by at most u times the duration of the piece.
 
     Args:
         speed: speed at the start of the piece as an affine form [W], m/s.
         i: index of the vehicle.
-        length: length of the piece (time interval of constant command), s.
-        motion: motion of all vehicles in the piece; ``onward`` and ``reach`` of vehicle ``i`` are changed.
+        length: duration of the piece (time interval of constant command), s.
+        motion: motion of all vehicles in the piece; the function changes ``onward`` and ``reach`` of vehicle ``i``.
 
     """
     least, most = low(motion.pull[i]) - motion.vague[i], high(motion.pull[i]) + motion.vague[i]
@@ -368,7 +373,7 @@ def hold(speed: Floats, i: int, length: float, motion: Motion) -> None:
 
 @compiled(apart=True)
 def between_shifted(x: Floats, shift: float) -> Floats:
-    """Return the affine form [W] (centre, slopes, remainder) of an arbitrary number between ``x`` and ``x + shift``.
+    """Return an affine form [W] (centre, slopes, remainder) that encloses every number between ``x`` and ``x + shift``.
 
     ``x`` is an affine form.
     """
@@ -379,16 +384,16 @@ def between_shifted(x: Floats, shift: float) -> Floats:
 
 @compiled(apart=True)
 def command(cell: Cell, i: int, piece: int, motion: Motion) -> None:
-    """Set ``motion.pull`` of vehicle ``i`` in a piece: the acceleration that it commands, or 0 before its latency has
-    elapsed.
+    """Set ``motion.pull`` of vehicle ``i`` in a piece: the acceleration that the vehicle commands, or 0 before the
+    vehicle's latency has elapsed.
 
     The function also sets ``motion.rest`` and ``motion.vague`` of the vehicle.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
         i: index of the vehicle.
-        piece: index of the piece, 0 to J - 1.
-        motion: receives the result.
+        piece: index of the piece (time interval of constant command), from 0 to J - 1.
+        motion: the function writes its results into this object.
 
     """
     pull = motion.pull[i]
@@ -411,14 +416,14 @@ def command(cell: Cell, i: int, piece: int, motion: Motion) -> None:
 
 @compiled(apart=True)
 def begin_later(cell: Cell, i: int, piece: int, motion: Motion) -> None:
-    """Set the motion of vehicle ``i`` in a piece if its command may take effect only within the piece or after it.
+    """Set the motion of vehicle ``i`` in a piece if the vehicle's command may take effect after the start of the piece.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
         i: index of the vehicle.
-        piece: index of the piece, 0 to J - 1.
-        motion: motion of each vehicle in the piece; ``onward``, ``reach``, ``pull`` and ``vague`` of vehicle ``i`` are
-            changed.
+        piece: index of the piece (time interval of constant command), from 0 to J - 1.
+        motion: motion of each vehicle in the piece; the function changes ``onward``, ``reach``, ``pull`` and ``vague``
+            of vehicle ``i``.
 
     """
     pull = motion.pull[i]
@@ -438,10 +443,10 @@ def begin_later(cell: Cell, i: int, piece: int, motion: Motion) -> None:
 
 @compiled(apart=True)
 def since(cell: Cell, i: int, time: float) -> Floats:
-    """Return how long the command of vehicle ``i`` has been in effect at ``time``, as an affine form [W], s, at least
-    0.
+    """Return for how many seconds (at least 0) the command of vehicle ``i`` has been in effect at ``time``, as an
+    affine form [W].
 
-    ``time`` counts from the first decision, in s. ``cell`` is the box of worlds.
+    ``time`` is in s after the first decision. ``cell`` has the box of worlds.
     """
     since = negative(cell.onset[i])
     since[0] += time
@@ -453,11 +458,11 @@ def stop(moving: bool, speed: Floats, i: int, length: float, motion: Motion) -> 
     """Set speed and distance of a braking vehicle that stops, or may stop, within a piece and then stays at rest.
 
     Args:
-        moving: True if the command of any vehicle builds up.
+        moving: True if the acceleration of any vehicle builds up gradually instead of at once.
         speed: speed at the start of the piece as an affine form [W], m/s.
         i: index of the vehicle.
-        length: length of the piece (time interval of constant command), s.
-        motion: motion of all vehicles in the piece; ``rest``, ``speed`` and ``way`` of vehicle ``i`` are set.
+        length: duration of the piece (time interval of constant command), s.
+        motion: motion of all vehicles in the piece; the function sets ``rest``, ``speed`` and ``way`` of vehicle ``i``.
 
     """
     pull, vague, width = motion.pull[i], motion.vague[i], speed.shape[0]

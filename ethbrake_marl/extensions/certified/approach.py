@@ -1,8 +1,8 @@
 """First contacts in a box of worlds: when, and at which closing speed, a pair of vehicles may come into contact.
 
 Each function looks at one piece (time interval of constant command). A *path* is a set of worlds with the same impacts
-so far (``affine.Path``). The affine forms of a path may also cover worlds with other impacts; the results of the
-functions hold for the worlds that really have the impacts of the path.
+so far (``affine.Path``). The affine forms of a path may also enclose states of worlds with other impacts. The results
+of the functions are correct for the worlds that really have the impacts of the path.
 """
 
 from __future__ import annotations
@@ -57,14 +57,15 @@ class Approach(NamedTuple):
 
 @compiled(apart=True)
 def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
-    """Return by how much bounces of the neighbouring pairs may change the relative speed or the gap of pair ``p``, at
-    most.
+    """Return the largest change of the relative speed or the gap of pair ``p`` that bounces of the neighbouring pairs
+    may cause.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        of_gap: True: the result is for the gap, m. False: it is for the relative speed, m/s.
+        of_gap: if True, return the change of the gap, m; if False, the change of the relative speed, m/s.
 
     """
     P, most = cell.gap.shape[0], 0.0
@@ -77,8 +78,8 @@ def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
 
 @compiled(apart=True)
 def pressing(motion: Motion, p: int) -> tuple[float, float]:
-    """Return the smallest and the largest closing acceleration of pair ``p`` in a piece, m/s2. The function allows for
-    vehicles that stop within the piece. ``motion`` is the motion of all vehicles in the piece (time interval of
+    """Return the smallest and the largest closing acceleration of pair ``p`` in a piece, m/s2. The two results also
+    cover vehicles that stop within the piece. ``motion`` has the motion of all vehicles in the piece (time interval of
     constant command).
     """
     front_low, front_high = low(motion.pull[p]) - motion.vague[p], high(motion.pull[p]) + motion.vague[p]
@@ -92,14 +93,16 @@ def pressing(motion: Motion, p: int) -> tuple[float, float]:
 
 @compiled(apart=True)
 def may_meet(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> bool:
-    """Return whether pair ``p`` may come into contact within this piece while its gap closes.
+    """Return whether pair ``p`` may come into contact within this piece at a time when its gap is closing.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
-        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
+        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
+            ``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        length: length of the piece, s.
+        length: duration of the piece (time interval of constant command), s.
 
     """
     N = cell.speed.shape[0]
@@ -127,16 +130,18 @@ def approach(
 
     Let w be the present closing speed, b the closing acceleration and g the gap. The closing speed at contact, w', then
     has the square ``w^2 + 2 b g``, and the contact comes after the time ``2 g / (w + w')``. If the front vehicle stops
-    first, g includes its stopping distance.
+    before the contact, g includes the stopping distance of the front vehicle.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
-        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
+        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
+            ``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        length: length of the piece, s.
-        front_stands: True: consider the worlds in which the front vehicle is at rest at contact. False: consider the
-            worlds in which it moves.
+        length: duration of the piece (time interval of constant command), s.
+        front_stands: if True, consider the worlds in which the front vehicle is at rest at the contact; if False, the
+            worlds in which the front vehicle moves at the contact.
 
     """
     N, width = cell.speed.shape[0], cell.speed.shape[1]
@@ -190,11 +195,11 @@ def _stopping_way(moving: bool, speed: Floats, pull: Floats, vague: float, lengt
     """Return the stopping distance (m) of a vehicle that stops within a piece, as an affine form [W].
 
     Args:
-        moving: True if the command of any vehicle builds up.
+        moving: True if the acceleration of any vehicle builds up gradually instead of at once.
         speed: speed at the start of the piece as an affine form [W], m/s.
-        pull: mean acceleration as an affine form [W], m/s2.
+        pull: mean acceleration of the vehicle in the piece as an affine form [W], m/s2.
         vague: largest deviation of the acceleration from ``pull``, m/s2.
-        length: length of the piece, s.
+        length: duration of the piece (time interval of constant command), s.
 
     """
     if not high(pull) + vague < 0.0 or (vague > 0.0 and not moving):

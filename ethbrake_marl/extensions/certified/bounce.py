@@ -1,4 +1,4 @@
-"""Motion of the two vehicles of an impact until the piece ends, in a box of worlds.
+"""Motion of two vehicles from their impact to the end of the piece, in all worlds of a box.
 
 A *piece* is a time interval of constant command.
 """
@@ -29,17 +29,20 @@ from ethbrake_marl.physics.state import Floats
 def spring_apart(
     cell: Cell, motion: Motion, p: int, how: Approach, jump: Floats, left: Floats, after: Path, way: Floats
 ) -> None:
-    """Set speed and distance, up to the end of the piece, of both vehicles of a pair that separates after an impact.
+    """Compute how both vehicles of a pair that separates after an impact move to the end of the piece.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
+            ``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        how: closing speed and time of the contact (from ``approach``).
+        how: closing speed and time of the contact of pair ``p``, as ``approach`` returns them.
         jump: change of the pair's relative speed by the impact, as an affine form [W] (centre, slopes, remainder), m/s.
-        left: time from the impact to the end of the piece, as an affine form [W], s.
-        after: receives the speeds at the end of the piece.
-        way: [N, W] receives the distances travelled in the piece, m.
+        left: time from the impact to the end of the piece (time interval of constant command) as an affine form [W], s.
+        after: the path (worlds with the same impacts so far) after the impact; the function writes the vehicles' speeds
+            at the end of the piece into it.
+        way: [N, W] distances travelled in the piece, m; the function writes the distances of the two vehicles of the
+            pair into it.
 
     """
     front, rear = product(cell.share[p, 0], jump), product(cell.share[p, 1], jump)
@@ -63,16 +66,16 @@ def spring_apart(
 
 @compiled(apart=True)
 def stand_still(cell: Cell, pull: Floats, vague: float, left: float, speed: Floats, way: Floats) -> None:
-    """Correct speed and distance of a braking vehicle: it stands from the time at which its speed would become
+    """Correct speed and distance of a braking vehicle: the vehicle stands from the time at which its speed would become
     negative.
 
     Args:
-        cell: a box of uncertain worlds, as affine forms.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
         pull: mean acceleration after the impact as an affine form [W] (centre, slopes, remainder), m/s2.
         vague: largest deviation of the acceleration from ``pull``, m/s2.
         left: longest time from the impact to the end of the piece (time interval of constant command), s.
-        speed: speed at the end of the piece as an affine form [W], m/s; corrected in place.
-        way: distance travelled in the piece as an affine form [W], m; corrected in place.
+        speed: speed at the end of the piece as an affine form [W], m/s; the function corrects it in place.
+        way: distance travelled in the piece as an affine form [W], m; the function corrects it in place.
 
     """
     least = low(speed)
@@ -91,21 +94,24 @@ def stand_still(cell: Cell, pull: Floats, vague: float, left: float, speed: Floa
 def stay(
     cell: Cell, path: Path, motion: Motion, p: int, how: Approach, speed: Floats, left: Floats, after: Path, way: Floats
 ) -> None:
-    """Set speed and distance, up to the end of the piece, of both vehicles of a pair that stays in contact after an
-    impact.
+    """Compute how both vehicles of a pair that stays in contact after an impact move to the end of the piece.
 
     Both vehicles get the speed of the pair's centre of mass.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
-        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
+        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
+            ``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        how: closing speed and time of the contact (from ``approach``).
+        how: closing speed and time of the contact of pair ``p``, as ``approach`` returns them.
         speed: closing speed at the impact as an affine form [W] (centre, slopes, remainder), m/s.
-        left: time from the impact to the end of the piece as an affine form [W], s.
-        after: receives the speeds at the end of the piece and the state of the pair in contact.
-        way: [N, W] receives the distances travelled in the piece, m.
+        left: time from the impact to the end of the piece (time interval of constant command) as an affine form [W], s.
+        after: the path (worlds with the same impacts so far) after the impact; the function writes into it the speeds
+            at the end of the piece and the state of the pair in contact.
+        way: [N, W] distances travelled in the piece, m; the function writes the distances of the two vehicles of the
+            pair into it.
 
     """
     N, touch = cell.speed.shape[0], after.touch[p]

@@ -1,8 +1,8 @@
 """Upper bound on the harm of a plan in all worlds of a box, by branch and bound.
 
-A *plan* has one action for each decision up to the horizon. The search divides the box into parts: it repeatedly halves
-the part with the largest bound. Letters for shapes: a world consists of ``Q`` numbers, of which ``K`` are uncertain; a
-plan has ``L`` actions.
+A *box* contains all worlds whose uncertain numbers lie in given intervals. A *plan* has one action for each decision up
+to the horizon. The search divides the box into parts: it repeatedly halves the part with the largest bound. Letters for
+shapes: a world consists of ``Q`` numbers, of which ``K`` are uncertain; a plan has ``L`` actions.
 """
 
 from __future__ import annotations
@@ -65,11 +65,12 @@ class Known(NamedTuple):
 
 @compiled(apart=True)
 def form_of(low_: Floats, high_: Floats, which: int, free: Ints) -> Floats:
-    """Return one number of a box as an affine form [K + 2] (centre, slopes, remainder).
+    """Return one of a world's numbers as an affine form [K + 2] (centre, slopes, remainder) that covers all worlds of a
+    box.
 
     Args:
-        low_: [Q] smallest value that each number of a world has in the box.
-        high_: [Q] largest value that each number of a world has in the box.
+        low_: [Q] smallest value in the box for each of the Q numbers of a world.
+        high_: [Q] largest value in the box for each of the Q numbers of a world.
         which: index of the number among the Q numbers of a world.
         free: [K] indices of the uncertain numbers; each of them has its own slope in the affine form.
 
@@ -90,14 +91,14 @@ def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats)
     """Return the cell of a box, and the time (s) from the alert to the start of the first piece as an affine form [W].
 
     A *cell* is the box as affine forms, with the commands divided into pieces (time intervals of constant command).
-    Times count from the first decision. (If the shielded vehicle's latency is uncertain, the time from the alert to the
-    first decision differs between worlds.) The first piece starts before the first decision, by the shortest time that
-    any world has from the alert to its first decision.
+    Times in a cell count from the first decision. (If the shielded vehicle's latency is uncertain, the time from the
+    alert to the first decision differs between worlds.) The first piece starts before the first decision: d seconds
+    before it, where d is the shortest time from the alert to the first decision in any world of the box.
 
     Args:
-        low_: [Q] smallest value that each number of a world has in the box.
-        high_: [Q] largest value that each number of a world has in the box.
-        free: [K] indices of those of a world's Q numbers that are uncertain.
+        low_: [Q] smallest value in the box for each of the Q numbers of a world.
+        high_: [Q] largest value in the box for each of the Q numbers of a world.
+        free: [K] indices of the uncertain numbers among the Q numbers of a world.
         known: quantities that are the same in all worlds of the box.
         plan: [L] action of the shielded vehicle at each decision.
 
@@ -152,10 +153,10 @@ def build_up(cell: Cell, i: int, late: Floats, rates: Floats) -> None:
     """Write the accelerations of vehicle ``i`` into ``cell.forces``, for every piece and for the time before the first
     piece.
 
-    The acceleration is 0 at the alert. A *piece* is a time interval of constant command.
+    At the alert the acceleration of the vehicle is 0. A *piece* is a time interval of constant command.
 
     Args:
-        cell: the box of worlds; only its ``forces`` change.
+        cell: the box of worlds and the vehicles' commands over time; the function changes only ``cell.forces``.
         i: index of the vehicle.
         late: time from the alert to the first piece as an affine form [W] (centre, slopes, remainder), s.
         rates: [2, W] rates at which the brakes build up (index 0) and release (index 1), m/s3.
@@ -203,24 +204,25 @@ def ramp(
     force: Floats, wanted: Floats, duration: Floats, longest: float, rates: Floats, rise: Floats, gain: Floats,
     swing: Floats,
 ) -> bool:  # fmt: skip
-    """Move an acceleration towards its target for some time, and add its effect on speed and distance.
+    """Let an acceleration approach its target ``wanted`` for some time, and add the effect on speed and distance.
 
-    Let d be the acceleration minus ``wanted`` at the start, e the same difference at the end, t the duration, and m the
-    time during which the acceleration changes. The changes of speed and distance are those of the constant acceleration
-    ``wanted``, plus ``m (d + e) / 2`` in speed and ``m t (d + e) / 2 - m^2 (d + 2 e) / 6`` in distance. Returns True if
-    in every world the acceleration equals ``wanted`` at the end.
+    Let d be the difference (acceleration minus ``wanted``) at the start, e this difference at the end, t the duration,
+    and m the time during which the acceleration changes. The changes of speed and distance are those of the constant
+    acceleration ``wanted``, plus ``m (d + e) / 2`` in speed and ``m t (d + e) / 2 - m^2 (d + 2 e) / 6`` in distance.
+    Returns True if the acceleration equals ``wanted`` at the end in every world of the box.
 
     Args:
-        force: acceleration at the start as an affine form [W] (centre, slopes, remainder), m/s2; becomes the
-            acceleration at the end.
+        force: acceleration at the start as an affine form [W] (centre, slopes, remainder), m/s2; the function replaces
+            it by the acceleration at the end.
         wanted: acceleration of the command as an affine form [W], m/s2.
         duration: time for which the command acts, as an affine form [W], s.
         longest: upper limit of ``duration``, s.
         rates: [2, W] rates at which the brakes build up (index 0) and release (index 1), m/s3.
-        rise: change of speed as an affine form [W], m/s; increased in place.
-        gain: distance beyond initial speed times duration as an affine form [W], m; increased in place.
-        swing: [2] receives the largest deviation of the acceleration from its mean, m/s2: at index 0 if the
-            acceleration falls, at index 1 if it rises.
+        rise: change of speed as an affine form [W], m/s; the function adds its result to this form in place.
+        gain: distance minus (initial speed times duration) as an affine form [W], m; the function adds its result to
+            this form in place.
+        swing: [2]; the function writes the largest deviation of the acceleration from its mean (m/s2) into it: at index
+            0 if the acceleration falls, at index 1 if the acceleration rises.
 
     """
     start, there = difference(force, wanted), True
@@ -252,8 +254,8 @@ def ramp(
 
 @compiled(apart=True)
 def wait(cell: Cell, late: Floats) -> bool:
-    """Advance the speeds and gaps of a cell in place, from the alert to the first piece (time interval of constant
-    command).
+    """Advance the speeds and gaps of a cell (box of worlds) in place, from the alert to the first piece (time interval
+    of constant command).
 
     Returns False if a contact, a stop, the speed limit or a command that takes effect may disturb the motion before the
     first piece. ``late`` [W] is the time from the alert to the first piece, s.
@@ -355,20 +357,21 @@ def bound_of(
     low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, stack: Stack, motion: Motion, out: Floats,
     most: float,
 ) -> float:  # fmt: skip
-    """Return an upper bound (m2/s2) on the harm of a plan over one box.
+    """Return an upper bound (m2/s2) on the harm of a plan in all worlds of one box.
 
     A result above ``most`` is no bound: the search stopped, and the harm may be larger than the result.
 
     Args:
-        low_: [Q] smallest value that each number of a world has in the box.
-        high_: [Q] largest value that each number of a world has in the box.
-        free: [K] indices of those of a world's Q numbers that are uncertain.
+        low_: [Q] smallest value in the box for each of the Q numbers of a world.
+        high_: [Q] largest value in the box for each of the Q numbers of a world.
+        free: [K] indices of the uncertain numbers among the Q numbers of a world.
         known: quantities that are the same in all worlds of the box.
         plan: [L] action of the shielded vehicle at each decision.
-        stack: working memory for the paths (each a set of worlds with the same impacts).
-        motion: working memory for the motion of each vehicle.
-        out: [K + 2] receives the affine form of the largest harm, whose largest value is the bound.
-        most: harm above which the search stops, m2/s2.
+        stack: memory that the search overwrites; it stores the paths (sets of worlds with the same impacts so far).
+        motion: memory that the function overwrites; it stores the motion of each vehicle in the present piece.
+        out: [K + 2]; the function writes the affine form of the largest harm into it. The bound is the largest value of
+            this form.
+        most: the search stops as soon as the harm of some world may exceed this number, m2/s2.
 
     """
     cell, late = cell_of(low_, high_, free, known, plan)
@@ -393,20 +396,20 @@ def bound_of(
 def bound_box(
     low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, enough: float, cells: int, only_enough: bool
 ) -> tuple[float, int]:
-    """Return an upper bound (m2/s2) on the harm of a plan over a box, and how many parts of the box were examined. The
-    function halves the part with the largest bound until the bound of the whole box is at most ``enough``, or ``cells``
-    parts were examined.
+    """Return an upper bound (m2/s2) on the harm of a plan in all worlds of a box, and how many parts of the box were
+    examined. The function halves the part with the largest bound until the bound of the whole box is at most
+    ``enough``, or ``cells`` parts were examined.
 
     Args:
-        low_: [Q] smallest value that each number of a world has in the box.
-        high_: [Q] largest value that each number of a world has in the box.
-        free: [K] indices of those of a world's Q numbers that are uncertain.
+        low_: [Q] smallest value in the box for each of the Q numbers of a world.
+        high_: [Q] largest value in the box for each of the Q numbers of a world.
+        free: [K] indices of the uncertain numbers among the Q numbers of a world.
         known: quantities that are the same in all worlds of the box.
         plan: [L] action of the shielded vehicle at each decision.
-        enough: bound that is small enough to stop, m2/s2.
-        cells: largest number of parts to examine.
-        only_enough: True: stop examining a part as soon as its harm is above ``enough``; a result above ``enough`` is
-            then no bound.
+        enough: the search stops as soon as the bound of the whole box is at most this number, m2/s2.
+        cells: largest number of parts of the box to examine.
+        only_enough: if True, stop examining a part of the box as soon as its harm may exceed ``enough``; a result above
+            ``enough`` is then no bound.
 
     """
     N, K, Q = known.limit.shape[0], free.shape[0], low_.shape[0]
@@ -470,14 +473,15 @@ class Boxes(NamedTuple):
     def check_possible(robust: str, scenario: Scenario, harm_count: HarmCount, others: Mapping[int, Script]) -> None:
         """Raise ``InvalidInput`` for a setting that ``robust="interior"`` cannot certify in any world.
 
-        Such settings are: total harm; more than three vehicles; an obstacle ahead; another vehicle with a script other
-        than full braking, coasting or one constant deceleration.
+        Interior mode cannot certify these settings: total harm; more than three vehicles; an obstacle ahead; another
+        vehicle with a script other than full braking, coasting or one constant deceleration.
 
         Args:
-            robust: worlds to certify: ``corners`` (with which the function never raises) or ``interior``.
+            robust: worlds of the box to certify: ``corners`` (for which the function never raises an error) or
+                ``interior``.
             scenario: the scenario of the worlds.
             harm_count: impacts that count: ``first`` (first impact of each pair) or ``total`` (every impact).
-            others: script of each other vehicle, by its index.
+            others: scripts of the other vehicles; the keys are vehicle indices.
 
         """
         if robust != INTERIOR:
@@ -508,11 +512,13 @@ class Boxes(NamedTuple):
         not the same in all worlds of the box. ``check_possible`` checks the settings that do not depend on the worlds.
 
         Args:
-            possible: [n * M] worlds, M in a row for each box: the reported world, then the corners of its box.
-            problem: the same worlds as a table with one row for each world, with the commands of the other vehicles.
+            possible: [n * M] worlds, M consecutive worlds for each box: the reported world, then the corners of its
+                box.
+            problem: table of the worlds in ``possible`` (one row for each world), including the commands of the other
+                vehicles.
             n: number of boxes.
             scenario: the scenario of the worlds.
-            others: script of each other vehicle, by its index.
+            others: scripts of the other vehicles; the keys are vehicle indices.
 
         """
         v, N, vehicle, members = possible.vehicles, possible.N, int(problem.vehicles[0]), possible.n // n
@@ -555,7 +561,7 @@ class Boxes(NamedTuple):
         """Return the boxes of all running episodes, with the new boxes (``self``) at the indices ``rows``.
 
         Args:
-            old: boxes of all episodes before the new ones begin; None: no episode has begun yet.
+            old: boxes of all episodes from before the new episodes begin; None if no episode has begun yet.
             rows: [m] indices of the new episodes. If all episodes are new, ``old`` is not used.
 
         """
@@ -571,8 +577,8 @@ class Boxes(NamedTuple):
 
         Args:
             plans: [n, L] action of the shielded vehicle at each decision, for each world.
-            harm: [n] largest harm of the plan in any corner of the box, m2/s2; the search stops when its bound is close
-                to this harm.
+            harm: [n] largest harm of each world's plan in any corner of the world's box, m2/s2; the search stops when
+                its bound is close to this harm.
 
         """
         return self.bound(np.arange(len(plans)), plans, NEAR * harm + NEARLY_NOTHING, CELLS_AT_ALERT)
@@ -580,15 +586,15 @@ class Boxes(NamedTuple):
     def bound(
         self, rows: Ints, plans: Floats, enough: Floats, cells: int = CELLS, *, only_enough: bool = False
     ) -> Floats:
-        """Return an upper bound on the harm since the alert, for each plan over all worlds of its box, [m] m2/s2.
+        """Return an upper bound on the harm since the alert, for each plan in all worlds of the plan's box, [m] m2/s2.
 
         Args:
             rows: [m] indices of the boxes.
             plans: [m, L] action of the shielded vehicle at each decision, for each box.
-            enough: [m] bound that is small enough to stop, m2/s2.
-            cells: largest number of parts of a box to examine.
-            only_enough: True: the search stops as soon as the harm may exceed ``enough``; a result above ``enough`` is
-                then no bound.
+            enough: [m] the search in a box stops as soon as the bound of the whole box is at most this number, m2/s2.
+            cells: largest number of parts of each box that the search examines.
+            only_enough: if True, the search also stops as soon as the harm may exceed ``enough``; a result above
+                ``enough`` is then no bound.
 
         """
         bounds = np.empty(len(rows))
@@ -613,7 +619,7 @@ def _refusal(what: str) -> InvalidInput:
 def checked_robust(robust: object, where: str) -> str:
     """Return ``robust`` if it is ``corners`` or ``interior``; raise ``UnknownName`` otherwise.
 
-    ``where`` names the setting at the start of the error message.
+    ``where`` is the start of the error message; it names the setting.
     """
     if robust not in CERTAINTIES:
         raise unknown_name(f"{where}: robust", robust, CERTAINTIES)

@@ -2,18 +2,19 @@
 
 A vehicle is *known* if its message has arrived or it is in sight. The estimate combines these sources:
 
-* From a known vehicle: its capacities, mass and own latency, and the newest state that was received from it. The state
-is extrapolated to the present: the vehicle follows its script from the time of the state on if a command was in force
-then, otherwise it coasts until the time at which it is expected to react. * For a vehicle that is not known: the
-scenario. Each quantity is the median of its distribution, or a chosen value of
+* A known vehicle: its capacities, mass and own latency, and the newest state that was received from it. The estimate
+  extrapolates this state to the present. If a command was in force at the time of the state, the vehicle is assumed to
+  follow its script from this time on. If not, the vehicle is assumed to coast until the time at which it is expected to
+  react.
+* The scenario, for a vehicle that is not known. Each quantity is the median of its distribution, or a chosen value of
   its range. The vehicle is assumed to follow its script from the alert on.
-* For a known vehicle whose messages lack some quantity (``v2x: tells``): the scenario, for this quantity only. A
-received place is used only together with the speed, and a received command only together with both. A received intent
-(announced command) is not used, because the script already predicts what the vehicle does. * From the vehicle itself:
-measurements of its own state, its distance since the alert, and its impacts with known
+* The scenario, for each quantity that the messages of a known vehicle lack (``v2x: tells``). A received place is used
+  only if the speed was received, too. A received command is used only if place and speed were received, too. A received
+  intent (announced command) is not used, because the script already predicts what the vehicle does.
+* The estimating vehicle itself: measurements of its own state, its distance since the alert, and its impacts with known
   neighbours.
 
-The estimate reads nothing else of the true world, so information that was not received cannot change it.
+The estimate reads nothing else of the true world, so information that was not received cannot change the estimate.
 """
 
 from __future__ import annotations
@@ -80,8 +81,8 @@ class Told(NamedTuple):
 
     @classmethod
     def to(cls, worlds: Worlds, vehicle: int) -> Told:
-        """Return the information that the vehicle with index ``vehicle`` has received in ``worlds`` by their present
-        time.
+        """Return the information that the vehicle with index ``vehicle`` has received in ``worlds`` up to the present
+        time of these worlds.
         """
         n, N = worlds.speeds_mps.shape
         known = worlds.vehicles.known_from_s[:, vehicle] <= worlds.time_s[:, np.newaxis]
@@ -144,10 +145,10 @@ def _places_of(worlds: Worlds, vehicle: int) -> Floats:
 class Ranges:
     """Ranges that a scenario declares for quantities of the vehicles that the estimating vehicle does not know.
 
-    Keys of the mappings: ``place`` (position relative to the estimating vehicle at the alert, m), ``speeds_mps``,
-    ``braking_capacity_mps2``, ``mass_t``, ``latency_s`` (latency without the delay of the alert message, s) and
-    ``news_s`` (time at which a vehicle has received the alert and may react, s; 0 without a channel). Each mapping has
-    an array [N] for each key.
+    Keys of the mappings ``middle``, ``low`` and ``high``: ``place`` (position relative to the estimating vehicle at the
+    alert, m), ``speeds_mps``, ``braking_capacity_mps2``, ``mass_t``, ``latency_s`` (latency without the delay of the
+    alert message, s) and ``news_s`` (time at which a vehicle has received the alert and may react, s; 0 without a
+    channel). For each key, a mapping has an array [N] with one value for each vehicle.
     """
 
     vehicle: int  # index of the estimating vehicle
@@ -159,11 +160,12 @@ class Ranges:
 
     @classmethod
     def of(cls, scenario: Scenario, vehicle: int, others: Mapping[int, Script] | None = None) -> Ranges:
-        """Return the ranges that ``scenario`` declares for all vehicles, for the estimates of the vehicle with index
-        ``vehicle``.
+        """Return the ranges that ``scenario`` declares for all vehicles. The vehicle with index ``vehicle`` uses them
+        for its estimates.
 
-        ``others`` are the scripts of the other vehicles by index; None: the scripts of the scenario. Raises
-        ``InvalidInput`` for a mixture of scenarios, because an unknown vehicle could belong to any of them.
+        ``others`` has the scripts of the other vehicles; the keys are vehicle indices. If ``others`` is None, the
+        scripts of the scenario are used. Raises ``InvalidInput`` for a mixture of scenarios, because an unknown vehicle
+        could belong to any of them.
         """
         if scenario.members:
             names = ", ".join(member.name for member in scenario.members)
@@ -199,9 +201,10 @@ class Ranges:
         the range.
 
         Args:
-            share: position in the range for some pairs (quantity, vehicle index): 0 is the smallest value, 1 the
-                largest. Other vehicles get the median. None: all vehicles get the median.
-            key: the quantity, a key of ``middle``.
+            share: for some pairs (quantity, vehicle index), the position of the value in its range: 0 is the smallest
+                value, 1 the largest. A vehicle without such a position gets the median. If ``share`` is None, all
+                vehicles get the median.
+            key: name of the quantity; must be a key of ``middle``.
 
         """
         value = self.middle[key].copy()
@@ -212,7 +215,7 @@ class Ranges:
 
     @property
     def uncertain(self) -> tuple[tuple[str, int], ...]:
-        """Uncertain numbers of the other vehicles, as pairs (quantity, vehicle index).
+        """The numbers of the other vehicles that are uncertain, as pairs (quantity, vehicle index).
 
         A number is uncertain if the scenario declares a range for it instead of one value.
         """
@@ -230,11 +233,12 @@ class Ranges:
 
         Args:
             worlds: the true worlds; only the information that the vehicle received is read.
-            way_m: [n] the vehicle's own distance since the alert, m.
-            share: position in the range, 0 to 1, for some pairs (quantity, vehicle index); all other quantities get
-                their median. None: the median of every quantity.
+            way_m: [n] distance that the estimating vehicle has travelled since the alert, m.
+            share: for some pairs (quantity, vehicle index), the position of the value in its range: 0 is the smallest
+                value, 1 the largest. All other values are medians. If ``share`` is None, every value is a median.
             foretold: the predicted present worlds, including impacts, and a mask [n, N]: True for a vehicle whose
-                predicted state replaces the state in its last message. None: no prediction.
+                predicted state replaces the state in its last message. If ``foretold`` is None, the estimate uses no
+                prediction.
 
         """
         worlds.refuse_build_up(":estimated")
@@ -297,9 +301,9 @@ def _places(ahead_m: Floats, behind_m: Floats, vehicle: int) -> Floats:
     behind negative.
 
     Args:
-        ahead_m: [P] gaps for the pairs in front of the vehicle, m.
-        behind_m: [P] gaps for the pairs behind the vehicle, m.
-        vehicle: index of the vehicle at position 0.
+        ahead_m: [P] gaps of the pairs, m; the function uses them only in front of ``vehicle``.
+        behind_m: [P] gaps of the pairs, m; the function uses them only behind ``vehicle``.
+        vehicle: index of the vehicle whose position is 0.
 
     """
     front = np.cumsum(ahead_m[:vehicle][::-1])[::-1]
@@ -307,12 +311,14 @@ def _places(ahead_m: Floats, behind_m: Floats, vehicle: int) -> Floats:
 
 
 def _in_order(place: Floats, known: Bools, vehicle: int) -> Floats:
-    """Correct estimated positions so that no vehicle is ahead of its predecessor, and return the positions, [n, N] m.
+    """Correct estimated positions so that no vehicle is ahead of the vehicle in front of it; return the positions, [n,
+    N] m.
 
     Args:
-        place: [n, N] position of each vehicle relative to ``vehicle``, m; changed in place.
-        known: [n, N] True for vehicles whose position is certain; their position is not changed.
-        vehicle: index of the vehicle at position 0.
+        place: [n, N] position of each vehicle relative to ``vehicle``, m; the function changes this array in place.
+        known: [n, N] True for vehicles whose position is certain; the function does not change the position of these
+            vehicles.
+        vehicle: index of the vehicle whose position is 0.
 
     """
     N = place.shape[1]

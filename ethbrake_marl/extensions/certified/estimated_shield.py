@@ -1,11 +1,11 @@
 """Shields that decide in the estimated world: they use only the information that their vehicle received.
 
-``estimated`` explains the *estimated world*. Mode ``step`` certifies every action in the estimated world in which every
-unknown quantity has its median. This mode promises nothing about the true world. Mode ``robust`` also certifies every
-action in the corners: the estimated worlds in which every unknown quantity has its smallest or largest value. If the
-true world is one of these corners, its harm up to the horizon is at most the bound at the first decision. Reason: later
-messages only remove corners that contradict them, and a new plan replaces the present plan only if it is better in the
-remaining corners.
+The module ``estimated`` explains the *estimated world*. Mode ``step`` certifies every action in the estimated world in
+which every unknown quantity has its median. Mode ``step`` promises nothing about the true world. Mode ``robust`` also
+certifies every action in the corners: the estimated worlds in which every unknown quantity has its smallest or largest
+value. If the true world is one of these corners, the harm in the true world up to the horizon is at most the bound at
+the first decision. Reason: a later message only removes corners that contradict the message, and a new plan replaces
+the present plan only if the new plan is better in the remaining corners.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ SURPRISE = 1e-6  # largest difference (m, m/s) between a measurement and its pre
 
 
 def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
-    """After a restart of the shield in ``rows``: restore the harm so far, and keep the old plan where it is at least as
-    good.
+    """After a restart of the shield in the episodes ``rows``, restore the harm so far, and keep each old plan that is
+    at least as good as the new plan.
 
-    ``shield`` has just been restarted; it is changed in place. ``before`` is a copy of the shield from before the
-    restart.
+    ``shield`` has just been restarted; the function changes it in place. ``before`` is a copy of the shield from before
+    the restart.
     """
     (running, backup), (old, held) = shield.memory[:2], before.memory[:2]
     assert running is not None and old is not None
@@ -67,19 +67,21 @@ def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
 class EstimatedShield:
     """``StepShield`` that certifies the proposed actions of one vehicle in its estimated world.
 
-    The shield starts at the first decision. It restarts when the vehicle learns of a further vehicle, learns that
-    another vehicle reacts, or sees a vehicle move otherwise than predicted. At a restart, the rest of the previous plan
-    is a candidate for the new plan. From the first decision on, ``predicted_harm`` [n] is the bound of that decision.
-    It is infinite if the vehicle had an impact before the first decision, because the harm of that impact is unknown.
+    The shield starts at the first decision. The shield restarts when its vehicle learns of a further vehicle, learns
+    that another vehicle reacts, or sees a vehicle move otherwise than predicted. After a restart, the shield keeps the
+    rest of the previous plan if this rest is at least as good as the new plan. From the first decision on,
+    ``predicted_harm`` [n] is the bound at the first decision. ``predicted_harm`` is infinite if the vehicle had an
+    impact before the first decision, because the harm of that impact is unknown.
 
     Args:
         scenario: the scenario of the worlds; a mixture raises ``InvalidInput``.
         vehicle: index of the shielded vehicle.
         harm_count: impacts that count: ``first`` (first impact of each pair) or ``total`` (every impact).
-        robust: worlds in which actions are certified. None: the world with the median of every unknown quantity.
-            ``corners``: also all corners of the ranges; more than ``MOST_CORNERS`` corners raise ``InvalidInput``.
-            ``interior``: all worlds of the box between the corners, certified only once, at the first decision.
-        others: scripts of the other vehicles by index; None: the scripts of the scenario.
+        robust: worlds in which actions are certified. None: only the world in which every unknown quantity has its
+            median. ``corners``: this world and all corners of the ranges of the unknown quantities; more than
+            ``MOST_CORNERS`` corners raise ``InvalidInput``. ``interior``: all worlds between the corners that are
+            possible at the first decision; later information then does not restart the shield.
+        others: scripts of the other vehicles; the keys are vehicle indices. None: the scripts of the scenario.
 
     """
 
@@ -123,11 +125,13 @@ class EstimatedShield:
 
     @property
     def members(self) -> int:
-        """Number of possible worlds that are certified for each true world: the median world and all corners."""
+        """Number of possible worlds in which an action is certified for each true world: the median world and all
+        corners.
+        """
         return 1 + len(self._corners())
 
     def __copy__(self) -> EstimatedShield:
-        """Return an independent copy. Decisions of the copy do not change the original shield."""
+        """Return an independent copy of the shield. Decisions of the copy do not change the original shield."""
         apart = object.__new__(EstimatedShield)
         apart.__dict__.update(self.__dict__)
         apart.shield = copy.copy(self.shield)
@@ -146,7 +150,8 @@ class EstimatedShield:
         return apart
 
     def begin(self, worlds: Worlds, rows: Ints) -> None:
-        """Start episodes at the indices ``rows`` of the batch; ``worlds`` [m] are their worlds at the alert.
+        """Start new episodes at the indices ``rows`` of the batch; ``worlds`` [m] are the worlds of these episodes at
+        the alert.
 
         Certification starts later, at the first decision, with the information received by then.
         """
@@ -166,15 +171,15 @@ class EstimatedShield:
     ) -> Floats:
         """Return the certified actions, [n], from -1 (full braking) to 1; 0 before the vehicle's latency has elapsed.
 
-        A repeated call at the same time returns the same actions. Raises ``InvalidInput`` for an episode without
-        ``begin``.
+        A repeated call at the same time returns the same actions. Raises ``InvalidInput`` for an episode that was not
+        started with ``begin``.
 
         Args:
             worlds: the true worlds; only the information that the vehicle received is read.
             proposed: [n] proposed actions.
             proposer: the policy and its memory. If no other plan certifies a proposal, the shield also tries the
-                policy's rollout in the estimated worlds. None: it tries no rollout.
-            only: [n] True for worlds in which the vehicle decides now; None: all worlds.
+                policy's rollout in the estimated worlds. If ``proposer`` is None, the shield tries no rollout.
+            only: [n] True for worlds in which the vehicle decides now; None means all worlds.
 
         """
         shield, vehicle = self.shield, self.vehicle
@@ -198,13 +203,13 @@ class EstimatedShield:
         return self._wanted.copy()
 
     def _begin_anew(self, worlds: Worlds, estimated: Worlds, way_m: Floats, due: Bools) -> None:
-        """Start the inner shield in worlds where it has not started, and restart it where new information requires
-        this.
+        """Start the inner shield (``self.shield``) in worlds where it has not started; restart it where new information
+        requires this.
 
         Args:
             worlds: the true worlds.
             estimated: the estimated worlds.
-            way_m: [n] the vehicle's distance since the alert, m.
+            way_m: [n] distance that the shielded vehicle has travelled since the alert, m.
             due: [n] True for worlds that have a decision now.
 
         """
@@ -237,15 +242,15 @@ class EstimatedShield:
     def _begin_shield(
         self, worlds: Worlds, estimated: Worlds, way_m: Floats, rows: Ints, keeps: Bools, before: StepShield | None
     ) -> None:
-        """Start the inner shield in ``rows``, with the median world and, in mode robust, the corners of the unknown
-        ranges.
+        """Start the inner shield (``self.shield``) in the episodes ``rows``. It certifies actions in the median world
+        and, in mode ``robust``, in the corners of the ranges of unknown quantities.
 
         Args:
-            worlds: the true worlds of these rows.
-            estimated: the estimated worlds of these rows.
-            way_m: [rows] distance of the vehicle since the alert, m.
-            rows: indices of the episodes in the batch.
-            keeps: mask of the vehicles, [rows, N], whose predicted state is better than their received state.
+            worlds: the true worlds of the episodes ``rows``.
+            estimated: the estimated worlds of the episodes ``rows``.
+            way_m: [m] distance that the shielded vehicle has travelled since the alert, m.
+            rows: [m] indices of the episodes in the batch.
+            keeps: [m, N] True for vehicles whose predicted state replaces their received state.
             before: the inner shield before the restart; None at the first start.
 
         """
@@ -262,10 +267,10 @@ class EstimatedShield:
         self.shield.begin(parts[0], rows, possible=Uncertainty.interleaved(parts))
 
     def _keeps(self, received: Told, time_s: Floats) -> Bools:
-        """Return a mask [n, N] of the vehicles whose predicted state is better than their received state.
+        """Return a mask [n, N]: True for each vehicle whose predicted state replaces its received state.
 
-        Such a vehicle is unknown, or its last message is older than its last predicted impact or contact. ``received``
-        is the received information, ``time_s`` [n] the present time.
+        The mask is True if a vehicle is unknown, or if its last message is older than its last predicted impact or
+        contact. ``received`` has the received information; ``time_s`` [n] is the present time.
         """
         running = self.shield.memory.running
         if running is None:
@@ -282,10 +287,10 @@ class EstimatedShield:
         return keeps
 
     def _note_impacts(self, worlds: Worlds) -> None:
-        """Store the present time as the time of impact of vehicles that had an impact in any certified world since the
-        last decision.
+        """Store the present time as the time of the last impact for each vehicle that had an impact since the last
+        decision in any possible world.
 
-        ``worlds`` are the true worlds now.
+        ``worlds`` are the true worlds at the present time.
         """
         running = self.shield.memory.running
         assert running is not None
@@ -299,11 +304,12 @@ class EstimatedShield:
         self._totals = totals.copy()
 
     def _is_surprised(self, estimated: Worlds, heard: Bools) -> Bools:
-        """Return a mask [n] of the worlds in which a vehicle is outside the range of its predicted states.
+        """Return a mask [n]: True for each world in which the state of a vehicle is outside the range of its predicted
+        states.
 
         Args:
-            estimated: the estimated worlds now, [n].
-            heard: [n, N] True for vehicles whose received state is compared.
+            estimated: the estimated worlds at the present time, [n].
+            heard: [n, N] True for vehicles whose received state is compared with the predicted states.
 
         """
         running = self.shield.memory.running

@@ -27,15 +27,15 @@ class Odometer(NamedTuple):
 
     @classmethod
     def begun(cls, alert: Worlds, vehicle: int) -> Odometer:
-        """Return the odometer of the vehicle with index ``vehicle`` at the start of episodes in the worlds ``alert``,
-        [n].
+        """Return an odometer for the vehicle with index ``vehicle`` at the start of episodes; ``alert`` [n] are the
+        worlds at the alert.
         """
         return cls(np.zeros(alert.n), alert.time_s.copy(), alert.speeds_mps[:, vehicle].copy())
 
     def look(self, worlds: Worlds, vehicle: int) -> Odometer:
-        """Return the odometer for the present time; ``worlds`` [n] are the present worlds. The method adds the distance
-        since the last decision: mean speed times time, or the stopping distance if a braking vehicle stopped. This is
-        exact if the command was constant.
+        """Return the odometer advanced to the present time; ``worlds`` [n] are the present worlds. The method adds the
+        distance since the last decision: mean speed times time, or the stopping distance if a braking vehicle stopped.
+        The added distance is exact if the command was constant.
         """
         speed, command, before = worlds.speeds_mps[:, vehicle], worlds.command_mps2[:, vehicle], self.speed_mps
         way = 0.5 * (before + speed) * (worlds.time_s - self.time_s)
@@ -45,7 +45,7 @@ class Odometer(NamedTuple):
 
 
 class Estimating(AgentAround):
-    """Agent that lets another agent, ``policy``, control its vehicle in the estimated world.
+    """Agent that lets another agent, ``policy``, control its vehicle on the basis of the estimated world.
 
     The policy starts at its first decision, with the information received by then. The policy restarts in a world when
     the vehicle learns of a further vehicle, or when a message over a channel says that another vehicle reacts. The
@@ -55,8 +55,7 @@ class Estimating(AgentAround):
     Args:
         policy: any agent that reads the state of the line.
         scenario: the scenario, which declares the ranges of all unknown quantities; a mixture raises ``InvalidInput``.
-        shows: True: the policy sees the estimated world at every decision. False: the policy sees it only when it
-            starts.
+        shows: if True, the policy sees the estimated world at every decision; if False, only when the policy starts.
 
     """
 
@@ -72,9 +71,9 @@ class Estimating(AgentAround):
         return Knowledge((Source.ESTIMATES,))
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Return the memory at the start of episodes, as a mapping.
+        """Return the agent's memory at the start of episodes, as a mapping.
 
-        The policy has not started yet, because nothing has been received.
+        The policy does not start here, because the vehicle has not received any information yet.
 
         Args:
             alert: the worlds at the alert, [n].
@@ -90,7 +89,7 @@ class Estimating(AgentAround):
         }
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """Return the policy's command, [n] m/s2, and the new memory.
+        """Return the policy's command, [n] m/s2, and the agent's new memory.
 
         Args:
             worlds: the true worlds; only the information that the vehicle received is read.
@@ -116,11 +115,11 @@ class Estimating(AgentAround):
         return estimated
 
     def _heard(self, worlds: Worlds, vehicle: int) -> Floats:
-        """Return a summary of what ``vehicle`` has received about each vehicle, [n, 2 N].
+        """Return a summary of the information that ``vehicle`` has received about each vehicle, [n, 2 N].
 
-        The first N columns are the amount of information (``Told.heard``). The other N columns are 1 if a message says
-        that the vehicle reacts and the reaction was not predicted. The policy restarts in worlds where this summary
-        changes. ``worlds`` are the true worlds now.
+        The first N columns have the amount of information about each vehicle (``Told.heard``). The other N columns have
+        a 1 for each vehicle whose reaction was reported in a message but not predicted, and a 0 for all others. The
+        policy restarts in worlds where this summary changes. ``worlds`` are the true worlds at the present time.
         """
         known = Told.to(worlds, vehicle)
         # a received latency predicts the reaction, unless a channel may delay the reaction
@@ -134,10 +133,11 @@ class Estimating(AgentAround):
 
 
 class EstimatingHybrid(Estimating):
-    """The paper's Algorithm 1 in the estimated world: it chooses between the policy and E-V2X-BM at the first decision.
+    """The paper's Algorithm 1 in the estimated world. At the first decision the agent chooses between the policy and
+    E-V2X-BM.
 
-    E-V2X-BM is the best constant deceleration. Whichever of the two predicts less harm controls the vehicle for the
-    whole episode.
+    E-V2X-BM is the best constant deceleration. The agent predicts the harm of the policy and of E-V2X-BM, and lets the
+    one with less predicted harm control the vehicle for the whole episode.
     """
 
     policy: HybridAgent

@@ -1,4 +1,6 @@
-"""Registry entries of this extension: the shield ``+robust``, and ``:estimated`` for agents and shields."""
+"""Agents and shields that this extension registers: the shield ``+robust``, and ``:estimated`` variants of other agents
+and shields.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +25,9 @@ def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings
 
     Args:
         policy: the agent to shield.
-        argument: ``corners``, ``interior``, or None for ``corners``.
-        settings: scenario, uncertainty and harm count; the agent's spec appears in error messages.
+        argument: which worlds of the box to certify: ``corners`` or ``interior``; None means ``corners``.
+        settings: settings of the agent: its scenario, uncertainty and harm count, and its spec (the text that asked for
+            the agent) for error messages.
 
     """
     where = f"agent {settings.spec!r}"
@@ -38,13 +41,14 @@ def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings
 def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
     """Make the shield ``+robust:estimated`` or ``+robust:interior:estimated``.
 
-    The shield certifies actions in the estimated world and in the ranges of the quantities that its vehicle did not
-    receive.
+    The shield certifies actions in the estimated world, and also for other values of the quantities that its vehicle
+    did not receive, within the ranges of these quantities.
 
     Args:
         policy: the agent to shield.
-        argument: ``corners``, ``interior``, or None for ``corners``.
-        settings: scenario and harm count; the agent's spec appears in error messages.
+        argument: which worlds of the box to certify: ``corners`` or ``interior``; None means ``corners``.
+        settings: settings of the agent: its scenario, its harm count, and its spec (the text that asked for the agent)
+            for error messages.
 
     """
     where = f"agent {settings.spec!r}"
@@ -57,12 +61,13 @@ def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: 
 def shield_steps_as_estimated(policy: Driver, argument: str | None, settings: AgentSettings) -> Driver:
     """Make the shield ``+step:estimated``, which certifies every action of ``policy`` in the estimated world.
 
-    Raises ``InvalidInput`` for a team or several learners.
+    Raises ``InvalidInput`` if ``policy`` is a team or if the scenario has several learners.
 
     Args:
         policy: the agent to shield.
         argument: not used.
-        settings: scenario and harm count; the agent's spec appears in error messages.
+        settings: settings of the agent: its scenario, its harm count, and its spec (the text that asked for the agent)
+            for error messages.
 
     """
     scenario = settings.needed_scenario()
@@ -77,14 +82,15 @@ def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: 
     """Make the shield ``+episode:estimated`` or ``+episode:pairwise:estimated``: the paper's Algorithm 1 on estimates.
 
     At the first decision the shield predicts, in the estimated world, the harm of ``policy`` and of E-V2X-BM (the best
-    constant deceleration). Whichever of the two has less predicted harm controls the whole episode.
+    constant deceleration). The one with less predicted harm controls the vehicle for the whole episode.
 
-    Raises ``InvalidInput`` for an agent that already decides on received information.
+    Raises ``InvalidInput`` if ``policy`` already decides on received information.
 
     Args:
         policy: the agent to compare with E-V2X-BM.
-        argument: ``pairwise`` or None.
-        settings: scenario; the agent's spec appears in error messages.
+        argument: ``pairwise`` for the pairwise form of E-V2X-BM, None for the coupled form.
+        settings: settings of the agent: its scenario, its harm count, and its spec (the text that asked for the agent)
+            for error messages.
 
     """
     hybrid = shield_episodes(policy, argument, settings)
@@ -99,8 +105,8 @@ def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: 
 def make_estimating_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
     """Make the agent ``e_v2x_bm:estimated`` or ``e_v2x_bm:pairwise:estimated``.
 
-    The agent is E-V2X-BM (the best constant deceleration) in the estimated world. ``argument`` is ``pairwise`` or None;
-    ``settings`` has the scenario.
+    The agent is E-V2X-BM (the best constant deceleration) in the estimated world. ``argument`` is ``pairwise`` for the
+    pairwise form of E-V2X-BM, or None for the coupled form. ``settings`` has the scenario.
     """
     return Estimating(make_e_v2x_bm(argument, settings), settings.needed_scenario())
 

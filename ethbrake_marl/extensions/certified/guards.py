@@ -19,32 +19,36 @@ from ethbrake_marl.shields.guard import StepGuard
 
 
 class RobustMode(IntEnum):
-    """Number of mode ``robust`` in the info ``shield_mode``; ``eb.ShieldMode`` has the numbers of the other modes."""
+    """Number by which the info ``shield_mode`` reports mode ``robust``; ``eb.ShieldMode`` has the numbers of the other
+    modes.
+    """
 
     ROBUST = 2
 
 
 class RobustGuard(StepGuard):
-    """Guard of mode ``robust``: in each step of the engine, a ``RobustShield`` decides which actions are applied."""
+    """Guard of mode ``robust``: at each step of the engine, a ``RobustShield`` decides which actions the engine
+    applies.
+    """
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos of a step as a mapping. ``members`` is the number of possible worlds that are certified for
-        each true world.
+        """Return the infos of a step as a mapping. The info ``members`` is the number of possible worlds in which an
+        action is certified for each true world.
 
         Args:
-            memory: shield and policies after the step.
-            ruling: decision of the step; None at the reset.
+            memory: the shield and the policies as they are after the step.
+            ruling: the shield's decision in this step; None at the reset of the environment.
 
         """
         return super().tell(memory, ruling) | {"members": memory.shield.memory.running.members}
 
 
 class EstimatedGuard(ShieldGuard):
-    """Guard of modes ``step`` and ``robust`` in the estimated world: an ``EstimatedShield`` decides which actions are
-    applied.
+    """Guard of modes ``step`` and ``robust`` in the estimated world: an ``EstimatedShield`` decides which actions the
+    engine applies.
 
-    Its bound on harm exists from the first decision on and holds in the estimated world. The guard does not compare the
-    true motion with the prediction: estimates may be wrong, so a difference is no error.
+    The shield promises a bound on harm from the first decision on; this bound holds in the estimated world. The guard
+    does not compare the true motion with the predicted motion: estimates may be wrong, so a difference is no error.
     """
 
     def _started(self, shield: EstimatedShield, alert: Worlds, rows: Ints) -> EstimatedShield:
@@ -55,8 +59,8 @@ class EstimatedGuard(ShieldGuard):
         """Return the proposed actions and the actions to apply, which are certified in the estimated worlds.
 
         Args:
-            running: the engine before the step.
-            memory: shield and policies before the step.
+            running: the engine as it is before the step.
+            memory: the shield and the policies as they are before the step.
             proposed: [n, 1] proposed actions.
 
         """
@@ -71,8 +75,9 @@ class EstimatedGuard(ShieldGuard):
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
         """Return the infos of a step that is certified in the estimated worlds, as a mapping.
 
-        ``trusted`` is true in mode ``robust``, because only there the bound may also hold in the true world. ``memory``
-        has the shield after the step; ``ruling`` is its decision (None at the reset).
+        The info ``trusted`` is true in mode ``robust`` and false in mode ``step``, because only in mode ``robust`` may
+        the bound also hold in the true world. ``memory`` has the shield as it is after the step. ``ruling`` is the
+        shield's decision in this step, or None at the reset of the environment.
         """
         estimated: EstimatedShield = memory.shield
         robust, shield = estimated.robust is not None, estimated.shield

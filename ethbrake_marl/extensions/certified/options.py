@@ -1,4 +1,6 @@
-"""Checked settings of ``robust`` and ``estimated`` shields; the settings object also makes the shield and its guard."""
+"""Settings of ``robust`` and ``estimated`` shields. The settings object checks its values and makes the shield and its
+guard.
+"""
 
 from __future__ import annotations
 
@@ -25,14 +27,14 @@ class RobustOptions(ShieldOptions):
     """``eb.ShieldOptions`` with further settings for incomplete knowledge.
 
     Args:
-        mode: a mode of ``eb.ShieldOptions``, or ``robust``: mode ``step`` extended to uncertain worlds. None:
-            ``robust`` if there is an uncertainty, else ``step``.
-        uncertainty: uncertainty for mode ``robust``, such as ``"gaps_m=0.5"``.
-        robust: worlds that mode ``robust`` certifies: the ``corners`` of the uncertainty (fast) or its whole
-            ``interior``.
-        estimated: True: certify in the estimated world, which uses only the information that the vehicle received.
-            Possible in modes ``step`` and ``robust`` with one learner, and without ``uncertainty``, ``allowance``,
-            ``cap``, ``logging`` and ``shares``.
+        mode: a mode of ``eb.ShieldOptions``, or ``robust``, which extends mode ``step`` to uncertain worlds. None means
+            ``robust`` if ``uncertainty`` is given, and ``step`` if it is not.
+        uncertainty: for mode ``robust``, an interval around each uncertain quantity, such as ``"gaps_m=0.5"``.
+        robust: worlds in which mode ``robust`` certifies actions: only the ``corners`` of the intervals (fast), or the
+            whole ``interior`` of the intervals.
+        estimated: if True, certify actions in the estimated world, which uses only the information that the vehicle
+            received and the scenario's ranges. ``estimated=True`` is possible in modes ``step`` and ``robust`` with one
+            learner, and without ``uncertainty``, ``allowance``, ``cap``, ``logging`` and ``shares``.
 
     Raises ``InvalidInput`` and ``UnknownName`` as ``eb.ShieldOptions`` does.
 
@@ -68,9 +70,9 @@ class RobustOptions(ShieldOptions):
 
     @property
     def written(self) -> str:
-        """The part of an agent spec after the ``+`` that asks for this shield.
+        """Text after the ``+`` in the spec of an agent that has a shield with these settings.
 
-        For instance ``robust:interior:estimated`` in ``ppo+robust:interior:estimated``.
+        For instance, this text is ``robust:interior:estimated`` in the spec ``ppo+robust:interior:estimated``.
         """
         robust = "" if self.robust == CORNERS else f":{self.robust}"
         return f"{self.mode}{robust}{':estimated' if self.estimated else ''}"
@@ -83,10 +85,11 @@ class RobustOptions(ShieldOptions):
     def shield(
         self, scenario: Scenario, vehicle: int | tuple[int, ...], others: Mapping[int, Script] | None = None
     ) -> Any:
-        """Return a new shield for ``vehicle``, before any episode.
+        """Return a new shield for ``vehicle``; no episode has begun in this shield.
 
-        ``vehicle`` is an index, or several indices for modes that shield several vehicles. ``others`` are the scripts
-        of the other vehicles by index; None: the scripts of the scenario.
+        ``vehicle`` is the index of the shielded vehicle, or several indices for modes that shield several vehicles.
+        ``others`` has the scripts of the other vehicles; the keys are vehicle indices. If ``others`` is None, the
+        scripts of the scenario are used.
         """
         if self.estimated:
             assert isinstance(vehicle, int)
@@ -115,8 +118,8 @@ class RobustOptions(ShieldOptions):
 
         Args:
             engine: the engine whose learners are shielded.
-            policies: agents that propose the actions, by vehicle index.
-            several: True: one shield decides for all learners together.
+            policies: agents that propose the actions; the keys are vehicle indices.
+            several: True if one shield decides for all learners together.
             how: further keyword arguments of ``StepGuard``.
 
         """
@@ -138,8 +141,9 @@ class RobustOptions(ShieldOptions):
 
 
 def checked_uncertainty(given: object) -> Uncertainty | None:
-    """Return ``given`` as an ``Uncertainty``, or None if ``given`` is None. A text such as ``"gaps_m=0.5"`` is parsed.
-    Raises ``InvalidInput`` if ``given`` is anything else.
+    """Return ``given`` as an ``Uncertainty``, or None if ``given`` is None. If ``given`` is a text such as
+    ``"gaps_m=0.5"``, the function parses it. Raises ``InvalidInput`` if ``given`` is not an ``Uncertainty``, a text or
+    None.
     """
     if given is None or isinstance(given, Uncertainty):
         return given
@@ -151,10 +155,11 @@ def checked_uncertainty(given: object) -> Uncertainty | None:
 
 
 def mode_uncertainty(mode: str, given: object, where: str) -> Uncertainty | None:
-    """Return the checked uncertainty for a shield mode, or None if there is none.
+    """Return the uncertainty ``given`` as an ``Uncertainty``, after a check that it fits the shield mode ``mode``; None
+    if ``given`` is None.
 
     Raises ``InvalidInput`` if mode ``robust`` has no uncertainty, or another mode has one; ``where`` is the beginning
-    of the error message. ``given`` is an ``Uncertainty``, its text, or None.
+    of the error message. ``given`` is an ``Uncertainty``, a text such as ``"gaps_m=0.5"``, or None.
     """
     uncertainty = checked_uncertainty(given)
     if (mode == "robust") != (uncertainty is not None):

@@ -1,6 +1,7 @@
 """Simulate all worlds of a box along paths: where a pair has an impact in some worlds only, a new path branches off.
 
-A *path* is a set of worlds with the same sequence of impacts (``affine.Path``). A *cell* is a box with its commands.
+A *path* is a set of worlds with the same sequence of impacts (``affine.Path``). A *cell* is a box (all worlds whose
+uncertain numbers lie in given intervals) together with the vehicles' commands over time.
 """
 
 from __future__ import annotations
@@ -87,7 +88,7 @@ def new_stack(N: int, width: int) -> Stack:
 def keep_worst(harm: Floats, worst: float, out: Floats) -> float:
     """Return the larger of ``worst`` and the largest value of the affine form ``harm`` [W], m2/s2.
 
-    If the value of ``harm`` is the larger one, ``harm`` is copied to ``out`` [W].
+    If the largest value of ``harm`` is above ``worst``, the function copies ``harm`` to ``out`` [W].
     """
     if not high(harm) <= worst:
         out[:] = harm
@@ -99,13 +100,15 @@ def keep_worst(harm: Floats, worst: float, out: Floats) -> float:
 def keep_rough(cell: Cell, path: Path, worst: float, out: Floats) -> float:
     """Record a rough bound on the harm of a path that is no longer simulated; return the largest harm recorded so far.
 
-    The rough bound (``rough_harm``) uses only the largest speeds that are still possible.
+    The rough bound (``rough_harm``) uses only the largest speeds that the vehicles can still reach.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
-        worst: largest harm recorded so far, m2/s2.
-        out: [W] receives the affine form of the harm if this harm is the largest so far.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
+        worst: largest harm recorded before this call, m2/s2.
+        out: array [W]; if the function records a new largest harm, it writes this harm here as an affine form (centre,
+            slopes, remainder).
 
     """
     return keep_with(np.zeros(cell.speed.shape[1]), rough_harm(cell, path, -1), worst, out)
@@ -117,18 +120,23 @@ def branch(
 ) -> float:
     """Handle the worlds in which pair ``p`` has an impact in this piece; return the largest harm recorded so far.
 
-    If no other impact can follow, the harm of these worlds is final and is recorded. Otherwise the worlds become a new
-    path on the stack. If that path cannot be simulated, a rough bound (``rough_harm``) is recorded instead.
+    If no other impact can follow, the harm of these worlds is final and is recorded. If another impact can follow, the
+    worlds become a new path on the stack. If the new path cannot be simulated, a rough bound on its harm
+    (``rough_harm``) is recorded instead.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
-        stack: paths that still have to be simulated; the function adds new paths.
-        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
+        stack: paths (sets of worlds with the same impacts so far) that still have to be simulated; the function may add
+            paths.
+        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
+            ``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        how: closing speed and time of the contact (from ``approach``).
-        worst: largest harm recorded so far, m2/s2.
-        out: [W] receives the affine form of the harm if this harm is the largest so far.
+        how: closing speed and time of the contact of pair ``p``, as ``approach`` returns them.
+        worst: largest harm recorded before this call, m2/s2.
+        out: array [W]; if the function records a new largest harm, it writes this harm here as an affine form (centre,
+            slopes, remainder).
 
     """
     P = cell.gap.shape[0]
@@ -163,8 +171,8 @@ def branch(
 @compiled(apart=True)
 def keep_with(harm: Floats, rest: float, worst: float, out: Floats) -> float:
     """Record the affine form ``harm`` [W] plus ``rest``, and return the largest harm recorded so far, m2/s2. ``rest``
-    is an upper bound on the harm of later impacts, m2/s2. ``worst`` is the largest harm recorded so far; ``out`` [W]
-    receives the affine form of a new largest harm.
+    is an upper bound on the harm of later impacts, m2/s2. ``worst`` is the largest harm recorded before this call. If
+    the function records a new largest harm, it writes the affine form of this harm into ``out`` [W].
     """
     whole = harm.copy()
     whole[0] += rest
@@ -173,20 +181,22 @@ def keep_with(harm: Floats, rest: float, worst: float, out: Floats) -> float:
 
 @compiled(apart=True)
 def closing_after(cell: Cell, path: Path, motion: Motion, p: int, speed: Floats, time: Floats, length: float) -> Floats:
-    """Return the closing speed (m/s) of the other pair if its impact may follow the impact of pair ``p`` in the same
-    piece.
+    """Return the closing speed (m/s) of the other pair if the other pair may have its impact after the impact of pair
+    ``p`` in the same piece.
 
-    The line has three vehicles. The result is an affine form [W] (centre, slopes, remainder); it is 0 if the other pair
-    cannot have contact.
+    The function is for a line of three vehicles, which has two pairs. The result is an affine form [W] (centre, slopes,
+    remainder); it is 0 if the other pair cannot have contact.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
-        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
+        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
+            ``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         speed: closing speed at the impact of pair ``p`` as an affine form [W], m/s.
         time: time of the impact of pair ``p`` as an affine form [W], s after the start of the piece.
-        length: length of the piece, s.
+        length: duration of the piece (time interval of constant command), s.
 
     """
     N, other = cell.speed.shape[0], 1 - p
@@ -217,12 +227,15 @@ def strike(
     (``thrown_back``).
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
-        stack: paths that still have to be simulated; the function adds new paths.
-        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
+        stack: paths (sets of worlds with the same impacts so far) that still have to be simulated; the function may add
+            paths.
+        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
+            ``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        how: closing speed and time of the contact (from ``approach``).
+        how: closing speed and time of the contact of pair ``p``, as ``approach`` returns them.
         speed: closing speed at the impact as an affine form [W] (centre, slopes, remainder), m/s.
         harm: harm including this impact as an affine form [W], m2/s2.
 
@@ -295,14 +308,16 @@ def may_only_touch(cell: Cell, path: Path, motion: Motion, p: int, how: Approach
     """Return whether pair ``p`` may reach gap 0 at closing speed 0, exactly when its vehicles begin to press on each
     other.
 
-    This is possible only if a command changes or an acceleration builds up.
+    Such a contact at closing speed 0 is possible only if a command changes or an acceleration builds up.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
-        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
+        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
+            ``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        how: closing speed and time of the contact (from ``approach``).
+        how: closing speed and time of the contact of pair ``p``, as ``approach`` returns them.
 
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
@@ -326,13 +341,14 @@ def may_only_touch(cell: Cell, path: Path, motion: Motion, p: int, how: Approach
 def may_turn(cell: Cell, motion: Motion, p: int, piece: int) -> bool:
     """Return whether accelerations that build up may press the vehicles of pair ``p`` together harder within a piece.
 
-    The front vehicle's acceleration may fall, or the rear vehicle's acceleration may rise.
+    Either the front vehicle's acceleration may fall, or the rear vehicle's acceleration may rise.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
+            ``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        piece: index of the piece, 0 to J - 1.
+        piece: index of the piece (time interval of constant command), from 0 to J - 1.
 
     """
     return may_move(cell, motion, p, piece, 0) or may_move(cell, motion, p + 1, piece, 1)
@@ -340,14 +356,16 @@ def may_turn(cell: Cell, motion: Motion, p: int, piece: int) -> bool:
 
 @compiled(apart=True)
 def may_move(cell: Cell, motion: Motion, i: int, piece: int, which: int) -> bool:
-    """Return whether brake build-up may lower (``which`` 0) or raise (``which`` 1) an acceleration within a piece.
+    """Return whether brake build-up may lower (``which=0``) or raise (``which=1``) the acceleration of vehicle ``i``
+    within a piece.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
+            ``move_alone``).
         i: index of the vehicle.
-        piece: index of the piece, 0 to J - 1.
-        which: 0 or 1.
+        piece: index of the piece (time interval of constant command), from 0 to J - 1.
+        which: 0 asks whether the acceleration may fall, 1 whether it may rise.
 
     """
     if not cell.forces.build[i] or motion.vague[i] > cell.forces.swing[i, piece + 1].max():
@@ -360,16 +378,20 @@ def touch_only(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, len
     """Put a second path on the stack: the worlds in which pair ``p`` came into contact without an impact and stayed in
     contact.
 
-    With brake build-up the pair may separate and have its first impact within the piece. The path just below on the
-    stack covers the worlds in which this happens. Returns False if the stack is full.
+    With brake build-up the pair may separate and have its first impact within the piece. The path just below the second
+    path on the stack covers the worlds in which the pair separates and has this impact. Returns False if the stack is
+    full.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
-        stack: paths that still have to be simulated; the function adds new paths.
-        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
+        stack: paths (sets of worlds with the same impacts so far) that still have to be simulated; the function may add
+            paths.
+        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
+            ``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        length: length of the piece, s.
+        length: duration of the piece (time interval of constant command), s.
 
     """
     size = stack.size[0]
@@ -392,17 +414,19 @@ def touch_only(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, len
 
 @compiled(apart=True)
 def thrown_back(cell: Cell, path: Path, motion: Motion, p: int, how: Approach, speed: Floats) -> bool:
-    """Return whether the rear vehicle may move backwards after the impact of pair ``p`` and be hit again.
+    """Return whether the rear vehicle of pair ``p`` may move backwards after the impact of the pair and be hit again.
 
-    The result is False for the last vehicle of the line if it never drives: no vehicle is behind it, so its backward
-    motion cannot lead to an impact.
+    The result is False for the last vehicle of the line if it never drives: no vehicle is behind the last vehicle, so
+    its backward motion cannot lead to an impact.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
-        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
+        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
+            ``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        how: closing speed and time of the contact (from ``approach``).
+        how: closing speed and time of the contact of pair ``p``, as ``approach`` returns them.
         speed: closing speed at the impact as an affine form [W] (centre, slopes, remainder), m/s.
 
     """
@@ -420,15 +444,16 @@ MOST_PATHS = 4000  # largest number of paths to simulate in one cell
 
 @compiled(apart=True)
 def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float) -> float:
-    """Return an upper bound on the harm in all worlds of the cell, m2/s2. A result above ``most`` is no bound, because
-    the search then stopped early.
+    """Return an upper bound on the harm in all worlds of the cell's box, m2/s2. A result above ``most`` is no bound,
+    because the search then stopped early.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        stack: working memory for paths (each a set of worlds with the same impacts).
-        motion: working memory for the motion of each vehicle.
-        out: [W] receives the affine form of the largest harm, whose largest value is the bound.
-        most: harm above which the search stops, m2/s2.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        stack: memory that the search overwrites; it stores the paths (sets of worlds with the same impacts so far).
+        motion: memory that the function overwrites; it stores the motion of each vehicle in the present piece.
+        out: [W]; the function writes the affine form of the largest harm into it. The bound is the largest value of
+            this form.
+        most: the search stops as soon as the harm of some world may exceed this number, m2/s2.
 
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
@@ -455,18 +480,20 @@ def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float
 
 @compiled(apart=True)
 def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
-    """Simulate a path to its end, and return the largest recorded harm, m2/s2.
+    """Simulate a path (worlds with the same impacts so far) to its end; return the largest harm recorded so far, m2/s2.
 
     The function records the harm of the path, and of each path that branches off and needs no further simulation.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece; changed in
-            place.
-        stack: paths that still have to be simulated; the function adds new paths.
-        motion: working memory for the motion of each vehicle.
-        worst: largest harm recorded so far, m2/s2.
-        out: [W] receives the affine form of the harm if this harm is the largest so far.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command); the function updates this state in place.
+        stack: paths (sets of worlds with the same impacts so far) that still have to be simulated; the function may add
+            paths.
+        motion: memory that the function overwrites; it stores the motion of each vehicle in the present piece.
+        worst: largest harm recorded before this call, m2/s2.
+        out: array [W]; if the function records a new largest harm, it writes this harm here as an affine form (centre,
+            slopes, remainder).
 
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
@@ -493,14 +520,17 @@ def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, o
 
 @compiled(apart=True)
 def may_meet_unseen(cell: Cell, path: Path, motion: Motion) -> bool:
-    """Return whether a pair that is in contact without an impact so far may have its first impact in the present piece.
+    """Return whether a pair that is in contact, but has had no impact yet, may have its first impact in the present
+    piece.
 
-    The vehicles of such a pair must separate before they can have an impact.
+    The vehicles of a pair in contact must separate before they can have an impact.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
-        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
+        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
+            ``move_alone``).
 
     """
     P = cell.gap.shape[0]
@@ -516,17 +546,20 @@ def may_meet_unseen(cell: Cell, path: Path, motion: Motion) -> bool:
 def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
     """Move the pairs in contact through the present piece, and branch off the worlds in which a pair has an impact.
 
-    The vehicles of a pair in contact move as one body, or separate. Worlds with an impact are recorded or put on the
-    stack (``branch``). Returns the largest recorded harm, m2/s2.
+    The vehicles of a pair in contact move as one body, or separate. For worlds with an impact, ``branch`` records the
+    harm or puts the worlds on the stack. Returns the largest harm recorded so far, m2/s2.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece; changed in
-            place.
-        stack: paths that still have to be simulated; the function adds new paths.
-        motion: motion of each vehicle in the present piece; changed in place.
-        worst: largest harm recorded so far, m2/s2.
-        out: [W] receives the affine form of the harm if this harm is the largest so far.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command); the function updates this state in place.
+        stack: paths (sets of worlds with the same impacts so far) that still have to be simulated; the function may add
+            paths.
+        motion: motion of each vehicle in the present piece (time interval of constant command); the function changes it
+            in place.
+        worst: largest harm recorded before this call, m2/s2.
+        out: array [W]; if the function records a new largest harm, it writes this harm here as an affine form (centre,
+            slopes, remainder).
 
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
@@ -573,14 +606,15 @@ def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out
 
 @compiled(apart=True)
 def go_on(cell: Cell, path: Path, motion: Motion) -> bool:
-    """Advance the path to the end of the present piece without an impact. Return False if the path has no world without
-    an impact in this piece.
+    """Advance the path to the end of the present piece, for the worlds without an impact in this piece. Return False if
+    every world of the path has an impact in this piece.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece; changed in
-            place.
-        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command); the function updates this state in place.
+        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
+            ``move_alone``).
 
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]

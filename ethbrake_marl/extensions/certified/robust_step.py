@@ -1,9 +1,10 @@
 """Step shield for uncertain worlds: it certifies plans in the corners of the box of possible worlds, or in the whole
 box.
 
-The *members* of a world are the worlds in which ``StepShield`` certifies a plan. For this shield the members are the
-reported world and the corners of an ``Uncertainty``. With ``robust="interior"`` the shield also bounds the harm of
-every plan over the whole box between the corners (``enclosure.Boxes``), at the alert and at every decision.
+``StepShield`` certifies each plan in several possible worlds, which are called the *members* of a world. For this
+shield the members are the reported world and the corners of an ``Uncertainty``. With ``robust="interior"`` the shield
+also bounds the harm of every plan over the whole box between the corners (``enclosure.Boxes``), at the alert and at
+every decision.
 """
 
 from __future__ import annotations
@@ -33,16 +34,18 @@ class RobustShield(StepShield):
 
     Args:
         scenario: the scenario of all worlds.
-        vehicle: index of the shielded vehicle; with an uncertainty there may be only one.
-        uncertainty: intervals around the reported quantities; None: the caller passes the ``possible`` worlds to
-            ``begin``.
-        robust: worlds to certify: ``corners`` or ``interior``.
+        vehicle: index of the shielded vehicle, or several indices; if ``uncertainty`` is given, only one vehicle is
+            possible.
+        uncertainty: intervals around the reported quantities. If ``uncertainty`` is None, the caller must pass the
+            possible worlds to ``begin`` (argument ``possible``).
+        robust: worlds in which actions are certified: ``corners`` (of the box of possible worlds) or ``interior`` (the
+            whole box).
         harm_count: impacts that count: ``first`` (first impact of each pair) or ``total`` (every impact).
-        others: scripts of the other vehicles by index; None: the scripts of the scenario.
+        others: scripts of the other vehicles; the keys are vehicle indices. None: the scripts of the scenario.
         settings: further keyword arguments of ``StepShield``.
 
-    Raises ``InvalidInput`` in three cases: where ``StepShield`` raises it, if an uncertainty is combined with several
-    vehicles or a cap, and for settings that ``interior`` cannot certify.
+    Raises ``InvalidInput`` in three cases: if ``StepShield`` raises this error, if an uncertainty is combined with
+    several vehicles or with a cap, or if ``robust="interior"`` cannot certify the settings.
 
     """
 
@@ -75,13 +78,13 @@ class RobustShield(StepShield):
         return f"uncertainty: {self.uncertainty}"
 
     def members_of(self, worlds: Worlds) -> Worlds:
-        """Return the members of worlds at the alert, [n * M]: each world followed by the corners of its uncertainty."""
+        """Return the members of worlds at the alert, [n * M]: each world followed by the corners of its box."""
         return worlds if self.uncertainty is None else self.uncertainty.members(worlds)
 
     @property
     def boxes(self) -> Boxes | None:
-        """In interior mode, the boxes (smallest and largest value of every number of each world) once episodes have
-        begun; otherwise None.
+        """The boxes (smallest and largest value of every number of each world) in interior mode. The property is None
+        in corners mode, and before the first episode.
         """
         boxes: Boxes | None = self.memory.enclosure
         return boxes
@@ -89,17 +92,18 @@ class RobustShield(StepShield):
     def _bound_at_alert(
         self, possible: Worlds, problem: ProfileProblem, rows: Ints, plan: Floats, harm: Floats
     ) -> tuple[Floats, Boxes | None]:
-        """Return the bound on the harm of each plan at the alert, [m] m2/s2, and the boxes of all episodes.
+        """Return a bound on the harm of each plan at the alert, [m] m2/s2, and the boxes (of possible worlds) of all
+        episodes.
 
-        In interior mode the bound covers all worlds of each box. In corners mode it covers only the members (the
-        reported world and the corners of its box), and the boxes are None.
+        In interior mode the bound covers all worlds of each box. In corners mode the bound covers only the members (the
+        reported world and the corners of its box), and the function returns None instead of boxes.
 
         Args:
-            possible: [m * M] members of the new worlds, M consecutive ones for each world.
-            problem: the same worlds as a table with one row for each world.
+            possible: [m * M] members of the new worlds, M consecutive members for each world.
+            problem: table of the worlds in ``possible``, with one row for each world.
             rows: [m] indices of the new episodes.
-            plan: [m, L] action at each decision.
-            harm: [m] largest harm of the plan in any member, m2/s2.
+            plan: [m, L] action of the shielded vehicle at each decision, for each new world.
+            harm: [m] largest harm of each world's plan in any member of this world, m2/s2.
 
         """
         if possible.n == len(rows) or self.robust != INTERIOR:
@@ -110,15 +114,16 @@ class RobustShield(StepShield):
     def _also_certified(
         self, now: Running, memory: StepMemory, budget: Floats, decision: Decision, asked: Bools
     ) -> Decision:
-        """Return the decision; in interior mode every new plan must be certified for all worlds of its box.
+        """Return ``decision``; in interior mode, only with plans that are certified for all worlds of their box.
 
-        A plan without this certificate is replaced by the plan from before the decision.
+        In interior mode, a plan that is not certified for its whole box is replaced by the plan from before the
+        decision.
 
         Args:
-            now: state of the members (the corners of the boxes) before the decision.
-            memory: memory of the shield.
+            now: states of the members (the reported worlds and the corners of their boxes) before the decision.
+            memory: memory of the shield, which includes the boxes and the plans from before the decision.
             budget: [n] largest harm that a new plan may have, m2/s2.
-            decision: the present decision, whose plans are certified only in the members.
+            decision: the present decision, whose plans are so far certified only in the members.
             asked: [n] True for episodes that have a decision now.
 
         """
@@ -126,11 +131,11 @@ class RobustShield(StepShield):
         return decision if boxes is None else certify_inside(boxes, now, memory.backup, budget, decision, asked)
 
     def _leaves_range(self, running: Running) -> Bools:
-        """Return a mask [n] of the reported worlds in whose box some world may leave the range between the members. The
-        members are the reported world and the corners of its box; ``running`` has their states. The mask is True where
-        ``StepShield`` returns True, and in worlds in which the shielded vehicle's latency is uncertain, because
-        decisions then fall at different times in the worlds of a box. The mask is True everywhere if one uncertain
-        number (friction) changes several quantities.
+        """Return a mask [n]: True for each reported world whose box may have a world that leaves the range between the
+        members. The members are the reported world and the corners of its box; ``running`` has the states of the
+        members. The mask is True where ``StepShield`` returns True. In interior mode it is also True where the shielded
+        vehicle's latency is uncertain, because the decisions then have different times in the worlds of a box. The mask
+        is True everywhere if one uncertain number (friction) changes several quantities.
         """
         leaves, boxes = super()._leaves_range(running), self.boxes
         if boxes is not None:
@@ -144,14 +149,14 @@ class RobustShield(StepShield):
 def certify_inside(
     boxes: Boxes, running: Running, held: Backup, budget: Floats, decision: Decision, asked: Bools
 ) -> Decision:
-    """Return the decision with the old plan in place of each new plan that is not certified in all worlds of its box.
+    """Return ``decision``, but keep the old plan wherever the new plan is not certified for all worlds of its box.
 
     Args:
-        boxes: smallest and largest value of every number of each world.
-        running: state of the members (corners of the boxes) before the decision.
-        held: plans and bounds from before the decision.
+        boxes: box of each world: the smallest and the largest value of each of the world's numbers.
+        running: states of the members (the reported worlds and the corners of their boxes) before the decision.
+        held: the plans and their bounds from before the decision.
         budget: [n] largest harm that a new plan may have, m2/s2.
-        decision: the present decision, whose plans are certified only in the corners.
+        decision: the present decision, whose plans are so far certified only in the corners.
         asked: [n] True for episodes that have a decision now. In interior mode an episode ends only at the horizon,
             because a box may contain moving worlds when all its corners are at rest.
 

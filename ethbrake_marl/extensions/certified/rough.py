@@ -1,15 +1,17 @@
 """Rough upper bound on harm, computed from the largest speeds that the vehicles of a line can still reach.
 
-The bound applies to worlds whose path cannot be simulated. The bound is always finite.
+The bound is used for a path (set of worlds with the same impacts so far) that cannot be simulated. The bound is always
+finite.
 
 Without impacts, a vehicle reaches at most its present speed, or the speed that it can reach by driving. An impact with
 closing speed w and restitution e changes the speed of each vehicle by (1 + e) w m / M, where m is the mass of the other
 vehicle and M the sum of both masses. Let u be the largest speed of any vehicle, and assume that no vehicle moves
-backwards yet. An impact slows the rear vehicle, but not below -e times its previous speed. It gives a front vehicle at
-rest at most (1 + e) times the rear vehicle's speed. So, in a line of three, the speed of the middle vehicle stays
-between -e u and (1 + e) u until both its pairs have had contact. (Three vehicles in contact at once leave with
-(1 + e) P - e v each, where v is the vehicle's speed before and P a weighted mean of the speeds. These speeds lie
-between the same bounds.)
+backwards yet. An impact slows the rear vehicle, but the new speed is at least -e times the previous speed. An impact
+gives a front vehicle at rest at most (1 + e) times the rear vehicle's speed. So, in a line of three, the speed of the
+middle vehicle stays between -e u and (1 + e) u until both its pairs have had contact. (If three vehicles are in contact
+at once, each vehicle has the speed (1 + e) P - e v after the impact. Here v is the speed of this vehicle before the
+impact, and P is a weighted mean of the three speeds before the impact. The speeds (1 + e) P - e v also lie between -e u
+and (1 + e) u.)
 """
 
 from __future__ import annotations
@@ -24,10 +26,10 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(apart=True)
 def driven(cell: Cell, i: int, speed: float, since: float) -> float:
-    """Return the largest speed (m/s) that vehicle ``i`` can reach by driving if it has at most ``speed`` at the time
-    ``since``.
+    """Return the largest speed (m/s) that vehicle ``i`` can reach by driving if its speed at the time ``since`` is at
+    most ``speed``.
 
-    ``since`` counts from the first decision, in s. ``cell`` is the box of worlds with its commands.
+    ``since`` is in s after the first decision. ``cell`` has the box of worlds and the vehicles' commands over time.
     """
     drive, rest = 0.0, cell.times[-1] - since
     if i == cell.vehicle:
@@ -43,15 +45,17 @@ def driven(cell: Cell, i: int, speed: float, since: float) -> float:
 
 @compiled(apart=True)
 def rough_harm(cell: Cell, path: Path, hit: int) -> float:
-    """Return an upper bound (m2/s2) on the harm of all worlds of a path, including the harm so far.
+    """Return an upper bound (m2/s2) on the harm in all worlds of a path (worlds with the same impacts so far),
+    including the harm so far.
 
     The bound uses only the largest speeds that the vehicles can still reach.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
-        hit: index of a further pair that is treated as if it had already had its impact already; -1: only the pairs
-            marked in the path.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
+        hit: index of one more pair whose first impact is treated as past, in addition to the pairs marked in the path;
+            -1: no more pairs.
 
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
@@ -69,15 +73,16 @@ def rough_harm(cell: Cell, path: Path, hit: int) -> float:
 
 @compiled(apart=True)
 def rough_rest(cell: Cell, own: Floats, backwards: float, since: float, path: Path, hit: int) -> float:
-    """Return an upper bound (m2/s2) on the sum of squared closing speeds of all first impacts that are still to come.
+    """Return an upper bound (m2/s2) on the harm of all first impacts that are still to come: the sum of their squared
+    closing speeds.
 
     Args:
-        cell: a box of uncertain worlds, as affine forms.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
         own: [N] largest speed that each vehicle can reach without an impact, m/s.
-        backwards: largest backward speed of any vehicle now, m/s.
+        backwards: largest backward speed of any vehicle at the time ``since``, m/s.
         since: present time, s after the first decision.
-        path: worlds of the box with the same impacts so far; only its marks of pairs that had an impact are read.
-        hit: index of a further pair that is treated as if it had already had its impact; -1: none.
+        path: worlds of the box with the same impacts so far; the function reads only which pairs have had an impact.
+        hit: index of one more pair whose first impact is treated as past; -1: no more pairs.
 
     """
     P, e = cell.gap.shape[0], cell.restitution

@@ -5,9 +5,9 @@ The state of a pair in contact is the motion of its centre of mass, as affine fo
 vehicles deviate from this motion. While both vehicles move forward, only their commands act on the pair. The centre of
 mass then follows the commands alone, no matter how often the two vehicles collide.
 
-A world *creeps* as soon as one of the two vehicles stands or moves backwards: the brakes of that vehicle then hold the
-vehicle instead of slowing the pair, and the state contains only limits on the speeds. A *flight* is the time between
-two impacts of the pair.
+A world *creeps* as soon as one of the two vehicles of the pair stands or moves backwards. The brakes of that vehicle
+then hold the vehicle instead of slowing the pair. For a world that creeps, the state of the pair contains only limits
+on the speeds. A *flight* is the time between two impacts of the pair.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ UNEVEN = 3.0  # largest ratio of closing to separating speed in a flight, for bo
 def common(cell: Cell, p: int, front: Floats, rear: Floats) -> Floats:
     """Return speed, acceleration or distance of the centre of mass of pair ``p``, as an affine form [W].
 
-    ``front`` and ``rear`` are the values of the two vehicles; ``cell`` has the share of each vehicle in the mass of the
-    pair.
+    ``front`` and ``rear`` are this quantity for the front and the rear vehicle, as affine forms. ``cell`` has the share
+    of each vehicle in the mass of the pair.
     """
     out = product(cell.share[p, 1], front)
     add(out, 1.0, product(cell.share[p, 0], rear))
@@ -63,10 +63,10 @@ def common(cell: Cell, p: int, front: Floats, rear: Floats) -> Floats:
 
 @compiled(apart=True)
 def pressing_together(motion: Motion, p: int) -> tuple[float, float]:
-    """Return the smallest and the largest closing acceleration (m/s2) of pair ``p`` if the commands of both vehicles
-    act.
+    """Return the smallest and the largest closing acceleration (m/s2) of pair ``p`` if both vehicles accelerate as
+    commanded.
 
-    ``motion`` is the motion of all vehicles in the present piece (time interval of constant command).
+    ``motion`` has the motion of all vehicles in the present piece (time interval of constant command).
     """
     vague = motion.vague[p] + motion.vague[p + 1]
     least = low(motion.pull[p + 1]) - high(motion.pull[p]) - vague
@@ -77,7 +77,7 @@ def pressing_together(motion: Motion, p: int) -> tuple[float, float]:
 def apart(touch: Floats) -> float:
     """Return the largest possible difference between the speeds of the two vehicles of a pair in contact, m/s.
 
-    ``touch`` [TOUCH_WIDTH] is the state of the pair, a row of ``Path.touch``.
+    ``touch`` [TOUCH_WIDTH] is the state of the pair in contact (a row of ``Path.touch``).
     """
     return float(max(touch[OPENING], touch[CLOSING], 0.0))
 
@@ -85,8 +85,8 @@ def apart(touch: Floats) -> float:
 @compiled(apart=True)
 def faster(cell: Cell, p: int) -> float:
     """Return the largest possible ratio v / u, for an impact of pair ``p``: v is the front vehicle's speed after the
-    impact, u the rear vehicle's speed before it. The result is at least 1. ``cell`` has the coefficient of restitution
-    and the shares of mass.
+    impact, and u is the rear vehicle's speed before the impact. The result is at least 1. ``cell`` has the coefficient
+    of restitution and each vehicle's share of the pair's mass.
     """
     return float(max(1.0, (1.0 + cell.restitution) * high(cell.share[p, 0])))
 
@@ -96,7 +96,7 @@ def backwards(cell: Cell, p: int) -> float:
     """Return the largest backward speed of the rear vehicle of pair ``p`` after an impact, as a multiple of its speed
     before the impact.
 
-    The result is at least 0. ``cell`` has the coefficient of restitution and the shares of mass.
+    The result is at least 0. ``cell`` has the coefficient of restitution and each vehicle's share of the pair's mass.
     """
     return float(max(0.0, (1.0 + cell.restitution) * high(cell.share[p, 1]) - 1.0))
 
@@ -106,13 +106,13 @@ def stray(cell: Cell, touch: Floats, p: int) -> float:
     """Return the largest difference (m/s) between the true speed of a pair's centre of mass and the speed in its affine
     form.
 
-    The result is above 0 only if one of the two vehicles may stand or move backwards. The speed in the affine form then
-    lies between 0 and ``CREEP``. The rear vehicle's speed lies between minus ``backwards`` times ``CREEP`` and
-    ``CREEP``. The front vehicle's speed lies between 0 and ``faster`` times ``CREEP``. (No impact makes a rear vehicle
-    faster.)
+    The result is above 0 only if one of the two vehicles may stand or move backwards. Let c be ``touch[CREEP]``, the
+    largest speed of the rear vehicle in such worlds. The speed in the affine form lies between 0 and c. The rear
+    vehicle's speed lies between ``-backwards(cell, p) * c`` and c. The front vehicle's speed lies between 0 and
+    ``faster(cell, p) * c``. (An impact never makes the rear vehicle faster.)
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
         touch: [TOUCH_WIDTH] state of the pair in contact, a row of ``Path.touch``.
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
 
@@ -126,10 +126,11 @@ def blur(cell: Cell, path: Path, p: int, side: int) -> float:
     of mass.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        side: 0 for the front vehicle of the pair, 1 for the rear one.
+        side: 0 for the front vehicle of the pair, 1 for the rear vehicle.
 
     """
     return float(high(cell.share[p, side]) * path.touch[p, SPREAD] + stray(cell, path.touch[p], p))
@@ -137,9 +138,9 @@ def blur(cell: Cell, path: Path, p: int, side: int) -> float:
 
 @compiled(apart=True)
 def begin_touch(touch: Floats) -> None:
-    """Reset the state of a pair in contact, except for the columns SPREAD and REACH of the present piece.
+    """Reset the state of a pair in contact, except for the columns SPREAD and REACH, which describe the present piece.
 
-    ``touch`` [TOUCH_WIDTH] is the state, a row of ``Path.touch``; it is changed in place.
+    ``touch`` [TOUCH_WIDTH] is the state of the pair (a row of ``Path.touch``); the function changes it in place.
     """
     spread, reach = touch[SPREAD], touch[REACH]  # columns of the present piece
     touch[:] = 0.0
@@ -150,16 +151,17 @@ def begin_touch(touch: Floats) -> None:
 def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
     """Move pair ``p``, which is in contact, through the present piece (time interval of constant command).
 
-    Before the call ``motion`` describes each vehicle as if it were alone. After the call ``motion`` describes the two
-    vehicles as one body, or as two if they separate.
+    Before the call, ``motion`` describes each vehicle as if this vehicle were alone on the road. After the call,
+    ``motion`` describes the two vehicles as one body, or as two single vehicles if they separate.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece; changed in
-            place.
-        motion: motion of each vehicle in the present piece; changed in place.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command); the function updates this state in place.
+        motion: motion of each vehicle in the present piece (time interval of constant command); the function changes it
+            in place.
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        length: length of the piece, s.
+        length: duration of the piece (time interval of constant command), s.
 
     """
     touch, front, rear = path.touch[p], p, p + 1
@@ -194,13 +196,14 @@ def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float)
 
 @compiled(apart=True)
 def dip_of(cell: Cell, vague: float, length: float) -> float:
-    """Return by how much (m/s) a vehicle's speed within a piece may be below its smaller value at the two ends of the
-    piece. The speed falls below this value only if the vehicle's acceleration changes its sign within the piece.
+    """Return by how much (m/s) a vehicle's speed within a piece may fall below the smaller one of its speeds at the
+    start and at the end of the piece. The speed can fall below both of these speeds only if the vehicle's acceleration
+    changes its sign within the piece.
 
     Args:
-        cell: a box of uncertain worlds, as affine forms.
-        vague: largest deviation of the acceleration from its mean, m/s2.
-        length: length of the piece (time interval of constant command), s.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        vague: largest deviation of the vehicle's acceleration from its mean in the piece, m/s2.
+        length: duration of the piece (time interval of constant command), s.
 
     """
     return 0.5 * vague * length if cell.moving else 0.0
@@ -208,9 +211,9 @@ def dip_of(cell: Cell, vague: float, length: float) -> float:
 
 @compiled(apart=True)
 def own_pulls(motion: Motion, p: int) -> tuple[float, float]:
-    """Return the smallest and the largest acceleration (m/s2) that the two vehicles of pair ``p`` command in a piece.
+    """Return the smallest and the largest acceleration (m/s2) that either vehicle of pair ``p`` commands in a piece.
 
-    ``motion`` is the motion of all vehicles in the piece (time interval of constant command).
+    ``motion`` has the motion of all vehicles in the piece (time interval of constant command).
     """
     weakest = min(low(motion.pull[p]) - motion.vague[p], low(motion.pull[p + 1]) - motion.vague[p + 1])
     return weakest, max(high(motion.pull[p]) + motion.vague[p], high(motion.pull[p + 1]) + motion.vague[p + 1])
@@ -221,13 +224,13 @@ def creep(cell: Cell, touch: Floats, p: int, slowest: float, weakest: float, har
     """Update the state of a pair in contact for worlds in which one of its vehicles may stand or move backwards.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        touch: [TOUCH_WIDTH] state of the pair in contact, a row of ``Path.touch``; changed in place.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        touch: [TOUCH_WIDTH] state of the pair in contact (a row of ``Path.touch``); the function changes it in place.
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        slowest: smallest speed of the centre of mass in the piece, m/s.
+        slowest: smallest speed of the pair's centre of mass in the piece, m/s.
         weakest: smallest acceleration that either vehicle commands, m/s2.
         hardest: largest acceleration that either vehicle commands, m/s2.
-        length: length of the piece, s.
+        length: duration of the piece (time interval of constant command), s.
 
     """
     largest = max(
@@ -249,19 +252,21 @@ def creep(cell: Cell, touch: Floats, p: int, slowest: float, weakest: float, har
 
 @compiled(apart=True)
 def come_to_rest(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
-    """Update pair ``p``, which is in contact, over a piece in which its speed is 0 in the affine form.
+    """Update the state of pair ``p``, which is in contact, over a piece in which the affine form of the pair's speed is
+    0.
 
-    In each world both vehicles stand, or the world *creeps* (one vehicle stands or moves backwards) and the brakes slow
-    the other vehicle. The brakes reduce the rear vehicle's speed. The front vehicle's speed is at most ``faster`` times
-    the rear vehicle's speed.
+    In each world, either both vehicles stand, or the world *creeps* (one vehicle stands or moves backwards) and the
+    brakes slow the other vehicle. The brakes reduce the rear vehicle's speed. The front vehicle's speed is at most
+    ``faster(cell, p)`` times the rear vehicle's speed.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece; changed in
-            place.
-        motion: motion of each vehicle in the present piece; changed in place.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command); the function updates this state in place.
+        motion: motion of each vehicle in the present piece (time interval of constant command); the function changes it
+            in place.
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        length: length of the piece, s.
+        length: duration of the piece (time interval of constant command), s.
 
     """
     touch = path.touch[p]
@@ -278,16 +283,17 @@ def come_to_rest(cell: Cell, path: Path, motion: Motion, p: int, length: float) 
 
 @compiled(apart=True)
 def part(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
-    """Separate the vehicles of pair ``p``, which was in contact and whose gap opens in the present piece. Afterwards
-    both vehicles move alone.
+    """Separate the vehicles of pair ``p``, which was in contact and whose gap opens in the present piece. After the
+    separation, each vehicle moves by itself.
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece; changed in
-            place.
-        motion: motion of each vehicle in the present piece; changed in place.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command); the function updates this state in place.
+        motion: motion of each vehicle in the present piece (time interval of constant command); the function changes it
+            in place.
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        length: length of the piece, s.
+        length: duration of the piece (time interval of constant command), s.
 
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
@@ -314,22 +320,22 @@ def part(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
 def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length: float, vague: float) -> None:
     """Update the relative speed and the gap of pair ``p``, which is in contact, over the present piece.
 
-    An impact never increases the relative speed, so this speed grows by at most the closing acceleration of the
-    commands. While the closing acceleration lies between b- (``least``) and b+ (``most``), and b- > 0, the relative
-    speed does not grow. A *flight* (the time between two impacts) that has gap g and relative speed w at some moment
-    has a gap of at most ``h = g + w^2 / (2 b-)`` and ends with a closing speed of at most ``sqrt(2 b+ h)``. The next
-    flight starts with e times this speed, where e is the restitution. So the relative speed decreases from flight to
-    flight if ``e sqrt(b+ / b-) < 1``. (If one vehicle stands or moves backwards, its brakes hold it. This makes flights
-    shorter, and their speeds smaller.)
+    An impact never increases the relative speed. The relative speed therefore grows at most at the rate of the closing
+    acceleration that the commands cause. While the closing acceleration lies between b- (``least``) and b+ (``most``),
+    and b- > 0, the relative speed does not grow. A *flight* (the time between two impacts) that has gap g and relative
+    speed w at some moment has a gap of at most ``h = g + w^2 / (2 b-)`` and ends with a closing speed of at most
+    ``sqrt(2 b+ h)``. The next flight starts with e times this speed, where e is the restitution. So the relative speed
+    decreases from flight to flight if ``e sqrt(b+ / b-) < 1``. (If one vehicle stands or moves backwards, the brakes of
+    this vehicle hold it. Flights are then shorter, and the relative speeds in them are smaller.)
 
     Args:
-        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
-        touch: [TOUCH_WIDTH] state of the pair in contact, a row of ``Path.touch``; changed in place.
+        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        touch: [TOUCH_WIDTH] state of the pair in contact (a row of ``Path.touch``); the function changes it in place.
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        least: smallest closing acceleration, m/s2.
-        most: largest closing acceleration, m/s2.
-        length: length of the piece, s.
-        vague: largest deviation of the acceleration from its mean, m/s2.
+        least: smallest closing acceleration of the pair in the piece, m/s2.
+        most: largest closing acceleration of the pair in the piece, m/s2.
+        length: duration of the piece (time interval of constant command), s.
+        vague: largest deviation of a vehicle's acceleration from its mean in the piece, m/s2.
 
     """
     e, fastest, wide = cell.restitution, apart(touch), touch[WIDE]
@@ -360,14 +366,14 @@ def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length:
 def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: float, most: float) -> None:
     """Start a new phase of a contact, because the closing acceleration of the pair has changed.
 
-    The limits of the new phase span the accelerations of the old and the new phase if the relative speed then still
-    decreases from impact to impact. Otherwise they span only the accelerations of the new phase.
+    The recorded range of closing accelerations covers the old and the new phase if the relative speed then still
+    decreases from impact to impact. If it does not, the recorded range covers only the new phase.
 
     Args:
-        touch: state of the pair in contact, a row of ``Path.touch``; changed in place.
+        touch: [TOUCH_WIDTH] state of the pair in contact (a row of ``Path.touch``); the function changes it in place.
         e: coefficient of restitution.
-        softest: smallest closing acceleration of both phases, m/s2.
-        hardest: largest closing acceleration of both phases, m/s2.
+        softest: smallest closing acceleration in the old and the new phase, m/s2.
+        hardest: largest closing acceleration in the old and the new phase, m/s2.
         least: smallest closing acceleration of the new phase, m/s2.
         most: largest closing acceleration of the new phase, m/s2.
 
@@ -388,14 +394,14 @@ def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: fl
 def settle(touch: Floats, e: float) -> None:
     """Reset the state of a contact if the pair certainly moves as one body by the end of the present piece.
 
-    Let the closing acceleration lie between ``b-`` and ``b+``, and let e be the restitution. A *flight* (the time
-    between two impacts) that begins with separating speed s lasts at most ``2 s / b-``. It ends with a closing speed of
-    at most ``s sqrt(b+ / b-)``, and the next flight begins with e times that speed. So all flights together last at
-    most ``2 s / (b- (1 - e sqrt(b+ / b-)))``. Afterwards the two vehicles move as one body, unless one stands or moves
-    backwards.
+    Let the closing acceleration of the pair lie between ``b-`` and ``b+``, and let e be the restitution. A *flight*
+    (the time between two impacts) that begins with separating speed s lasts at most ``2 s / b-``. This flight ends with
+    a closing speed of at most ``s sqrt(b+ / b-)``, and the next flight begins with e times this closing speed. So all
+    flights together last at most ``2 s / (b- (1 - e sqrt(b+ / b-)))``. After the last flight, the two vehicles move as
+    one body, unless one stands or moves backwards.
 
     Args:
-        touch: state of the pair in contact, a row of ``Path.touch``; changed in place.
+        touch: [TOUCH_WIDTH] state of the pair in contact (a row of ``Path.touch``); the function changes it in place.
         e: coefficient of restitution.
 
     """
@@ -412,15 +418,16 @@ def settle(touch: Floats, e: float) -> None:
 def is_blurred(path: Path, motion: Motion, N: int, p: int, length: float) -> bool:
     """Return whether the gap of pair ``p`` is too uncertain to simulate a further impact in this piece.
 
-    The gap is too uncertain if its uncertainty exceeds the largest distance by which it can shrink within the piece.
-    Such a pair is treated as in contact from the start of the piece.
+    The gap is too uncertain if its uncertainty exceeds the largest distance by which the gap can shrink within the
+    piece. A pair with such a gap is treated as in contact from the start of the piece.
 
     Args:
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
+        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
+            interval of constant command).
         motion: motion of each vehicle in the present piece (time interval of constant command).
         N: number of vehicles.
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        length: length of the piece, s.
+        length: duration of the piece (time interval of constant command), s.
 
     """
     if motion.rest[p] != MOVES or motion.rest[p + 1] != MOVES:

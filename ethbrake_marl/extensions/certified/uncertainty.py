@@ -2,10 +2,10 @@
 these intervals.
 
 The true value of a quantity with the reported value x lies in [x - h, x + h]. The half-width h is a number in the
-quantity's unit, or a share of x. Impossible values are cut off from the interval: latencies, speeds and gaps below 0,
-and speeds above the vehicle's limit. The *box* of a world is the set of all combinations of values in its intervals.
-The *members* of a world are the reported world and every corner of its box: 2^d corners for d uncertain numbers. The
-bound of shield mode ``robust`` is proven for the members (``docs/internals/proofs/shield-corners.md``).
+quantity's unit, or a share of x (such as 5 %). Impossible values are cut off from the interval: latencies, speeds and
+gaps below 0, and speeds above the vehicle's limit. The *box* of a world is the set of all combinations of values in its
+intervals. The *members* of a world are the reported world and every corner of its box: 2^d corners for d uncertain
+numbers. The bound of shield mode ``robust`` is proven for the members (``docs/internals/proofs/shield-corners.md``).
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ _NUMBER = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """Interval of one quantity, for one vehicle or pair, or for all of them."""
+    """Interval around one reported quantity, for one vehicle or pair, or for all vehicles or pairs."""
 
     quantity: str  # one of QUANTITIES
     half_width: float  # in the quantity's unit, or a share of its value below 1
@@ -102,7 +102,7 @@ _Side = tuple[str, int, Floats, Floats]  # one uncertain number: quantity, index
 
 @dataclass(frozen=True, slots=True)
 class Uncertainty:
-    """Intervals around the reported quantities of a world. ``parse_uncertainty`` makes an uncertainty from a text.
+    """Intervals around the reported quantities of a world. ``parse_uncertainty`` makes an ``Uncertainty`` from a text.
 
     Raises ``InvalidInput`` if there is no interval, or if two intervals cover the same quantity of a vehicle or pair.
     """
@@ -129,7 +129,7 @@ class Uncertainty:
     def moves_together(self) -> bool:
         """True if one uncertain number (friction) changes several quantities.
 
-        The largest and smallest gaps and speeds may then occur in worlds that are no corners.
+        If this property is true, the largest and smallest gaps and speeds may occur in worlds that are no corners.
         """
         return any(each.quantity == "friction" and each.half_width > 0.0 for each in self.intervals)
 
@@ -137,10 +137,11 @@ class Uncertainty:
         """Return the members of worlds at the alert, [n * M]: each world followed by the corners of its box.
 
         The *box* of a world is the set of all combinations of values in its intervals. The corners are in the order of
-        binary numbers, with the first interval as the lowest bit. Intervals of width 0 add no corners. For friction
-        eight values are used instead of the two ends of its interval, because friction changes all capacities together
-        and harm may rise or fall with it. Raises ``InvalidInput`` for a vehicle that does not exist, a capacity or mass
-        that may be 0, or more than ``MOST_CORNERS`` corners.
+        binary numbers, with the first interval as the lowest bit (0: smallest value, 1: largest value). Intervals of
+        width 0 add no corners. For friction, eight values replace the two ends of the interval, because friction
+        changes all capacities together and harm may rise or fall with it. Raises ``InvalidInput`` if an interval names
+        a vehicle that does not exist, if a capacity or mass may be 0, or if there are more than ``MOST_CORNERS``
+        corners.
         """
         sides = self._sides(worlds)
         ends = [_OF_FRICTION if name == "friction" else (0.0, 1.0) for name, *_ in reversed(sides)]
@@ -159,7 +160,7 @@ class Uncertainty:
     def interleaved(parts: list[Worlds]) -> Worlds:
         """Merge M batches of n worlds each into one batch [n * M].
 
-        World 0 of every batch comes first, then world 1 of every batch, and so on.
+        The merged batch begins with world 0 of every batch, then has world 1 of every batch, and so on.
         """
         order = np.arange(parts[0].n * len(parts)).reshape(len(parts), parts[0].n).T.ravel()
         return Worlds.concatenate(parts).take(order)
@@ -170,7 +171,7 @@ class Uncertainty:
         Args:
             worlds: the reported worlds, [n].
             rng: source of randomness.
-            corners: True: draw one of the corners of the box; False: draw uniformly from the whole box.
+            corners: if True, draw one of the corners of the box; if False, draw uniformly from the whole box.
 
         """
         sides = self._sides(worlds)
@@ -180,7 +181,7 @@ class Uncertainty:
         return _placed(worlds, sides, lambda k: shares[k])
 
     def _sides(self, worlds: Worlds) -> list[_Side]:
-        """Return the uncertain numbers of ``worlds``, each with its smallest and its largest value, [n].
+        """Return the uncertain numbers of ``worlds``, each with its smallest value [n] and its largest value [n].
 
         Each uncertain number belongs to one quantity and one vehicle or pair (index from 0).
         """
@@ -225,8 +226,8 @@ def parse_uncertainty(text: str) -> Uncertainty:
     ``UNCERTAINTY_EXAMPLE``.
 
     A half-width is a number in the quantity's unit, or a percentage of its value. ``.vehicle_2`` or ``.pair_1`` after
-    the quantity limits the entry to one vehicle or pair. Blanks around entries and ``=`` are ignored. Raises
-    ``InvalidInput`` for any other text.
+    the quantity limits the entry to one vehicle or pair. Blanks around an entry and around its ``=`` are ignored.
+    Raises ``InvalidInput`` for any other text.
     """
     entries = [entry.strip() for entry in text.split(",")]
     if "" in entries:
@@ -248,8 +249,8 @@ def parse_uncertainty(text: str) -> Uncertainty:
 
 
 def _values(worlds: Worlds, quantity: str) -> Floats:
-    """Return the reported values of one of ``QUANTITIES``: [n, N], for gaps [n, P], for friction [n, 1]. Capacities are
-    those on a dry road.
+    """Return the reported values of one of ``QUANTITIES``. The result has the shape [n, N], for gaps [n, P], for
+    friction [n, 1]. The returned capacities are those on a dry road.
     """
     if quantity.endswith("_rate_mps3"):
         return np.asarray(getattr(worlds.vehicles, quantity), np.float64)
@@ -264,12 +265,12 @@ def _of(quantity: str, place: int) -> str:
 def _placed(worlds: Worlds, sides: list[_Side], share: Callable[[int], Floats | float]) -> Worlds:
     """Return the worlds with each uncertain number at a given position in its interval.
 
-    Without a V2X channel, an uncertain latency also changes when a message arrives. With a channel, an uncertain
-    latency changes only when the vehicle reacts. Friction limits the capacities of all vehicles together.
+    Without a V2X channel, an uncertain latency also changes when a message arrives. With a V2X channel, an uncertain
+    latency changes only when the vehicle reacts. An uncertain friction limits the capacities of all vehicles together.
 
     Args:
         worlds: the reported worlds, [n].
-        sides: the uncertain numbers, from ``_sides``.
+        sides: the uncertain numbers and their smallest and largest values, as ``_sides`` returns them.
         share: function that gets the index of an uncertain number and returns its position in the interval, a number or
             [n]: 0 is the smallest value, 1 the largest.
 
