@@ -149,7 +149,7 @@ class RolloutClassificationModel(VineModel):
         return observed[rows], tried, costs
 
     def _usual(self, rows: Ints, least: Floats) -> Floats:
-        """Update the mean cost of each scenario of a mixture; return, for B decisions, their scenarios' mean costs, [B].
+        """Update the mean cost of each scenario of a mixture; return the mean costs for B decisions, [B].
 
         A mean cost below ``LEAST_USUAL`` is returned as ``LEAST_USUAL``, because costs are divided by the result.
 

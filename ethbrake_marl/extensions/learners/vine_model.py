@@ -156,7 +156,7 @@ class VineModel(BaseAlgorithm):
         return Tried(then, actor.means(then), gradient[good].astype(np.float32), importance[good])
 
     def _train(self, actor: AveragedActor, tried: Tried) -> None:
-        """Train the actor at the decisions in ``tried``: move its outputs towards the targets of ``trusted_targets``."""
+        """Train the actor: at the decisions in ``tried``, move its outputs towards ``trusted_targets``."""
         recipe = self.recipe
         self._update_learning_rate(actor.optimizer)
         target, weight = trusted_targets(tried, recipe.trust_radius, recipe.anchor)

@@ -97,7 +97,7 @@ def try_changes(
     Returns the time (s) at which the command first changes in the profile with the least harm.
 
     Args:
-        world: world to simulate, with its bounds and random stream.
+        world: world to simulate, with the bounds of the commands and a random stream.
         kind: which vehicle the controlled vehicle meets: ``FRONT_FIRST`` the one ahead, ``REAR_FIRST`` the one behind.
         at: state of the world at the first decision, [WIDTH], in the order of the columns ``proofs.line.LINE``.
         start: state of the simulation at the first decision, [S].
@@ -142,7 +142,7 @@ def fill_extreme(
     is the mean of the two commands, weighted with their durations. The speed at the end of the step is then exact.
 
     Args:
-        world: world of the profile, with its bounds and its time step.
+        world: world of the profile, with the bounds of the commands and the time step.
         kind: the first command: ``FRONT_FIRST`` for full drive, ``REAR_FIRST`` for full braking.
         change: time at which the command first changes, s.
         meeting: time of the second change of the command, s.

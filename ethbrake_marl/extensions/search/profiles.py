@@ -181,7 +181,7 @@ def search_world(
     never worse than any starting profile.
 
     Args:
-        world: world to simulate, with its bounds and random stream.
+        world: world to simulate, with the bounds of the commands and a random stream.
         start: state of the world at the first decision, [S].
         seed_ends: time steps at which the phases of the Q starting profiles end, [Q, K].
         seed_commands: commands of the starting profiles, [Q, K, C] m/s2.
@@ -242,7 +242,7 @@ def improve(world: SearchWorld, ends: Ints, commands: Floats, states: Floats, bu
     Returns infinity if the physics could not simulate the profile.
 
     Args:
-        world: world to simulate, with its bounds and random stream.
+        world: world to simulate, with the bounds of the commands and a random stream.
         ends: time steps at which the phases end, [K]; changed in place.
         commands: commands of the phases, [K, C] m/s2; changed in place.
         states: [K + 1, S] state of the world at the start of each phase; row 0: state at the first decision;
@@ -304,7 +304,7 @@ def gather(
     Any two profiles of the field differ in harm.
 
     Args:
-        world: world to simulate, with its bounds and random stream.
+        world: world to simulate, with the bounds of the commands and a random stream.
         seed_ends: time steps at which the phases of the Q starting profiles end, [Q, K].
         seed_commands: commands of the starting profiles, [Q, K, C] m/s2.
         states: [K + 1, S] state of the world at the start of each phase; row 0: state at the first decision;
@@ -422,7 +422,7 @@ def select_stepwise(
     function of the commands: rounding may then decide how much harm a profile causes.
 
     Args:
-        world: world to simulate, with its bounds and random stream.
+        world: world to simulate, with the bounds of the commands and a random stream.
         seed_ends: time steps at which the phases of the Q starting profiles end, [Q, K].
         seed_commands: commands of the starting profiles, [Q, K, C] m/s2.
         states: [K + 1, S] state of the world at the start of each phase; row 0: state at the first decision;

@@ -178,7 +178,7 @@ def climb(world: SearchWorld, plan: Plan, room: Plan, value: float, reached: int
     an amount lowers the harm, the next candidate adds twice this amount to the commands of the same steps.
 
     Args:
-        world: world to simulate, with its bounds and random stream.
+        world: world to simulate, with the bounds of the commands and a random stream.
         plan: commands to improve, with their simulated states.
         room: arrays for intermediate results.
         value: harm of ``plan``, m2/s2.
@@ -232,7 +232,7 @@ def draw_templates(world: SearchWorld, best: Plan, room: Plan, bound: float, num
     does less harm than ``bound``.
 
     Args:
-        world: world to simulate, with its bounds and random stream.
+        world: world to simulate, with the bounds of the commands and a random stream.
         best: output: commands and states of the best template.
         room: arrays for intermediate results.
         bound: a template with at least this harm is rejected, m2/s2.
