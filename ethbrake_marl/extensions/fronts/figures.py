@@ -107,7 +107,8 @@ def ternary_figure(results: Json) -> Figure:
 def _places(shares: Floats) -> Floats:
     """Return the positions of k points in the ternary plot, [2, k]: horizontal and vertical coordinates.
 
-    ``shares`` [k, 3] are the shares of the harm that the three vehicles bear. At a corner, one vehicle bears all harm.
+    ``shares`` [k, 3] are the shares of the harm that the three vehicles bear. At a corner of the plot, one vehicle
+    bears all harm.
     """
     places: Floats = (shares[:, :, np.newaxis] * _CORNERS).sum(axis=1).T
     return places

@@ -1,7 +1,7 @@
 """The front of a list of worlds: for each choice of weights, the least weighted harm and the harm of each vehicle.
 
 A point of the front is the mean harm of each vehicle over the list, for one choice of weights. The points approximate
-the convex part of the Pareto front. They are the best results of a search; it is not proven that no better ones exist.
+the convex part of the Pareto front. A search computes the points; it is not proven that no better points exist.
 """
 
 from __future__ import annotations

@@ -57,8 +57,8 @@ def weight_grid(vehicles: int, steps: int = STEPS) -> Floats:
 def corners(vehicles: int) -> Floats:
     """Return one choice of weights for each of the N vehicles, [N, N]: in row i, vehicle i has the weight 1.
 
-    In row i, all other vehicles have the weight ``SLIGHT``. Their harm decides only between commands under which
-    vehicle i has almost the same harm.
+    In row i, all other vehicles have the weight ``SLIGHT``. The harm of the other vehicles decides only between
+    commands under which vehicle i has almost the same harm.
     """
     return np.where(np.eye(vehicles) == 1.0, 1.0, SLIGHT)
 

@@ -47,8 +47,9 @@ def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) ->
     Args:
         engine: engine that simulates the n branches; its state is changed.
         act: policy of all learners: a function from observations to actions.
-        offsets: for each branch, the offset, the learner that gets the offset, and the number of steps with it.
-        gamma: discount of one time step.
+        offsets: for each branch, the offset, the learner that gets the offset, and the number of steps with this
+            offset.
+        gamma: discount factor per time step.
 
     Returns two arrays with one number for each branch, [n]. The first array contains the discounted return of the
     learner with the offset, from the start of the branch on (NaN if the simulation failed). The second array contains
@@ -80,9 +81,9 @@ def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) 
 
     Args:
         engine: engine that simulates the n worlds; its state is changed.
-        decide: function that returns the actions of the learners, [m, L]. Its three arguments are the observations
-            [m, L, F], the indices of the m worlds, and the number of steps so far.
-        gamma: discount of one time step.
+        decide: function that returns the actions of the learners, [m, L]. The three arguments of ``decide`` are the
+            observations [m, L, F], the indices of the m worlds, and the number of steps so far.
+        gamma: discount factor per time step.
         at_least: number of steps before which no world ends early because its vehicles are at rest.
 
     If harm is the only term of the reward, the simulation of a world ends as soon as all its vehicles are at rest and
@@ -171,8 +172,9 @@ def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, sta
 def counted_harm(engine: Engine, count: HarmCount) -> Floats:
     """Return the harm up to now that each of the L learners of an engine should make small, [n, L] m2/s2.
 
-    If the reward has objectives, this harm is the value of the learner's objective. If not, it is the harm of the whole
-    line. ``count`` is the count of harm: ``first`` (each pair's first impact) or ``total`` (all impacts).
+    If the reward has objectives, this harm is the value of the learner's objective. If the reward has no objectives,
+    this harm is the harm of the whole line. ``count`` is the count of harm: ``first`` (each pair's first impact) or
+    ``total`` (all impacts).
     """
     declared, shape = engine.reward.objective, (engine.n, len(engine.learners))
     if declared is None:

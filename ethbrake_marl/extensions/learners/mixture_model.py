@@ -138,13 +138,13 @@ class ExpertsModel(VineModel):
     def _compare(self, seen: Float32s, moments: State) -> tuple[Float32s, Floats, Float32s]:
         """Compare the K experts: let each expert drive from B visited decisions to the end, and return its costs.
 
-        The cost of an expert is minus its return, plus ``tie_break`` times its harm. If the reward counts first-impact
-        harm, this harm is the total harm, and the other way round. The B decisions are drawn from the visited decisions
-        at which the experts choose different actions.
+        The cost of an expert is minus its return, plus ``tie_break`` times its harm. This harm is the total harm if the
+        reward counts first-impact harm, and the first-impact harm if the reward counts total harm. The B decisions are
+        drawn from the visited decisions at which the experts choose different actions.
 
         Args:
             seen: [steps, rows, F] observations at the visited decisions.
-            moments: states of the worlds at these decisions.
+            moments: states of the worlds at the visited decisions.
 
         Returns observations [B, F], costs [B, K], and the importance (weight in the loss) of each decision, [B].
 

@@ -50,7 +50,7 @@ def explore(engine: Engine, plan: ExpertsPlan, acts: Sequence[Act], gamma: float
         engine: engine of the training run; it is not changed.
         plan: settings of the mixture of experts (recipe key ``experts``).
         acts: earlier experts, each as a function from observations [rows, F] to actions [rows].
-        gamma: discount of one time step.
+        gamma: discount factor per time step.
 
     """
     alert, start = engine.first_moments(plan.worlds)
@@ -70,7 +70,7 @@ def drive_from(
         engine: engine of the training run; it is not changed.
         start: the n states from which the policy drives.
         act: policy: a function from observations [rows, F] to actions [rows].
-        gamma: discount of one time step.
+        gamma: discount factor per time step.
         count: count of harm, ``first`` or ``total``; None: the count that the reward uses.
 
     Returns two arrays [n] for the first learner: the return (NaN if the simulation failed), and the harm that this
@@ -86,14 +86,15 @@ def drive_from(
 def show_templates(engine: Engine, plan: ExpertsPlan, explored: Explored, gamma: float, seed: int) -> Shown:
     """Draw templates (random braking profiles); return the decisions of templates that do better than all experts.
 
-    In each world ``plan.templates`` templates are drawn, and the best one is simulated. If its return exceeds the
-    return of the best earlier expert by more than ``plan.gain``, its observations and actions are returned.
+    In each world ``plan.templates`` templates are drawn, and the best one is simulated. If the return of this
+    template exceeds the return of the best earlier expert by more than ``plan.gain``, the observations and actions of
+    the template are returned.
 
     Args:
         engine: engine of the training run; it is not changed.
         plan: settings of the mixture of experts (recipe key ``experts``).
         explored: worlds, and the best results of the earlier experts in them, as ``explore`` returns them.
-        gamma: discount of one time step.
+        gamma: discount factor per time step.
         seed: seed with which the templates are drawn.
 
     """
@@ -142,7 +143,7 @@ def own_worlds(engine: Engine, plan: ExpertsPlan, explored: Explored, act: Act, 
         plan: settings of the mixture of experts (recipe key ``experts``).
         explored: worlds, and the best results of the earlier experts in them, as ``explore`` returns them.
         act: the new expert: a function from observations [rows, F] to actions [rows].
-        gamma: discount of one time step.
+        gamma: discount factor per time step.
 
     """
     gained, _ = drive_from(engine, explored.start, act, gamma)

@@ -88,7 +88,7 @@ class RolloutClassificationModel(VineModel):
 
         Args:
             seen: [steps, rows, F] observations at the visited decisions.
-            moments: states of the worlds at these decisions.
+            moments: states of the worlds at the visited decisions.
 
         Returns three arrays: the observations [B, F], the numbers of the choices [B, C] (numbered as in
         ``ChoosingActor``), and the costs of the choices [B, C]. Column 0 is the actor's own choice. The cost of a

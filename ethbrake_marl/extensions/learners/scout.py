@@ -36,12 +36,12 @@ class Scout(nn.Module):
         nn.init.zeros_(last.bias)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Return the logarithm of the predicted size, at most 20, of decisions with observations [rows, F], [rows]."""
+        """Return the logarithm, at most 20, of each decision's predicted size, [rows], from observations [rows, F]."""
         logarithm: Tensor = self.layers(observation)[:, 0].clamp(max=20.0)
         return logarithm
 
     def expect(self, observation: Float32s) -> Floats:
-        """Return the predicted size, above 0, of decisions with observations [rows, F], [rows]."""
+        """Return the predicted size of each decision, above 0, [rows], from observations [rows, F]."""
         with torch.no_grad():
             size: Floats = np.exp(self(torch.from_numpy(observation)).numpy().astype(np.float64))
         return size
@@ -71,7 +71,7 @@ def draw_rows(expected: Floats, count: int, focus: float) -> tuple[Ints, Float32
         focus: share of the draws with probabilities in proportion to ``expected``; the other draws are uniform.
 
     Returns the indices of the drawn decisions [count], and their importance [count], which is their weight in the loss:
-    ``1 / (n p)``, where p is the probability of drawing the decision. The mean importance is 1 in expectation.
+    ``1 / (n p)``, where p is the probability of drawing the decision. The expected value of the importance is 1.
 
     """
     n = len(expected)
@@ -93,8 +93,8 @@ def choose_rows(
         count: number of decisions to draw.
         focus: share of the draws with probabilities in proportion to the predicted size, with replacement (see
             ``draw_rows``). If ``focus`` is 0, all decisions are drawn uniformly and without replacement.
-        expect: function that predicts the size of decisions, [rows], from observations [rows, F]. If it is None,
-            decisions are drawn as with ``focus`` = 0.
+        expect: function that predicts the size of decisions, [rows], from observations [rows, F]. If ``expect`` is
+            None, decisions are drawn as with ``focus`` = 0.
 
     Returns the indices of the drawn decisions in ``observed``, and the weight of each drawn decision in the loss
     (*importance*). The weight is 1 if the decisions are drawn uniformly.

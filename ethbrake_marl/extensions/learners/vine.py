@@ -31,8 +31,8 @@ class Vine(Algorithm):
     def build(self, training: Training, environment: EthBrakeVecEnv) -> VineModel:
         """Return a new model for a training run.
 
-        The model learns in ``environment``. Its initial weights are copied from the policy that the recipe's key
-        ``start`` names; without this key, the initial weights are random.
+        The model learns in ``environment``. The model's initial weights are copied from the policy that the recipe's
+        key ``start`` names; without this key, the initial weights are random.
         """
         recipe = training.recipe
         assert isinstance(recipe, VineRecipe)

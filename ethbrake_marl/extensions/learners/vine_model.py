@@ -95,7 +95,7 @@ class VineModel(BaseAlgorithm):
     def _visit(self, callback: BaseCallback, act: Act) -> tuple[Float32s, State]:
         """Drive all worlds for ``n_steps`` decisions with the policy ``act``; call ``callback`` after each decision.
 
-        Returns the observations [n_steps, rows, F], and the states of the worlds at these decisions.
+        Returns the observations [n_steps, rows, F], and the states of the worlds at the visited decisions.
         """
         seen, moments, numbers = [], [], []
         for _ in range(self.recipe.n_steps):
@@ -119,7 +119,7 @@ class VineModel(BaseAlgorithm):
 
         Args:
             seen: [steps, rows, F] observations at the visited decisions.
-            moments: states of the worlds at these decisions.
+            moments: states of the worlds at the visited decisions.
             actor: policy; a tried action is the policy's action plus or minus an offset.
 
         Returns the decisions at which the two actions were tried, with the measured gradients.

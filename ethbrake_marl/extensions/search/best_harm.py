@@ -192,8 +192,8 @@ def _kept_or_searched(
 ) -> BestHarmTable:
     """Return the table of best known harm for one chunk (at most ``CHUNK`` worlds of the list).
 
-    If ``file`` contains a table of these worlds that was made with the same options, this table is returned. If not,
-    the worlds are searched, and the table is written to ``file``.
+    If ``file`` contains a table of these worlds that was made with the same options, this table is returned. If
+    ``file`` contains no such table, the worlds are searched, and the new table is written to ``file``.
 
     Args:
         task: scenario and controlled vehicles.

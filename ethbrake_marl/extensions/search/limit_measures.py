@@ -24,8 +24,8 @@ KNOWN, BELOW = "known", "below_best_known"
 class LimitMeasures(MeasureSet):
     """Measures of unavoidable contact, of the best known harm, and of each agent's regret.
 
-    The functions of the measures receive the outcome of an agent and a ``Regrets`` object with the best known harm of
-    every world.
+    Each measure is computed from the outcome of an agent and a ``Regrets`` object, which contains the best known harm
+    of every world.
     """
 
     measures = (
@@ -122,8 +122,8 @@ class LimitMeasures(MeasureSet):
     def row(self, tally: AgentTally, worlds: int, context: Regrets | Silent) -> dict[str, Any]:
         """Return additional values for an agent in the summary, by name.
 
-        ``known_best_share`` is the share of worlds whose best known harm was known before the evaluation.
-        ``below_best_known`` is the number of worlds in which the agent does less harm than was known.
+        ``known_best_share`` is the share of the worlds for which a best known harm existed before the evaluation.
+        ``below_best_known`` is the number of worlds in which the agent does less than this earlier best known harm.
         ``best_known_warning`` is a warning text or None. ``impact_unproven`` describes the worlds in which contact is
         proven unavoidable but an impact is not, with the fields of ``Between``.
 

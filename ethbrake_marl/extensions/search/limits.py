@@ -63,12 +63,12 @@ class Limits:
 
     @property
     def known(self) -> Bools:
-        """True for worlds whose best known harm, under both counts, was known before the evaluation, [n]."""
+        """True for worlds for which a best known harm, under both counts, existed before the evaluation, [n]."""
         return np.isfinite(self.first_impact_harm) & np.isfinite(self.total_harm)
 
     @property
     def warning(self) -> str:
-        """Warning that a table contains the best known harm of some worlds only; empty if of all worlds or of none."""
+        """Warning text if a table contains the best known harm of only some of the worlds; otherwise empty."""
         known, avoidable = self.known, self.proof.avoidable
         listed = known if avoidable is None else known & ~avoidable
         missing = int((~known).sum())
