@@ -46,7 +46,7 @@ def front_command(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show each vehicle's harm for many choices of whose harm counts.
+    """Show how sparing one vehicle changes the harm of the others.
 
     For each choice of weights, a search looks in every world for the commands with the least weighted harm. The command
     compares the results with full braking, with maximin (commands that minimise the largest harm of a vehicle) and, if

@@ -36,7 +36,7 @@ class Outlook(NamedTuple):
 
     @property
     def decisions(self) -> int:
-        """Largest number of decisions in an episode."""
+        """Largest possible number of decisions in an episode."""
         return int(np.ceil(self.horizon_s / self.time_step_s)) + 1
 
     def problem(self, worlds: Worlds, vehicle: int, others_mps2: Floats) -> ProfileProblem:

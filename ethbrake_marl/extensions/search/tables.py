@@ -151,7 +151,7 @@ class BestHarmTable:
     def improved(
         self, identity: UInt64s, harm_count: HarmCount, harm: Floats, profiles: Profiles | None = None
     ) -> tuple[BestHarmTable, Bools]:
-        """Return the table with the value in ``harm`` wherever it is smaller, and a mask [m] of the changed worlds.
+        """Return a copy of the table with all smaller values from ``harm``, and a mask [m] of the changed worlds.
 
         A value in ``harm`` must be smaller than the value in the table by more than ``TOLERANCE``. Worlds that are not
         in the table are ignored. Raises ``InvalidInput`` if the table does not contain ``harm_count``, or if ``harm``

@@ -48,9 +48,9 @@ def _best_templates(
 ) -> None:
     """Write the template with the least harm in each world to ``commands`` [n, T].
 
-    The number of steps of its episode is written to ``steps`` [n]. ``random`` [n] is the initial state of each world's
-    random stream. A template whose harm is at least ``bound`` [n] is rejected. ``number`` templates are drawn in each
-    world.
+    The number of steps of this template's episode is written to ``steps`` [n]. ``random`` [n] is the initial state of
+    each world's random stream. A template whose harm is at least ``bound`` [n] is rejected. ``number`` templates are
+    drawn in each world.
     """
     start, T, S = problem.start, commands.shape[1], problem.start.shape[1]
     best, room = Plan(np.zeros(T), np.zeros((T + 1, S))), Plan(np.zeros(T), np.zeros((T + 1, S)))
