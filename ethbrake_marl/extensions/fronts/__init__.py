@@ -1,1 +1,1 @@
-"""The command ``study front``: the harm that each vehicle bears if the vehicles' harms are weighted in many ways."""
+"""The command ``study front``: the harm of each vehicle under commands that minimise a weighted sum of the harms."""

@@ -50,13 +50,13 @@ def front_command(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show each vehicle's harm for many choices of whose harm counts.
+    """Show how sparing one vehicle changes the harm of the others.
 
-    For each choice of weights, the search looks in every world for the commands with the least weighted harm. The
-    result is compared with full braking, with maximin (commands that minimise the largest harm of a vehicle) and, if
-    there is one learner, with agents. The default weights are a grid, equal weights, and one corner for each vehicle.
-    In a corner, one vehicle has the weight 1 and all other vehicles have a tiny weight. The command writes front.json,
-    front.png and, for three vehicles, front-ternary.png.
+    For each choice of weights, a search looks in every world for the commands with the least weighted harm. The command
+    compares the results with full braking, with maximin (commands that minimise the largest harm of a vehicle) and, if
+    there is one learner, with agents. The default choices of weights are a grid, equal weights, and, for each vehicle,
+    weight 1 for this vehicle and a tiny weight for all others. The command writes front.json, front.png and, for three
+    vehicles, front-ternary.png.
     """
     with Out(as_json=as_json, force=force) as out:
         import numpy as np

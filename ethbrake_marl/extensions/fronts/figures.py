@@ -1,4 +1,4 @@
-"""Figures of a front: ternary plot of the vehicles' shares of harm, and plot of the largest harm against the sum."""
+"""Figures of a front: who bears which share of the harm, and the harm of the line against the largest harm."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ Json = dict[str, Any]
 
 
 def front_figures(results: Json) -> dict[str, Figure]:
-    """Return the figures of a front by file name. ``results`` is the content of ``front.json``.
+    """Return the figures of a front, by file name. ``results`` is the content of ``front.json``.
 
-    There is a ternary plot only if the line has three vehicles.
+    The ternary plot is drawn only for a line of three vehicles.
     """
     figures = {"front.png": sum_figure(results)}
     if len(results["vehicles"]) == 3:
@@ -42,7 +42,7 @@ def front_figures(results: Json) -> dict[str, Figure]:
 
 
 def sum_figure(results: Json) -> Figure:
-    """Draw the largest mean harm of a vehicle against the sum of all vehicles' mean harm.
+    """Draw the mean harm of the line (horizontal) and the mean harm of the vehicle that bears most (vertical).
 
     There is one point for each choice of weights. ``results`` is the content of ``front.json``.
     """
@@ -62,7 +62,7 @@ def sum_figure(results: Json) -> Figure:
 
 
 def ternary_figure(results: Json) -> Figure:
-    """Draw which shares of the harm the three vehicles bear. The colour of a point shows the sum of their harm.
+    """Draw the shares of harm that the three vehicles bear. The colour of a point shows the harm of the whole line.
 
     ``results`` is the content of ``front.json``.
     """
@@ -105,9 +105,10 @@ def ternary_figure(results: Json) -> Figure:
 
 
 def _places(shares: Floats) -> Floats:
-    """Return the coordinates, [2, k], of k points in the triangle whose corners are the vehicles.
+    """Return the positions of k points in the ternary plot, [2, k]: horizontal and vertical coordinates.
 
-    Row k of ``shares`` [k, 3] contains the shares of harm that the three vehicles bear.
+    ``shares`` [k, 3] are the shares of the harm that the three vehicles bear. At a corner of the plot, one vehicle
+    bears all harm.
     """
     places: Floats = (shares[:, :, np.newaxis] * _CORNERS).sum(axis=1).T
     return places

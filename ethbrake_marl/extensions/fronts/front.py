@@ -1,7 +1,7 @@
 """The front of a list of worlds: for each choice of weights, the least weighted harm and the harm of each vehicle.
 
-Because each world is searched by itself, the means over the list are points of the convex part of the Pareto front of
-mean harm. The points are the best that a search found. No bounds are proven.
+A point of the front is the mean harm of each vehicle over the list, for one choice of weights. The points approximate
+the convex part of the Pareto front. A search computes the points; it is not proven that no better points exist.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ Progress = Callable[[int, int], None]  # called with the number of finished sear
 
 
 class Front(NamedTuple):
-    """Best profiles in n worlds for each of W choices of weights, and the harm that each vehicle bears under them."""
+    """Best command profiles in n worlds for each of W choices of weights, and the resulting harm of each vehicle."""
 
     weights: Floats  # [W, N] weights of the vehicles' harm
     harm_count: HarmCount  # harm count that is weighted, ``first`` or ``total``
@@ -73,15 +73,15 @@ class Front(NamedTuple):
     def mean(self, harm_count: HarmCount | None = None) -> Floats:
         """Return the mean harm of each vehicle over the worlds, [W, N] m2/s2.
 
-        ``harm_count`` is ``first`` or ``total``; None: the count that the search minimised.
+        ``harm_count`` is ``first`` or ``total``; None: the harm count that the search minimised.
         """
         mean: Floats = self.borne[harm_count or self.harm_count].mean(axis=1)
         return mean
 
     def nondominated(self) -> Bools:
-        """Return whether each profile is not dominated by another profile of the front for the same world, [W, n].
+        """Return True for each profile that no other profile of the front for the same world dominates, [W, n].
 
-        A profile dominates another profile if no vehicle bears more harm and at least one vehicle bears less.
+        Profile A dominates profile B if no vehicle bears more harm under A and at least one vehicle bears less.
         """
         return nondominated(self.borne[self.harm_count].transpose(1, 0, 2)).T
 
@@ -108,11 +108,11 @@ def search_front(
 ) -> Front:
     """Search every world for the commands with the least weighted harm, for every choice of weights.
 
-    In every world, the result for a choice of weights has at most the weighted harm of each of these: ``CONSTANTS``
-    constant commands, the results for other weights and, with one learner, the profile shipped for this world,
-    ``agents`` and every shipped policy that can drive the learner. The result for a world depends neither on
-    ``threads`` nor on the other worlds. Raises the exceptions of ``checked_weights``, ``best_harm`` and
-    ``make_agents``, and ``InvalidInput`` if ``agents`` are given but there are several learners.
+    For each choice of weights, the result in a world is at least as good as ``CONSTANTS`` constant commands and as the
+    results for all other weights. With one learner, the result is also at least as good as the profile that is shipped
+    for this world, as ``agents``, and as every shipped policy that can drive the learner. The result for a world
+    depends neither on ``threads`` nor on the other worlds. Raises the exceptions of ``checked_weights``, ``best_harm``
+    and ``make_agents``, and ``InvalidInput`` if ``agents`` are given but the scenario has several learners.
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.extensions.fronts.front import search_front
@@ -166,13 +166,13 @@ def search_front(
 def least_largest(scenario: Scenario, worlds: Worlds, front: Front, *, budget: int = BUDGET, threads: int = 1) -> Borne:
     """Search for commands that minimise the largest harm of a vehicle, and return the harm of each vehicle under them.
 
-    The result is an array [n, N] in m2/s2 for each harm count. The function uses ``best_harm`` with the objective
-    ``maximin``. In every world, the largest harm of a vehicle is at most as large as under any profile of ``front``.
+    The result is an array [n, N] in m2/s2 for each harm count. In every world, the largest harm of a vehicle under the
+    resulting commands is at most the largest harm of a vehicle under any profile of ``front``.
 
     Args:
         scenario: scenario of the worlds.
         worlds: worlds at t = 0, [n].
-        front: front of the same worlds.
+        front: front that was searched in the same worlds.
         budget: number of profiles to try in each world.
         threads: number of threads.
 
@@ -194,7 +194,7 @@ def _joined_borne(parts: Sequence[Borne]) -> Borne:
 
 
 class Preferring(NamedTuple):
-    """Scenario with one choice of weights of the vehicles' harm, and agents made for this scenario."""
+    """Scenario in which one choice of weights of the vehicles' harm is fixed, and agents for this scenario."""
 
     scenario: Scenario  # scenario with fixed ``harm_weight`` and the objective ``preference``
     agents: Mapping[str, Driver]  # agents that are compared with the front, by spec
@@ -204,13 +204,13 @@ class Preferring(NamedTuple):
     def of(
         cls, scenario: Scenario, weights: Floats, agents: Sequence[str], silent: Sequence[str], harm_count: HarmCount
     ) -> Preferring:
-        """Return the scenario with ``weights`` [N], and agents for it from the specs ``agents`` and ``silent``."""
+        """Fix the ``weights`` [N] in ``scenario``, and make the agents that ``agents`` and ``silent`` name."""
         fixed = scenario.replace(harm_weight=weights.tolist(), objective="preference")
         made = (make_agents(specs, fixed, harm_count=harm_count) for specs in (agents, silent))
         return cls(fixed, *made)
 
     def weighted(self, worlds: Worlds) -> Worlds:
-        """Return the worlds with the weights of this scenario as their ``harm_weight``."""
+        """Return a copy of ``worlds`` in which each vehicle has the ``harm_weight`` of this scenario."""
         weight = np.broadcast_to(np.array(self.scenario.harm_weight, np.float64), worlds.speeds_mps.shape).copy()
         return replace(worlds, vehicles=replace(worlds.vehicles, harm_weight=weight))
 
@@ -233,17 +233,18 @@ def _searched(
     preferring: Sequence[Preferring],
     tell: Callable[[int], None],
 ) -> Front:
-    """Return the front of some worlds.
+    """Search ``worlds`` for every choice of weights, and return the front.
 
-    Each choice of weights is searched twice: the second search starts from the results of all first searches.
+    There are two searches for each choice of weights. The second search starts from the best result of the first
+    searches for all choices of weights.
 
     Args:
         worlds: worlds at t = 0, [n].
         task: scenario, controlled vehicles, and the harm count to minimise.
         weights: weights of the vehicles' harm, [W, N].
         effort: keyword arguments ``budget``, ``seed`` and ``threads`` of ``search_profiles``.
-        preferring: scenario and agents for each of the W choices of weights.
-        tell: function that is called after each search with the number of worlds that were searched.
+        preferring: for each of the W choices of weights, the scenario with these weights and agents for this scenario.
+        tell: function that is called after each search; its argument is the number of worlds that were searched.
 
     """
     problem, pool = task_problem(worlds, task), Pool()
@@ -278,25 +279,25 @@ def _searched(
 
 
 def observes_weights(agent: Driver) -> bool:
-    """Return whether the commands of an agent may depend on the weights of the vehicles' harm.
+    """Return False if an agent is a trained policy that does not observe the weights of the vehicles' harm.
 
-    The result is False only for trained policies that do not observe the weights.
+    For every other agent the result is True, because its commands may depend on the weights.
     """
     manifest = getattr(agent, "manifest", None)
     return manifest is None or any("harm_weight" in name for name in manifest.observation.features)
 
 
 class Pool:
-    """Collection of profiles for the same worlds, from which the best ones for any weights can be chosen."""
+    """Profiles that were tried in the same worlds; for any weights, the best profile of each world can be chosen."""
 
     def __init__(self) -> None:
         self._profiles: list[Profiles] = []
         self._borne: dict[HarmCount, list[Floats]] = {count: [] for count in HARM_COUNTS}
 
     def add(self, problem: ProfileProblem, profiles: Profiles) -> Borne:
-        """Add one profile for each world of ``problem``.
+        """Add ``profiles``, one for each world of ``problem``, to the pool.
 
-        Return the harm of each vehicle under these profiles, [n, N] m2/s2, by harm count.
+        Return the harm of each vehicle under the added profiles, [n, N] m2/s2, by harm count.
         """
         self._profiles.append(profiles)
         all_borne = problem.borne(profiles)
@@ -305,10 +306,10 @@ class Pool:
         return all_borne
 
     def choice(self, weights: Floats, harm_count: HarmCount) -> Ints:
-        """Return, for each world, the number of the added profile with the least weighted harm, [n].
+        """Return, for each world, the number of the profile with the least weighted harm, [n], in the order of adding.
 
-        If several profiles have the least weighted harm, the one with the least sum of harm is chosen. ``weights`` [N]
-        are the weights of the vehicles, and ``harm_count`` is the count of harm that is weighted.
+        Among profiles with equal weighted harm, the profile with the least unweighted harm of the line is chosen.
+        ``weights`` [N] are the weights of the vehicles' harm, and ``harm_count`` is the count of harm that is weighted.
         """
         borne = np.stack(self._borne[harm_count])
         amounts = amounts_of(borne.reshape(-1, len(weights)), weights).reshape(borne.shape[:2])
@@ -319,7 +320,7 @@ class Pool:
     def best(self, weights: Floats, harm_count: HarmCount) -> Profiles:
         """Return the profile with the least weighted harm in each of the n worlds.
 
-        The arguments are those of ``choice``.
+        The arguments are the same as for ``choice``.
         """
         chosen = self.choice(weights, harm_count)
         parts = [(k, np.flatnonzero(chosen == k)) for k in np.unique(chosen)]
@@ -328,10 +329,10 @@ class Pool:
         return Profiles(*(np.concatenate(each)[back] for each in zip(*padded, strict=True)))
 
     def least(self, weights: Floats, harm_count: HarmCount) -> tuple[Borne, tuple[Profiles, ...]]:
-        """Return the profiles with the least weighted harm for each of W choices of weights.
+        """Choose the profile with the least weighted harm in each world, for each of W choices of weights.
 
-        The first result is the harm of each vehicle under these profiles, [W, n, N] m2/s2; the second is the W
-        profiles.
+        The first result is the harm of each vehicle under the chosen profiles, [W, n, N] m2/s2, by harm count. The
+        second result is the chosen profiles, [n] for each choice of weights.
 
         ``weights`` [W, N] are the choices of weights, and ``harm_count`` is the count of harm that is weighted.
         """

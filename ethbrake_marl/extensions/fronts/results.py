@@ -33,16 +33,16 @@ def front_results(
     """Return the content of ``front.json``: the front, full braking, maximin, and the agents.
 
     All means have 95 % intervals over worlds, or over recordings if the worlds come from recordings. For each choice of
-    weights, an agent's ``ratio`` is its mean weighted harm divided by that of the front, or null if that of the front
-    is 0. An agent's ``above`` is its mean weighted harm minus that of the front.
+    weights, ``ratio`` is the mean weighted harm of an agent divided by the mean weighted harm of the front (null if
+    the latter is 0), and ``above`` is the agent's mean weighted harm minus the front's mean weighted harm.
 
     Args:
-        front: front to describe.
+        front: front that is written to the file.
         scenario: scenario of the worlds.
         sample: worlds for which the front was searched.
-        beside: further results to include: name (``full_brake``, which is required, or others such as ``maximin``) ->
-            harm count -> harm of each vehicle, [n, N] m2/s2.
-        seed: seed of the list of worlds; None: the seed is unknown.
+        beside: further results, by name and harm count: harm of each vehicle, [n, N] m2/s2. The name ``full_brake`` is
+            required; others, such as ``maximin``, are optional.
+        seed: seed with which the worlds were drawn; None: the seed is unknown.
 
     """
     least, by = front.amounts, sample.clusters
@@ -92,17 +92,16 @@ def _vehicles(borne: Borne, by: Texts | None) -> Mapping[str, list[Json]]:
 def hypervolumes(front: Front, full_brake: Floats, clusters: Texts | None = None) -> list[Json]:
     """Return the hypervolumes of the front and of each agent, for two reference points.
 
-    The points are the vehicles' mean harms for each choice of weights.
+    A point consists of the mean harms of all vehicles for one choice of weights.
 
-    The first reference point is the mean harm of full braking: only points that are better than full braking for every
-    vehicle contribute. The second reference point contains, for each vehicle, its largest mean harm under full braking
-    or at any point of the front: points that are worse than full braking for some vehicle contribute, too. ``share`` is
-    an agent's hypervolume divided by the front's hypervolume. The 95 % intervals are percentiles over ``RESAMPLES``
-    resamples of the worlds, or of the clusters if they are given. Raises ``InvalidInput`` if an agent has the name
-    ``front``.
+    With the first reference point, the mean harm of full braking, a point contributes only if it is better than full
+    braking for every vehicle. The second reference point is, for each vehicle, the larger one of its mean harm under
+    full braking and its largest mean harm on the front. ``share`` is an agent's hypervolume divided by the front's
+    hypervolume. The 95 % intervals are percentiles over ``RESAMPLES`` bootstrap samples of the worlds, or of the
+    ``clusters`` if given. Raises ``InvalidInput`` if an agent has the name ``front``.
 
     Args:
-        front: front with the harm of the agents.
+        front: front that also contains the harm of the agents.
         full_brake: harm of each vehicle if the learners brake fully, [n, N] m2/s2.
         clusters: name of the cluster (recording) to which each world belongs, [n]; None: all worlds are independent.
 
@@ -138,9 +137,9 @@ def hypervolumes(front: Front, full_brake: Floats, clusters: Texts | None = None
 
 
 def _interval(values: Floats) -> Json | None:
-    """Return ``values[0]``, with the 2.5 % and 97.5 % percentiles of all other values as its interval, as plain data.
+    """Return ``values[0]`` and its 95 % interval: the 2.5 % and 97.5 % percentiles of all later values.
 
-    Returns None if a value is not finite.
+    Returns None if one of the values is not finite.
     """
     if not np.isfinite(values).all():
         return None
@@ -159,9 +158,10 @@ def full_braking(scenario: Scenario, sample: Sample) -> Borne:
 
 
 def front_sheet(results: Json) -> Sheet:
-    """Return a table with a row for each choice of weights: harm of each vehicle, and ``ratio`` of each agent.
+    """Return a table with one row for each choice of weights, and one for each further result, such as full braking.
 
-    ``results`` is the content of ``front.json``.
+    A row contains the mean harm of each vehicle and, for a choice of weights, the ``ratio`` of each agent. ``results``
+    is the content of ``front.json``.
     """
     count = results["harm_count"]
     columns: list[Column | str] = [

@@ -19,10 +19,11 @@ SLIGHT = 1e-4  # weight of the other vehicles in a corner; their harm decides be
 
 
 def weight_grid(vehicles: int, steps: int = STEPS) -> Floats:
-    """Return a grid of W evenly spaced choices of weights that sum to 1, [W, N].
+    """Return W evenly spaced choices of weights, [W, N]. In each choice the weights of the N vehicles sum to 1.
 
-    Between two neighbouring rows, the weight of one vehicle rises by one step and that of another falls by one step.
-    Raises ``InvalidInput`` if ``steps`` is below 1, or if the grid would have more than ``MOST`` rows.
+    From one choice to the next, the weight of one vehicle rises by 1 / ``steps``, and the weight of another vehicle
+    falls by 1 / ``steps``. Raises ``InvalidInput`` if ``steps`` is below 1, or if there would be more than ``MOST``
+    choices.
 
     >>> from ethbrake_marl.extensions.fronts.weights import weight_grid
     >>> weight_grid(3, 1).tolist()
@@ -54,9 +55,10 @@ def weight_grid(vehicles: int, steps: int = STEPS) -> Floats:
 
 
 def corners(vehicles: int) -> Floats:
-    """Return N choices of weights, [N, N]. In row i, vehicle i has the weight 1.
+    """Return one choice of weights for each of the N vehicles, [N, N]: in row i, vehicle i has the weight 1.
 
-    All other vehicles have the weight ``SLIGHT``, so their harm matters only if the harm of vehicle i is almost equal.
+    In row i, all other vehicles have the weight ``SLIGHT``. The harm of the other vehicles decides only between
+    commands under which vehicle i has almost the same harm.
     """
     return np.where(np.eye(vehicles) == 1.0, 1.0, SLIGHT)
 
@@ -64,8 +66,8 @@ def corners(vehicles: int) -> Floats:
 def checked_weights(weights: Sequence[Sequence[float]] | Floats, vehicles: int) -> Floats:
     """Check W choices of weights of the N vehicles' harm, and return them as an array [W, N].
 
-    Raises ``InvalidInput`` if there are no rows, if a row does not contain one weight for each vehicle, if a weight is
-    neither 0 nor from 1e-6 to 1e6, or if a row contains only zeros.
+    Raises ``InvalidInput`` if there is no choice of weights, if a choice does not contain one weight for each vehicle,
+    if a weight is neither 0 nor from 1e-6 to 1e6, or if all weights of a choice are 0.
     """
     rows = [checked_numbers("weights", row) for row in weights]
     for k, row in enumerate(rows):
@@ -84,7 +86,8 @@ def checked_weights(weights: Sequence[Sequence[float]] | Floats, vehicles: int) 
 def parsed_weights(texts: Sequence[str], vehicles: int) -> Floats:
     """Convert W texts such as ``1,4,1``, each with the weights of N vehicles, into an array [W, N].
 
-    Raises ``InvalidInput`` if a text is not a list of numbers, and the exceptions of ``checked_weights``.
+    Raises ``InvalidInput`` if a text does not consist of numbers with commas between them, and the exceptions of
+    ``checked_weights``.
     """
     rows = []
     for text in texts:

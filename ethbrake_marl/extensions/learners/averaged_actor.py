@@ -25,19 +25,19 @@ from ethbrake_marl.training.networks import ACTIVATIONS, sb3_names, tensors_of
 class Deterministic(BasePolicy):
     """Base class of policies without exploration noise: actions are the network's outputs, clipped to [-1, 1].
 
-    A subclass defines ``forward``, and either ``means`` or ``act``. For a recipe of ``vine`` with ``focus`` above 0,
-    the subclass also defines ``expect``. In all methods, ``rows`` is the number of observations, and F is the number of
-    features of an observation.
+    A subclass must define ``forward``, and one of ``means`` and ``act``. If the recipe of ``vine`` has ``focus`` above
+    0, the subclass must also define ``expect``. In all methods, ``rows`` is the number of observations, and F is the
+    number of features of an observation.
     """
 
     def means(self, observation: Float32s) -> Float32s:
-        """Return the unclipped outputs [rows] of the network in training for observations [rows, F]."""
+        """Return the outputs [rows], not clipped to [-1, 1], of the network in training for observations [rows, F]."""
         raise NotImplementedError
 
     def expect(self, observation: Float32s) -> Floats:
-        """Return the predicted absolute gradient of the return with respect to the action, [rows].
+        """Predict the size of the gradient of the return with respect to the action, [rows].
 
-        ``observation`` [rows, F] are the observations.
+        ``observation`` [rows, F] are the observations from which the gradient is predicted.
         """
         raise NotImplementedError
 
@@ -48,7 +48,7 @@ class Deterministic(BasePolicy):
     def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
         """Return copies of the averaged weights, by name.
 
-        The names are those in a policy bundle whose network is ``network``.
+        The weights have the same names as in a policy bundle whose network is ``network``.
         """
         return tensors_of(self, network)
 
@@ -58,15 +58,16 @@ class Deterministic(BasePolicy):
 
 
 class AveragedActor(Deterministic):
-    """Actor whose network exists twice: ``learning`` is in training, ``average`` has a running average of its weights.
+    """Actor whose network exists twice: ``learning`` is trained; ``average`` has running averages of its weights.
 
-    A trained policy uses the averaged weights. These weights have the names that they have in Stable-Baselines3's PPO.
+    A trained policy uses the averaged weights. The averaged weights have the same names as in PPO of
+    Stable-Baselines3.
 
     Args:
         observation_space: Gymnasium space of an observation.
         action_space: Gymnasium space of an action.
-        rate: learning rate as a function of the share of the training that remains (1 to 0).
-        recipe: recipe of the training, which also describes the network.
+        rate: learning rate as a function of the share of the training run that remains (1 to 0).
+        recipe: recipe of the training run, which also describes the network.
 
     """
 
@@ -98,9 +99,9 @@ class AveragedActor(Deterministic):
             learns.copy_(mean)
 
     def take_over(self, tensors: Mapping[str, Float32s]) -> None:
-        """Copy the weights of a policy bundle into both copies of the network.
+        """Copy the weights of a policy bundle into both networks, ``learning`` and ``average``.
 
-        ``tensors`` maps the name of each tensor to its weights.
+        ``tensors`` contains the weights of the policy bundle by name.
         """
         state = self.state_dict()
         for name, theirs in sb3_names(self._spec).items():

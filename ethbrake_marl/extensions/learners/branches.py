@@ -1,8 +1,8 @@
 """Branches: copies of a running episode. Each copy is simulated to its end with slightly different actions.
 
-In a branch, an offset is added to one learner's actions for a few steps. After these steps the policy's actions are
-used without an offset. Two branches that start in the same state differ only in the offset: their random numbers (for
-lost messages) are the same.
+In a branch, an offset (a small number) is added to one learner's actions for a few steps. After these steps the
+policy's actions are used without an offset. Two branches from the same state differ only in the offset: they use the
+same random numbers, so the same messages are lost.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ Decide = Callable[[Observations, Ints, int], Floats]  # (observations [m, L, F],
 class Offsets(NamedTuple):
     """Offsets that are added to the actions of one learner in each of n branches (copies of a running episode).
 
-    For example, with ``learner = [0, 0]``, ``size = [0.1, -0.1]``, ``steps = [3, 3]``, the foremost learner brakes less
-    for three steps in the first branch, and more for three steps in the second branch.
+    For example, ``learner = [0, 0]``, ``size = [0.1, -0.1]`` and ``steps = [3, 3]`` describe two branches. In the first
+    branch the foremost learner brakes less for three steps, in the second branch it brakes harder for three steps.
     """
 
     learner: Ints  # [n] index, among the learners, of the learner with the offset (0 = foremost)
@@ -45,15 +45,16 @@ def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) ->
     """Simulate every branch (copy of a running episode) to its end, with an offset added to one learner's actions.
 
     Args:
-        engine: engine whose n rows are the branches; the engine is changed.
+        engine: engine that simulates the n branches; its state is changed.
         act: policy of all learners: a function from observations to actions.
-        offsets: for each row, the offset, the learner that gets the offset, and the number of steps.
-        gamma: discount of one time step.
+        offsets: for each branch, the offset, the learner that gets the offset, and the number of steps with this
+            offset.
+        gamma: discount factor per time step.
 
-    Returns two arrays [n]. The first array contains the discounted return, from the start of the branch, of the learner
-    with the offset (NaN for a row whose simulation failed). The second array contains the change of this learner's
-    action after clipping to [-1, 1], summed over the steps. If harm is the only term of the reward, a row ends as soon
-    as all its vehicles are at rest and will stay at rest.
+    Returns two arrays with one number for each branch, [n]. The first array contains the discounted return of the
+    learner with the offset, from the start of the branch on (NaN if the simulation failed). The second array contains
+    the sum over the steps of (action with offset, clipped to [-1, 1], minus action of the policy). If harm is the only
+    term of the reward, a branch ends as soon as all its vehicles are at rest and will stay at rest.
 
     """
     moved, most = np.zeros(engine.n), int(offsets.steps.max(initial=0))
@@ -73,20 +74,20 @@ def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) ->
 
 
 def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) -> Floats:
-    """Simulate every row (world) of an engine to its end, and return each learner's discounted return, [n, L].
+    """Simulate all n worlds of an engine to the end, and return each learner's discounted return, [n, L].
 
-    In the shapes, n is the number of rows (worlds), m of rows that still run, L of learners, and F of observed
-    features.
+    L is the number of learners, F the number of features of an observation, and m the number of worlds whose
+    simulation has not ended.
 
     Args:
-        engine: engine whose rows (worlds) are simulated; the engine is changed.
-        decide: function with three arguments: the observations [m, L, F], the numbers of the rows that still run [m],
-            and the number of steps so far. The function returns the actions of the learners, [m, L].
-        gamma: discount of one time step.
-        at_least: number of steps that every row runs before it may end early.
+        engine: engine that simulates the n worlds; its state is changed.
+        decide: function that returns the actions of the learners, [m, L]. The three arguments of ``decide`` are the
+            observations [m, L, F], the indices of the m worlds, and the number of steps so far.
+        gamma: discount factor per time step.
+        at_least: number of steps before which no world ends early because its vehicles are at rest.
 
-    If harm is the only term of the reward, a row ends early as soon as all its vehicles are at rest and will stay at
-    rest. The return is NaN for a row whose simulation failed.
+    If harm is the only term of the reward, the simulation of a world ends as soon as all its vehicles are at rest and
+    will stay at rest. If the simulation of a world fails, its return is NaN.
 
     """
     vehicles = np.array(engine.learners, np.int64)
@@ -109,10 +110,10 @@ def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) 
 
 
 def visit(engine: Engine, act: Act) -> tuple[Observations, State]:
-    """Simulate every row (world) of an engine to its end, and return the observations and states of all steps.
+    """Simulate all worlds of an engine to the end, and return the observations and states at all decisions.
 
     ``act`` is the policy of all learners. Returns the observations [m, L, F] and the states of the worlds at the m
-    decisions of all rows, ordered by time. L is the number of learners, F the number of features.
+    decisions in all worlds together, ordered by time. L is the number of learners, F the number of features.
     """
     seen_then, moments = [], []
 
@@ -126,11 +127,11 @@ def visit(engine: Engine, act: Act) -> tuple[Observations, State]:
 
 
 def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
-    """Return whether all vehicles of a row are at rest and will stay at rest, [m] bool, for each of ``rows`` [m].
+    """Return, for each of m worlds, whether all its vehicles are at rest and will stay at rest, [m] bool.
 
-    ``before`` [m, columns] is the packed state of these rows one step earlier. The result is True only if nothing has
-    changed in this step and if no latency is still running. The end of a latency may change the observation, and then a
-    policy may move the vehicles again.
+    ``rows`` [m] are the indices of the worlds in the engine; ``before`` [m, columns] is their packed state one step
+    earlier. The result is True only if nothing has changed in this step and if every latency has elapsed. When a
+    latency elapses, the observation may change, so that a policy may move a vehicle again.
     """
     if engine.packed.has_messages or engine.in_pieces:
         return np.zeros(len(rows), np.bool_)  # a message may still change the observation, or a profile the command
@@ -141,13 +142,13 @@ def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
 
 @compiled
 def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, stands: Bools) -> None:
-    """Write into ``stands`` [m], for each of ``rows`` [m], whether all vehicles are at rest and will stay at rest.
+    """Write into ``stands`` [m], for each of m worlds, whether all its vehicles are at rest and will stay at rest.
 
     Args:
-        state: packed state of all rows of an engine.
-        before: [m, columns] packed state of ``rows`` one time step earlier.
-        params: packed constants of the worlds in all rows.
-        rows: [m] numbers of the rows to check.
+        state: packed state of all worlds of an engine.
+        before: [m, columns] packed state of the m worlds one time step earlier.
+        params: packed constants (such as masses and latencies) of all worlds of the engine.
+        rows: [m] indices of the worlds to check, in ``state`` and ``params``.
         stands: [m] array for the result; it is overwritten.
 
     """
@@ -169,10 +170,11 @@ def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, sta
 
 
 def counted_harm(engine: Engine, count: HarmCount) -> Floats:
-    """Return the harm so far that each of the L learners of an engine should make small, [n, L] m2/s2.
+    """Return the harm up to now that each of the L learners of an engine should make small, [n, L] m2/s2.
 
-    This harm is the learner's objective if the reward has objectives, else the harm of the whole line. ``count`` is the
-    count of harm: ``first`` (each pair's first impact) or ``total`` (all impacts).
+    If the reward has objectives, this harm is the value of the learner's objective. If the reward has no objectives,
+    this harm is the harm of the whole line. ``count`` is the count of harm: ``first`` (each pair's first impact) or
+    ``total`` (all impacts).
     """
     declared, shape = engine.reward.objective, (engine.n, len(engine.learners))
     if declared is None:
@@ -182,14 +184,14 @@ def counted_harm(engine: Engine, count: HarmCount) -> Floats:
 
 
 def other_count(count: HarmCount) -> HarmCount:
-    """Return the count of harm that is not ``count``: ``total`` for ``first``, and ``first`` for ``total``."""
+    """Return the other one of the two counts of harm: ``total`` for ``first``, and ``first`` for ``total``."""
     return "total" if count == "first" else "first"
 
 
 def moving_rows(moments: State) -> Bools:
     """Return, for each of the n states ``moments``, whether at least one vehicle moves, [n] bool.
 
-    A training ignores states in which all vehicles are at rest, because actions have no effect there.
+    A training run ignores states in which all vehicles are at rest, because actions have no effect there.
     """
     column = moments.packed.column
     moving: Bools = (moments.motion[:, column.speed : column.command] != 0.0).any(axis=1)

@@ -21,15 +21,15 @@ from ethbrake_marl.training.networks import ACTIVATIONS
 class AveragedGatingNetwork(nn.Module):
     """Gating network: from an observation of F features it chooses which of K experts (networks) acts.
 
-    The network exists twice: ``learning`` is in training; ``average`` has the running average of its weights, and makes
-    the choice.
+    The network exists twice: ``learning`` is trained; ``average`` has running averages of its weights. The network
+    ``average`` chooses the expert.
 
-    A memory stores the last M decisions at which the experts were compared: the observation, and the extra cost of each
-    expert. The extra cost is the cost of the expert minus the cost of the cheapest expert.
+    A memory stores the observation, and the extra cost of each expert, for the last M decisions at which the experts
+    were compared. The extra cost is the cost of the expert minus the cost of the cheapest expert.
 
     Args:
         inputs: number F of features of an observation.
-        rate: learning rate as a function of the share of the training that remains (1 to 0).
+        rate: learning rate as a function of the share of the training run that remains (1 to 0).
         recipe: recipe with the key ``experts``.
 
     """
@@ -54,21 +54,18 @@ class AveragedGatingNetwork(nn.Module):
         self.register_buffer("compared", torch.zeros(1, dtype=torch.int64))
 
     def remember(self, seen: Float32s, more: Float32s) -> None:
-        """Add m decisions to the memory: observations ``seen`` [m, F] and the experts' extra costs ``more`` [m, K]."""
+        """Store m decisions in the memory: observations ``seen`` [m, F], extra costs ``more`` [m, K] of K experts."""
         places = torch.arange(int(self.compared), int(self.compared) + len(seen)) % len(self.seen)
         self.seen[places], self.more[places] = torch.from_numpy(seen), torch.from_numpy(more)
         self.compared += len(seen)
 
     def recall(self, count: int) -> tuple[Tensor, Tensor]:
-        """Draw ``count`` decisions from the memory; return their observations [count, F] and extra costs [count, K]."""
+        """Draw decisions from the memory; return their observations [count, F] and experts' extra costs [count, K]."""
         some = torch.randint(min(int(self.compared), len(self.seen)), (count,))
         return self.seen[some], self.more[some]
 
     def choose(self, observation: Float32s) -> NDArray[np.int64]:
-        """Return the index of the expert that ``average`` chooses for each observation, [rows].
-
-        ``observation`` [rows, F] are the observations.
-        """
+        """Return, for each of the observations [rows, F], the index of the expert that ``average`` chooses, [rows]."""
         with torch.no_grad():
             chosen: NDArray[np.int64] = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
         return chosen

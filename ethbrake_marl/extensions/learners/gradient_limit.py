@@ -19,8 +19,8 @@ NARROWEST = 4.0  # least ratio of the largest offset to the smallest; takes prec
 def limit_that_cuts(sizes: Floats, share: float) -> float:
     """Return the limit at which clipping gradients lowers the sum of their absolute values by the fraction ``share``.
 
-    ``sizes`` [n] are absolute gradients. For example, clipping ``[1, 1, 4]`` at 2 lowers the sum from 6 to 4, which is
-    one third less. Therefore the limit for these gradients and ``share`` = 1/3 is 2.
+    ``sizes`` [n] are the absolute gradients. For example, with ``sizes`` = [1, 1, 4] and ``share`` = 1/3 the limit is
+    2: clipping at 2 gives [1, 1, 2], and the sum falls from 6 to 4, by one third.
     """
     rising = np.sort(sizes)
     remaining = (
@@ -32,16 +32,16 @@ def limit_that_cuts(sizes: Floats, share: float) -> float:
 def smallest_offset(measured: Floats, least: float, most: float) -> float:
     """Return the smallest offset (change of an action) with which gradients should be measured.
 
-    If the harm is a smooth function of the action, all offsets give similar gradients. If the harm jumps, smaller
-    offsets give larger gradients. The result is the offset at which the root mean square of the gradients should be
-    ``SPREAD`` times as large as at the offset ``most``. The result is at most ``most / NARROWEST`` and at least
-    ``least``. If gradients are not larger at small offsets, the result is ``least``.
+    If harm is a smooth function of the action, large and small offsets give similar gradients. If harm is
+    discontinuous, smaller offsets give larger gradients. The result is an offset that is expected to give ``SPREAD``
+    times the gradients (root mean square) that the largest offset ``most`` gives. This offset is limited to the range
+    from ``least`` to ``most / NARROWEST``. If small offsets do not give larger gradients, the result is ``least``.
 
     Args:
-        measured: [n, 2] absolute gradient, and the offset with which the gradient was measured (0: not measured yet).
-            The half of these rows with the smaller offsets is compared with the half with the larger offsets.
-        least: lower end of the range of offsets.
-        most: upper end of the range of offsets.
+        measured: [n, 2] absolute gradient, and the offset with which this gradient was measured (0: not measured yet).
+            The gradients of the smaller half of the offsets are compared with those of the larger half.
+        least: smallest offset that the recipe allows.
+        most: largest offset that the recipe allows.
 
     """
     known = measured[measured[:, 1] > 0.0]

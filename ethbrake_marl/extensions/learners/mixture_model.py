@@ -1,4 +1,4 @@
-"""Training of a mixture of experts: several networks, and a gating network that chooses which of them acts."""
+"""Training of a mixture of experts with the algorithm ``vine``."""
 
 from __future__ import annotations
 
@@ -36,11 +36,12 @@ from ethbrake_marl.policies.network_spec import Float32s
 class ExpertsModel(VineModel):
     """Model that trains a mixture of experts: several networks, and a gating network that chooses which of them acts.
 
-    The training has four stages. They train the first expert in all worlds, then each other expert in worlds that are
-    selected for this expert, then the gating network, and at last all networks jointly.
+    The training run has four stages. The first stage trains the first expert in all worlds. The second stage trains
+    each other expert in worlds that are selected for this expert. The third stage trains the gating network, and the
+    last stage trains all networks together.
 
     Args:
-        environment: environment of the training.
+        environment: environment in which the model is trained.
         recipe: recipe with the key ``experts``.
 
     """
@@ -92,14 +93,14 @@ class ExpertsModel(VineModel):
         update_learning_rate(optimizers, rate)
 
     def _enter(self, stage: Stage, number: int) -> None:
-        """Prepare a stage of the training. The stage begins, or is resumed, at update ``number``.
+        """Prepare a stage of the training run. The stage begins, or is resumed, at update ``number``.
 
-        If the stage trains an expert other than the first one, the method lets this expert imitate templates (random
-        braking profiles) that do better than the earlier experts, and selects the worlds for its training.
+        If the stage trains a second or later expert, this expert first imitates templates (random braking profiles)
+        that do better than the earlier experts. Then the worlds for the training of this expert are selected.
 
-        The preparation depends only on the earlier experts, so a resumed training repeats the preparation exactly.
+        The preparation depends only on the earlier experts, so a resumed training run repeats the preparation exactly.
 
-        Raises ``NoBetterTemplate`` if no template does better than the earlier experts, or if no world is selected.
+        Raises ``NoBetterTemplate`` if no template does better than the earlier experts, or if no world can be selected.
         """
         self._stage, self._own = stage, None
         if stage.trains != "other":
@@ -122,7 +123,7 @@ class ExpertsModel(VineModel):
             self.policy.actors[stage.network].load_state_dict(pupil.state_dict())
 
     def _imitate(self, pupil: AveragedActor, shown: Shown, seed: int) -> None:
-        """Train the expert ``pupil`` to imitate the actions of ``shown``; ``seed`` sets the order of decisions."""
+        """Train the expert ``pupil`` to imitate the actions in ``shown``, in a random order that ``seed`` fixes."""
         pupil.optimizer = adam(self.lr_schedule(1.0), pupil.learning)
         seen, wanted = torch.from_numpy(shown.seen), torch.from_numpy(shown.action)
         generator = torch.Generator().manual_seed(seed)
@@ -135,15 +136,15 @@ class ExpertsModel(VineModel):
         follow(pupil.average, pupil.learning, 0.0)
 
     def _compare(self, seen: Float32s, moments: State) -> tuple[Float32s, Floats, Float32s]:
-        """From B of the visited decisions, let each of K experts drive to the end of the episode; return the costs.
+        """Compare the K experts: let each expert drive from B visited decisions to the end, and return its costs.
 
-        The cost of an expert is minus its return, plus ``tie_break`` times its harm. This harm is counted in the way
-        (first impacts or all impacts) that the reward does not use. The B decisions are drawn from the decisions at
-        which the experts choose different actions.
+        The cost of an expert is minus its return, plus ``tie_break`` times its harm. This harm is the total harm if the
+        reward counts first-impact harm, and the first-impact harm if the reward counts total harm. The B decisions are
+        drawn from the visited decisions at which the experts choose different actions.
 
         Args:
             seen: [steps, rows, F] observations at the visited decisions.
-            moments: states of the worlds at these decisions.
+            moments: states of the worlds at the visited decisions.
 
         Returns observations [B, F], costs [B, K], and the importance (weight in the loss) of each decision, [B].
 
@@ -167,13 +168,13 @@ class ExpertsModel(VineModel):
     def _train_gate(self, seen: Float32s, costs: Floats, importance: Float32s | None = None) -> None:
         """Train the gating network to choose the cheapest expert.
 
-        In the loss, a wrong choice has a weight in proportion to its extra cost: its cost minus the cost of the
-        cheapest expert.
+        The weight of a wrong choice in the loss is proportional to its extra cost: the cost of the chosen expert minus
+        the cost of the cheapest expert.
 
         Args:
             seen: [B, F] observations.
             costs: [B, K] cost of each expert.
-            importance: [B] factor of each decision in the loss; None: all factors are 1.
+            importance: [B] weight of each decision in the loss; None: all weights are 1.
 
         """
         importance = np.ones(len(seen), np.float32) if importance is None else importance

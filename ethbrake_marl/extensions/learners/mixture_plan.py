@@ -9,9 +9,9 @@ from ethbrake_marl.training.recipe import Fraction, Layers, NonNegative, Positiv
 
 
 class Shares(FileModel):
-    """Share (0 to 1) of all updates that each stage of the training of a mixture of experts gets.
+    """How the updates of a training run are divided among the four stages that train a mixture of experts.
 
-    The four shares sum to 1.
+    Each stage gets a share from 0 to 1. The shares sum to 1.
     """
 
     pretraining_first: Fraction  # share for the first expert, which is trained in all worlds
@@ -33,9 +33,9 @@ class Shares(FileModel):
 class ExpertsPlan(FileModel):
     """Settings of a mixture of experts: several networks, and a gating network that chooses which of them acts.
 
-    Each expert after the first is pre-trained in two steps. First, the new expert imitates templates (random braking
-    profiles) in worlds in which a template does better than all earlier experts. Then the new expert is trained in the
-    worlds in which it is better than the best earlier expert, or nearly as good.
+    Each expert after the first one is pre-trained in two steps. In the first step, the new expert imitates templates
+    (random braking profiles) in worlds in which a template does better than all earlier experts. In the second step,
+    the new expert is trained in the worlds in which it is better than the best earlier expert, or nearly as good.
     """
 
     networks: int = Field(ge=2, le=16, description="number of experts")

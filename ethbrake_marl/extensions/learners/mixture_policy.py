@@ -26,7 +26,7 @@ class ExpertsPolicy(Deterministic):
     Args:
         observation_space: Gymnasium space of an observation.
         action_space: Gymnasium space of an action.
-        rate: learning rate as a function of the share of the training that remains (1 to 0).
+        rate: learning rate as a function of the share of the training run that remains (1 to 0).
         recipe: recipe with the key ``experts``.
 
     """
@@ -40,9 +40,9 @@ class ExpertsPolicy(Deterministic):
         self.gate = AveragedGatingNetwork(flatdim(observation_space), rate, recipe)
 
     def _chosen(self, observation: Float32s, ask: Callable[[AveragedActor, Float32s], NDArray[Any]]) -> Floats:
-        """Return one value for each observation [rows, F], computed by the actor that the gating network chooses.
+        """Let the actor that the gating network chooses compute one number for each observation [rows, F].
 
-        ``ask`` is a method of an actor that maps observations to values, such as ``AveragedActor.means``.
+        ``ask`` is the method of the actor that computes the numbers, such as ``AveragedActor.means``.
         """
         chosen, values = self.gate.choose(observation), np.empty(len(observation))
         for number, actor in enumerate(self.actors):
@@ -65,6 +65,6 @@ class ExpertsPolicy(Deterministic):
         return tensors
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Return the actions [rows, 1] of the averaged networks for observations [rows, F]."""
+        """Return the actions [rows, 1] that the averaged networks choose for observations [rows, F]."""
         chosen = self.gate.average(observation).argmax(dim=1, keepdim=True)
         return torch.cat([actor(observation) for actor in self.actors], dim=1).gather(1, chosen)

@@ -23,11 +23,11 @@ class Stage(NamedTuple):
 
 
 def stages_of(plan: ExpertsPlan, updates: int) -> tuple[Stage, ...]:
-    """Return the stages of a training, earliest first. A stage may contain no updates.
+    """Return the stages of a training run, earliest first. A stage with a small share may get no updates.
 
     Args:
-        plan: value of the recipe's key ``experts``, which contains the share of each stage.
-        updates: number of updates in the whole training.
+        plan: value of the recipe's key ``experts``, which contains the share of updates for each stage.
+        updates: number of updates in the whole training run.
 
     """
     shares, others = plan.shares, plan.networks - 1

@@ -1,6 +1,6 @@
-"""Selection of worlds and templates with which a new expert of a mixture is trained.
+"""Selection of the worlds and templates with which a new expert of a mixture is trained.
 
-A *template* is a random braking profile. A new expert imitates templates that do better than all earlier experts.
+A *template* is a random braking profile. A new expert first imitates templates that do better than all earlier experts.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ NO_DIFFERENCE = 1e-2  # returns that differ by less than this count as equal
 
 
 class Explored(NamedTuple):
-    """The first n worlds of the training, and the best result of the earlier experts in each of these worlds."""
+    """The first n worlds of the training run, and the best result of the earlier experts in each of these worlds."""
 
     alert: Worlds  # the worlds at the alert
     start: State  # states of the worlds at the first decision
@@ -37,20 +37,20 @@ class Explored(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """Decisions of templates (random braking profiles) that a new expert imitates: m observations and actions."""
+    """Observations and actions at m decisions of templates (random braking profiles), which a new expert imitates."""
 
     seen: Float32s  # [m, F] observations
     action: Float32s  # [m] actions of the templates, in [-1, 1]
 
 
 def explore(engine: Engine, plan: ExpertsPlan, acts: Sequence[Act], gamma: float) -> Explored:
-    """Let every earlier expert drive the first ``plan.worlds`` worlds of the training; return the best results.
+    """Let every earlier expert drive the first ``plan.worlds`` worlds of the training run; return the best results.
 
     Args:
-        engine: engine of the training; it is not changed.
-        plan: value of the recipe's key ``experts``.
+        engine: engine of the training run; it is not changed.
+        plan: settings of the mixture of experts (recipe key ``experts``).
         acts: earlier experts, each as a function from observations [rows, F] to actions [rows].
-        gamma: discount of one time step.
+        gamma: discount factor per time step.
 
     """
     alert, start = engine.first_moments(plan.worlds)
@@ -64,17 +64,17 @@ def explore(engine: Engine, plan: ExpertsPlan, acts: Sequence[Act], gamma: float
 def drive_from(
     engine: Engine, start: State, act: Act, gamma: float, count: HarmCount | None = None
 ) -> tuple[Floats, Floats]:
-    """Let one policy drive from each of n states to the end of the episode, and return its returns and harms.
+    """Let one policy drive from each of n states to the end of the episode, and measure its return and its harm.
 
     Args:
-        engine: engine of the training; it is not changed.
+        engine: engine of the training run; it is not changed.
         start: the n states from which the policy drives.
         act: policy: a function from observations [rows, F] to actions [rows].
-        gamma: discount of one time step.
+        gamma: discount factor per time step.
         count: count of harm, ``first`` or ``total``; None: the count that the reward uses.
 
-    Returns two arrays [n] for the first learner: its return (NaN if the simulation failed), and the harm that it should
-    make small (m2/s2).
+    Returns two arrays [n] for the first learner: the return (NaN if the simulation failed), and the harm that this
+    learner should make small (m2/s2).
 
     """
     rows = engine.branch(start)
@@ -84,16 +84,17 @@ def drive_from(
 
 
 def show_templates(engine: Engine, plan: ExpertsPlan, explored: Explored, gamma: float, seed: int) -> Shown:
-    """Draw templates (random braking profiles), and return the decisions of those that do better than all experts.
+    """Draw templates (random braking profiles); return the decisions of templates that do better than all experts.
 
-    For each world, ``plan.templates`` templates are drawn. The decisions of the best of these templates are returned if
-    its return exceeds that of the best expert by more than ``plan.gain``.
+    In each world ``plan.templates`` templates are drawn, and the best one is simulated. If the return of this
+    template exceeds the return of the best earlier expert by more than ``plan.gain``, the observations and actions of
+    the template are returned.
 
     Args:
-        engine: engine of the training; it is not changed.
-        plan: value of the recipe's key ``experts``.
-        explored: worlds and results of the earlier experts, from ``explore``.
-        gamma: discount of one time step.
+        engine: engine of the training run; it is not changed.
+        plan: settings of the mixture of experts (recipe key ``experts``).
+        explored: worlds, and the best results of the earlier experts in them, as ``explore`` returns them.
+        gamma: discount factor per time step.
         seed: seed with which the templates are drawn.
 
     """
@@ -131,18 +132,18 @@ def show_templates(engine: Engine, plan: ExpertsPlan, explored: Explored, gamma:
 
 
 def own_worlds(engine: Engine, plan: ExpertsPlan, explored: Explored, act: Act, gamma: float) -> State:
-    """Return the starting states of the worlds in which a new expert is to be trained.
+    """Select the worlds in which a new expert is to be trained, and return their states at the first decision.
 
-    A world is selected if the return of the new expert is larger than the return of the best earlier expert minus
-    ``plan.margin``. Worlds in which the two returns are equal, or in which an earlier expert does no harm, are not
-    selected.
+    A world is selected if the return of the new expert is above the return of the best earlier expert, or less than
+    ``plan.margin`` below it. Worlds in which these two returns are equal, or in which an earlier expert does no harm,
+    are not selected.
 
     Args:
-        engine: engine of the training; it is not changed.
-        plan: value of the recipe's key ``experts``.
-        explored: worlds and results of the earlier experts, from ``explore``.
+        engine: engine of the training run; it is not changed.
+        plan: settings of the mixture of experts (recipe key ``experts``).
+        explored: worlds, and the best results of the earlier experts in them, as ``explore`` returns them.
         act: the new expert: a function from observations [rows, F] to actions [rows].
-        gamma: discount of one time step.
+        gamma: discount factor per time step.
 
     """
     gained, _ = drive_from(engine, explored.start, act, gamma)
@@ -152,4 +153,7 @@ def own_worlds(engine: Engine, plan: ExpertsPlan, explored: Explored, act: Act, 
 
 
 class NoBetterTemplate(EthBrakeError, ValueError):
-    """Raised if no template (random braking profile) does better than the earlier experts: a new one is useless."""
+    """Raised if no template (random braking profile) does better than the earlier experts.
+
+    A further expert would then be useless.
+    """

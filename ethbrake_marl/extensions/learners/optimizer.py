@@ -11,7 +11,7 @@ from torch.optim import Optimizer
 
 
 class Adam(torch.optim.Adam):
-    """Torch's optimiser Adam without torch's decorators. The results are the same as with them, bit for bit.
+    """Torch's optimiser Adam without the decorators of its methods; the results are the same, bit for bit.
 
     The decorators would import torch's compiler, which takes 1 to 3 s of processor time.
     """

@@ -20,9 +20,9 @@ class RolloutClassification(Algorithm):
     """The algorithm rollout classification. One actor drives all learners."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> RolloutClassificationModel:
-        """Return a new model for a training. The model learns in ``environment``.
+        """Return a new model for a training run. The model learns in ``environment``.
 
-        The untrained model acts as the first policy of the recipe's key ``policies``; without this key it brakes fully.
+        At first the model acts as the first policy of the recipe's key ``policies``; without this key it brakes fully.
         """
         recipe = training.recipe
         assert isinstance(recipe, RolloutClassificationRecipe)
@@ -33,7 +33,7 @@ class RolloutClassification(Algorithm):
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
         """Return copies of an actor's averaged weights, by name.
 
-        The names are those in a policy bundle whose network is ``network``.
+        The weights have the same names as in a policy bundle whose network is ``network``.
         """
         tensors: dict[str, Float32s] = actor.tensors(network)
         return tensors

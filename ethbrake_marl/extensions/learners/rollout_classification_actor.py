@@ -1,6 +1,6 @@
 """Actor that gives each of several actions a score, and takes the action with the highest score.
 
-A memory stores the costs of tried actions.
+The actor also has a memory of tried actions and their costs, from which it learns.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from ethbrake_marl.training.networks import ACTIVATIONS, copy_of, tensors_of_lay
 
 
 class _TorchActor(Actor):
-    """``Actor`` (the network of a policy) with the matrix products of torch instead of numpy.
+    """Copy of the class ``Actor`` (network of a policy) that multiplies matrices with torch instead of numpy.
 
-    This class is three times as fast as ``Actor``. The outputs of the two classes differ only by rounding.
+    ``_TorchActor`` is three times as fast as ``Actor``. The outputs of the two classes differ only by rounding.
     """
 
     @torch.no_grad()
@@ -48,21 +48,21 @@ class _TorchActor(Actor):
 class ChoosingActor(Deterministic):
     """Actor whose network gives each of several choices a score. The actor takes the choice with the highest score.
 
-    Choices are numbered. The choices are numbered. A number below ``first`` stands for a trained policy, which then
-    decides on the action. Each larger number stands for an action; these actions are evenly spaced from -1 to 1. The
-    network ``learning`` is in training. The network ``average`` has the running average of its weights, and chooses
-    when the actor drives.
+    A choice has a number. A choice with a number below ``first`` is a trained policy, which then computes the action. A
+    choice with the number ``first`` or above is an action; these actions are evenly spaced from -1 to 1. The network
+    ``learning`` is trained. The network ``average`` has running averages of the weights of ``learning``; when the actor
+    drives, ``average`` chooses.
 
     A memory stores the last M decisions at which C choices were compared. The *extra cost* of a choice is its cost
-    minus the cost of the cheapest choice at the same decision. F is the number of features.
+    minus the cost of the cheapest choice at the same decision. F is the number of features of an observation.
 
     Args:
         observation_space: Gymnasium space of an observation.
         action_space: Gymnasium space of an action.
-        rate: learning rate as a function of the share of the training that remains (1 to 0).
-        recipe: recipe of the training.
-        policies: weights of each trained policy that the actor can choose, by name of the tensor.
-        members: number of scenarios in the mixture on which the actor is trained; 1 if the scenario is no mixture.
+        rate: learning rate as a function of the share of the training run that remains (1 to 0).
+        recipe: recipe of the training run.
+        policies: for each trained policy that the actor can choose, its weights by name.
+        members: number of scenarios in the mixture in which the actor is trained; 1 if the scenario is no mixture.
 
     """
 
@@ -107,8 +107,8 @@ class ChoosingActor(Deterministic):
     def choose(self, observation: Float32s) -> Ints:
         """Return, for each of the observations [rows, F], the number of the choice with the highest score, [rows].
 
-        A number below the attribute ``first`` stands for a policy. The numbers from ``first`` on stand for actions that
-        are evenly spaced from -1 to 1.
+        A choice with a number below the attribute ``first`` is a trained policy. A choice with the number ``first`` or
+        above is an action; these actions are evenly spaced from -1 to 1.
         """
         chosen: Ints = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
         return chosen
@@ -118,7 +118,7 @@ class ChoosingActor(Deterministic):
         return actions
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Return the actions [rows, 1] of the averaged network for observations [rows, F]."""
+        """Return the actions [rows, 1] that the averaged network chooses for observations [rows, F]."""
         return torch.from_numpy(self.act(observation.numpy()))[:, None]
 
     def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
@@ -126,11 +126,11 @@ class ChoosingActor(Deterministic):
         return {**tensors_of_layers("policy", self.average), **of_policies}
 
     def remember(self, seen: Float32s, tried: Ints, more: Floats) -> None:
-        """Add m decisions to the memory.
+        """Store m decisions, with the tried choices and their extra costs, in the memory.
 
         Args:
             seen: [m, F] observations.
-            tried: [m, C] numbers of the tried choices, as from ``choose``; column 0 is the choice of the actor itself.
+            tried: [m, C] numbers of the tried choices, as ``choose`` returns them; column 0: the actor's own choice.
             more: [m, C] extra cost of each tried choice.
 
         """
@@ -142,14 +142,14 @@ class ChoosingActor(Deterministic):
     def draw(self, batches: int, count: int, focus: float) -> Iterator[tuple[Tensor, Tensor]]:
         """Draw decisions from the memory for several gradient steps.
 
-        Yields, for each gradient step, the row numbers of the drawn decisions in the memory, [count], and their
-        importance (weight in the loss), [count].
+        Yields, for each gradient step, the indices of the drawn decisions in the memory, [count], and their importance
+        (weight in the loss), [count].
 
         Args:
             batches: number of gradient steps.
             count: number of decisions for each gradient step.
-            focus: share of the decisions that are drawn in proportion to their largest extra cost; the rest is drawn
-                uniformly.
+            focus: share of the draws with probabilities in proportion to a decision's largest extra cost; the other
+                draws are uniform.
 
         """
         known = min(int(self.known), len(self.seen))
@@ -163,16 +163,16 @@ class ChoosingActor(Deterministic):
             yield torch.from_numpy(rows[part]), torch.from_numpy(importance[part])
 
     def loss(self, some: Tensor, importance: Tensor, guide: float) -> Tensor:
-        """Return the loss at some decisions of the memory: the expected extra cost of the choice, plus a convex term.
+        """Return the loss at some decisions of the memory: the expected extra cost of a choice, plus a convex term.
 
-        The expected extra cost uses the softmax of the scores as probabilities. The gradient of this expectation nearly
-        vanishes if a probability is close to 0 or 1. The gradient of the convex term does not. The convex term lowers
-        the score of every tried choice except the cheapest one, in proportion to the extra cost.
+        The probability of a choice is the softmax of the scores. If a probability is close to 0 or 1, the gradient of
+        the expected extra cost nearly vanishes, but the gradient of the convex term does not. The convex term lowers
+        the score of every tried choice except the cheapest one, in proportion to its extra cost.
 
         Args:
-            some: row numbers of these decisions in the memory.
-            importance: factor of each decision in the loss.
-            guide: weight of the convex term.
+            some: indices, in the memory, of the decisions.
+            importance: weight of each decision in the loss.
+            guide: factor on the convex term; the loss is (expected extra cost) + ``guide`` * (convex term).
 
         """
         more = self.more[some]

@@ -32,9 +32,9 @@ class RolloutClassificationModel(VineModel):
     """Model that drives with an actor, tries several actions at some of its decisions, and learns from their costs.
 
     Args:
-        environment: environment of the training.
-        recipe: recipe of the training.
-        policies: weights of each trained policy that the actor can choose, by name of the tensor.
+        environment: environment in which the model is trained.
+        recipe: recipe of the training run.
+        policies: for each trained policy that the actor can choose, its weights by name.
 
     """
 
@@ -82,17 +82,18 @@ class RolloutClassificationModel(VineModel):
         self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
 
     def _try_actions(self, seen: Float32s, moments: State) -> tuple[Float32s, Ints, Floats]:
-        """At B of the visited decisions, try C choices: actions, or policies that act.
+        """Try C choices (actions, or trained policies that act) at each of B visited decisions, and return their costs.
 
-        Each choice is simulated to the end of the episode.
+        After each tried choice the episode is simulated to its end.
 
         Args:
             seen: [steps, rows, F] observations at the visited decisions.
-            moments: states of the worlds at these decisions.
+            moments: states of the worlds at the visited decisions.
 
         Returns three arrays: the observations [B, F], the numbers of the choices [B, C] (numbered as in
-        ``ChoosingActor``), and the costs of the choices [B, C]. Column 0 contains the choice of the actor itself. The
-        cost of a choice is minus the return, changed by the recipe's keys ``tie_break``, ``caution`` and ``relative``.
+        ``ChoosingActor``), and the costs of the choices [B, C]. Column 0 is the actor's own choice. The cost of a
+        choice is minus the return from the decision on; the recipe's keys ``tie_break``, ``caution`` and ``relative``
+        modify this cost.
 
         """
         recipe, actor, learners = self.recipe, self.policy, len(self.engine.learners)
@@ -148,15 +149,13 @@ class RolloutClassificationModel(VineModel):
         return observed[rows], tried, costs
 
     def _usual(self, rows: Ints, least: Floats) -> Floats:
-        """Update the mean cost of each scenario of a mixture.
+        """Update the mean cost of each scenario of a mixture; return the mean costs for B decisions, [B].
 
-        Return the mean cost of the scenario of each of B decisions, [B].
-
-        The result is at least ``LEAST_USUAL``, because costs are divided by it.
+        A mean cost below ``LEAST_USUAL`` is returned as ``LEAST_USUAL``, because costs are divided by the result.
 
         Args:
-            rows: [B] index of each decision's world among all visited worlds.
-            least: [B] cost of the best tried choice at each decision.
+            rows: [B] index of the visited state at which each decision was made.
+            least: [B] cost of the cheapest tried choice at each decision.
 
         """
         numbers = self._numbers[rows]

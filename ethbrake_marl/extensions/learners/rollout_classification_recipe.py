@@ -36,7 +36,7 @@ class ChoosingShape(Shape):
 
         Args:
             observation_size: number of features of an observation.
-            more: other fields of ``NetworkSpec``.
+            more: values of further fields of ``NetworkSpec``, by name.
 
         """
         return super().spec(observation_size, output="choice", choices=self.choices, **more)
@@ -46,18 +46,18 @@ PolicyName = Annotated[str, Field(pattern=r"^[a-z-]+(@.+)?$", max_length=4096)]
 
 
 class RolloutClassificationRecipe(TrainingRecipe):
-    """Recipe of rollout classification: the policy learns from several actions, each tried to the end of its episode.
+    """Recipe of rollout classification: at some decisions several actions are tried, each to the end of the episode.
 
-    The policy chooses among ``network.choices`` actions, evenly spaced from -1 to 1, and the trained ``policies``. A
-    round consists of ``n_envs x n_steps`` decisions and an update. At ``tried`` decisions of a round, these choices are
-    tried:
+    At each decision the policy chooses one of ``network.choices`` actions, evenly spaced from -1 to 1, or one of the
+    trained ``policies``. A round consists of ``n_envs x n_steps`` decisions and an update. At ``tried`` decisions of a
+    round, these choices are tried:
 
     - the choice of the policy itself;
     - for each range of ``near``, one action below and one action above the action of the policy;
     - the actions ``fixed``;
-    - ``drawn`` random choices: trained policies if the recipe has any, else actions.
+    - ``drawn`` random choices: trained policies if the recipe has the key ``policies``, else actions.
 
-    The *cost* of a choice is minus the return from that decision to the end of the episode.
+    The *cost* of a choice is minus the return from the decision to the end of the episode.
     """
 
     most_decisions = 2**22
@@ -143,7 +143,7 @@ class RolloutClassificationRecipe(TrainingRecipe):
         return 2 * len(self.near) + len(self.fixed) + self.drawn
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Return the description, for a policy bundle, of the network and of the policies that it can choose.
+        """Return the description of the network, and of the policies that it can choose, for a policy bundle.
 
         ``observation_size`` is the number of features of an observation.
         """
@@ -157,9 +157,9 @@ class RolloutClassificationRecipe(TrainingRecipe):
 
         The policies are loaded when this property is first used.
 
-        A policy that itself chooses between policies is replaced by these policies.
+        If a named policy itself chooses among several policies, these policies take its place.
 
-        Raises ``InvalidInput``, which names the policy, if a policy cannot be used.
+        If a policy cannot be used, an ``InvalidInput`` that names this policy is raised.
         """
         loaded: list[Policy] = []
         for name in self.policies:

@@ -1,8 +1,8 @@
 """Scout: a small network that predicts at which decisions the action matters. More branches start at such decisions.
 
-A branch (a copy of the episode with another action) takes as much time if the action has no effect as if it has a large
-effect. Therefore decisions at which the action matters are drawn with a higher probability. A decision with a higher
-probability gets a smaller weight in the loss, so the expected loss stays the same (importance sampling).
+A branch is a copy of the episode with another action. Simulating a branch from a decision at which the action has no
+effect is a waste of time. Therefore decisions at which the action matters are drawn with a higher probability, and get
+a smaller weight in the loss, so that the expected loss stays the same (importance sampling).
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ WIDTH = 64  # units of the hidden layer
 class Scout(nn.Module):
     """Small network that predicts from an observation how much the action at a decision matters.
 
-    The network learns to predict the *size* of a decision: the absolute value of the measured gradient, or the measured
-    difference in cost. ``inputs`` is the number F of features of an observation.
+    The network learns to predict the *size* of a decision: the absolute value of the measured gradient or, for a
+    mixture of experts, the difference in cost between the experts. ``inputs`` is the number F of features of an
+    observation.
     """
 
     def __init__(self, inputs: int) -> None:
@@ -35,25 +36,25 @@ class Scout(nn.Module):
         nn.init.zeros_(last.bias)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Return the logarithm of the expected size, at most 20, for observations [rows, F]. The shape is [rows]."""
+        """Return the logarithm, at most 20, of each decision's predicted size, [rows], from observations [rows, F]."""
         logarithm: Tensor = self.layers(observation)[:, 0].clamp(max=20.0)
         return logarithm
 
     def expect(self, observation: Float32s) -> Floats:
-        """Return the expected size [rows], above 0, for observations [rows, F]."""
+        """Return the predicted size of each decision, above 0, [rows], from observations [rows, F]."""
         with torch.no_grad():
             size: Floats = np.exp(self(torch.from_numpy(observation)).numpy().astype(np.float64))
         return size
 
     def loss(self, observation: Tensor, size: Tensor, importance: Tensor) -> Tensor:
-        """Return a loss that is least if the network predicts the mean size.
+        """Return a loss that is smallest if the network predicts the mean size of the decisions.
 
-        Large sizes influence this loss less than they would influence a squared error.
+        Decisions with a large size influence this loss less than they would influence a squared error.
 
         Args:
-            observation: [rows, F] observations.
-            size: [rows] measured sizes.
-            importance: [rows] factor of each row in the loss.
+            observation: [rows, F] observations at the decisions.
+            size: [rows] measured size of each decision.
+            importance: [rows] weight of each decision in the loss.
 
         """
         logarithm = self(observation)
@@ -62,15 +63,15 @@ class Scout(nn.Module):
 
 
 def draw_rows(expected: Floats, count: int, focus: float) -> tuple[Ints, Float32s]:
-    """Draw ``count`` of n rows with replacement; a row with a large expected size is drawn more often.
+    """Draw ``count`` of n decisions with replacement; a decision with a larger size is drawn more often.
 
     Args:
-        expected: [n] expected size of each row, above 0.
-        count: number of rows to draw.
-        focus: share of the rows that is drawn in proportion to ``expected``; the rest is drawn uniformly.
+        expected: [n] size of each decision (predicted gradient, or difference in cost), above 0.
+        count: number of decisions to draw.
+        focus: share of the draws with probabilities in proportion to ``expected``; the other draws are uniform.
 
-    Returns the numbers of the drawn rows [count], and their importance [count]: ``1 / (n p)``, where p is the
-    probability with which the row is drawn. The expected importance is 1.
+    Returns the indices of the drawn decisions [count], and their importance [count], which is their weight in the loss:
+    ``1 / (n p)``, where p is the probability of drawing the decision. The expected value of the importance is 1.
 
     """
     n = len(expected)
@@ -82,21 +83,21 @@ def draw_rows(expected: Floats, count: int, focus: float) -> tuple[Ints, Float32
 def choose_rows(
     observed: Float32s, rows: Ints, count: int, focus: float, expect: Callable[[Float32s], Floats] | None
 ) -> tuple[Ints, Float32s]:
-    """Draw ``count`` of the decisions ``rows``, at which actions will be tried.
+    """Draw ``count`` of the decisions ``rows``; at the drawn decisions several actions will be tried.
 
-    Decisions that matter are drawn more often.
+    Decisions at which the action is predicted to matter are drawn more often.
 
     Args:
         observed: [n, F] observations at all decisions.
-        rows: row numbers of the decisions to draw from.
+        rows: indices, in ``observed``, of the decisions to draw from.
         count: number of decisions to draw.
-        focus: share of the decisions that are drawn in proportion to ``expect``, with replacement (see ``draw_rows``).
-            0: all decisions are drawn uniformly and without replacement.
-        expect: function from observations [rows, F] to expected sizes [rows]; None: decisions are drawn as for
-            ``focus`` = 0.
+        focus: share of the draws with probabilities in proportion to the predicted size, with replacement (see
+            ``draw_rows``). If ``focus`` is 0, all decisions are drawn uniformly and without replacement.
+        expect: function that predicts the size of decisions, [rows], from observations [rows, F]. If ``expect`` is
+            None, decisions are drawn as with ``focus`` = 0.
 
-    Returns the row numbers of the drawn decisions, and the importance of each: its weight in the loss, 1 if the
-    decisions are drawn uniformly.
+    Returns the indices of the drawn decisions in ``observed``, and the weight of each drawn decision in the loss
+    (*importance*). The weight is 1 if the decisions are drawn uniformly.
 
     """
     if focus == 0.0 or expect is None or len(rows) == 0:

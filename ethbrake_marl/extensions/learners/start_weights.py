@@ -1,4 +1,4 @@
-"""Use the weights of a trained policy at the start of a training that observes these and further features."""
+"""Use the weights of a trained policy at the start of a training run that observes further features."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from ethbrake_marl.training.training import Training
 
 
 def widened(policy: Policy, training: Training) -> dict[str, NDArray[np.float32]]:
-    """Return the weights of a trained policy by name, with added weights for the further features of a training.
+    """Return the weights of ``policy`` by name, as initial weights of a training run that may observe more features.
 
-    The added weights are 0. Raises ``InvalidInput`` if the training lacks a feature that the policy observes, or if the
-    networks of policy and training differ.
+    The weights for features that the policy does not observe are 0. Raises ``InvalidInput`` if the training run does
+    not observe a feature of the policy, if the policy is a mixture of experts, or if the networks differ in layers or
+    output.
     """
     recipe, wanted = training.recipe, training.recipe.network_spec(training.observation.size)
     network = policy.manifest.network
@@ -33,15 +34,15 @@ def widened(policy: Policy, training: Training) -> dict[str, NDArray[np.float32]
 
 
 def padded(policy: Policy, training: Training, key: str) -> dict[str, NDArray[np.float32]]:
-    """Return the weights of a trained policy by name, with added weights for the further features of a training.
+    """Return the weights of ``policy`` by name, without the critic, for a training run that may observe more features.
 
-    The added weights are 0. The weights of the critic are left out. Raises ``InvalidInput`` if the training does not
-    observe a feature of the policy.
+    The weights for features that the policy does not observe are 0. Raises ``InvalidInput`` if the training run does
+    not observe a feature of the policy.
 
     Args:
         policy: trained policy.
-        training: training that begins with these weights.
-        key: key of the recipe under which the policy is named, for the error message.
+        training: training run that uses the weights.
+        key: key of the recipe that names the policy; it is quoted in the error message.
 
     """
     names = [feature.name for feature in training.observation.features]

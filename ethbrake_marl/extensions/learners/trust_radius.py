@@ -1,6 +1,6 @@
 """Targets for the actor's outputs, computed from measured gradients.
 
-A target is at most one trust radius away from the output.
+The distance from an output of the actor to its target is always less than a fixed length, the trust radius.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ class Tried(NamedTuple):
 def trusted_targets(tried: Tried, radius: float, anchor: float) -> tuple[Float32s, Float32s]:
     """Return targets [B] for the actor's outputs at B decisions, and the weights [B] of the squared errors in the loss.
 
-    For an output ``m`` at which the return has the measured gradient ``g``: ``weight = (|g| / radius) + anchor`` and
-    ``target = m + (g / weight)``. The target is less than ``radius`` away from ``m`` for every gradient. At ``output =
-    m``, the loss ``(weight / 2) * (output - target)^2`` has the slope ``-g``. So a step that lowers the loss raises the
-    return.
+    Let ``m`` be the actor's present output at a decision, and ``g`` the measured gradient of the return. Then ``weight
+    = (|g| / radius) + anchor`` and ``target = m + (g / weight)``. The target is less than ``radius`` away from ``m``
+    for every gradient. At ``output = m``, the loss ``(weight / 2) * (output - target)^2`` has the slope ``-g``;
+    therefore a small change of the output that lowers the loss raises the return.
 
-    If an output is already at or beyond -1 or 1, the target is not farther out than the output, because actions are
-    clipped to [-1, 1].
+    Actions are clipped to [-1, 1]. Therefore the target of an output at or beyond -1 or 1 is never farther out than the
+    output itself.
 
     Args:
-        tried: decisions and measured gradients.
-        radius: trust radius, which no distance from an output to its target reaches.
-        anchor: weight of a decision with the gradient 0, above 0. A larger ``anchor`` brings the target closer to the
-            output, especially if the gradient is small.
+        tried: decisions, with the actor's outputs and the measured gradients.
+        radius: trust radius: the distance from an output to its target is always smaller.
+        anchor: weight in the loss of a decision with gradient 0; must be above 0. With a larger ``anchor`` the target
+            is closer to the output, especially if the gradient is small.
 
     """
     outward = ((tried.mean >= 1.0) & (tried.gradient > 0.0)) | ((tried.mean <= -1.0) & (tried.gradient < 0.0))

@@ -1,4 +1,4 @@
-"""The algorithm ``vine``: continue from the same state with two actions, and measure the gradient of the return.
+"""The algorithm ``vine``: try two actions in the same state, and measure the gradient of the return.
 
 The name is from Schulman et al. 2015 (TRPO), who sample branches from visited states with common random numbers.
 """
@@ -25,14 +25,14 @@ from ethbrake_marl.training.training import Training
 class Vine(Algorithm):
     """The algorithm vine, which measures gradients of the return and trains an actor with them.
 
-    The same actor drives all learners. If there is one learner, a mixture of experts may drive it instead.
+    The same actor drives all learners. A single learner may be driven by a mixture of experts instead.
     """
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> VineModel:
-        """Return a new model for a training.
+        """Return a new model for a training run.
 
-        The model learns in ``environment``. The initial weights are copied from the policy that the recipe's key
-        ``start`` names; without this key they are random.
+        The model learns in ``environment``. The model's initial weights are copied from the policy that the recipe's
+        key ``start`` names; without this key, the initial weights are random.
         """
         recipe = training.recipe
         assert isinstance(recipe, VineRecipe)
@@ -49,7 +49,7 @@ class Vine(Algorithm):
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
         """Return copies of an actor's averaged weights, by name.
 
-        The names are those in a policy bundle whose network is ``network``.
+        The weights have the same names as in a policy bundle whose network is ``network``.
         """
         tensors: dict[str, Float32s] = actor.tensors(network)
         return tensors
@@ -57,7 +57,8 @@ class Vine(Algorithm):
     def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:
         """Return the model's optimisers by name.
 
-        The name is ``policy``. For a mixture of experts, the names are ``network_1``, ``network_2``, ... and ``gate``.
+        A model with one actor has one optimiser, ``policy``. A mixture of experts has the optimisers ``network_1``,
+        ``network_2``, ... of its experts, and ``gate`` of its gating network.
         """
         if not isinstance(model, ExpertsModel):
             return {"policy": model.policy.optimizer}

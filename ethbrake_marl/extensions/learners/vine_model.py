@@ -28,12 +28,12 @@ from ethbrake_marl.policies.network_spec import Float32s
 class VineModel(BaseAlgorithm):
     """Model that drives with a deterministic actor, tries two actions at some of its decisions, and learns from them.
 
-    One of the two actions is higher than the actor's action, the other is lower. The difference between the two returns
-    measures the gradient of the return with respect to the action.
+    One of the two actions is higher than the actor's action, the other is lower. From the difference between the two
+    returns the model computes the gradient of the return with respect to the action.
 
     Args:
-        environment: environment of the training.
-        recipe: recipe of the training.
+        environment: environment in which the model is trained.
+        recipe: recipe of the training run.
 
     """
 
@@ -84,7 +84,7 @@ class VineModel(BaseAlgorithm):
     def _update(self, callback: BaseCallback, total: int) -> None:
         """Make one update of the training: collect decisions, and learn from them.
 
-        ``callback`` is the callback of the training; ``total`` is the number of decisions in the whole training.
+        ``callback`` is the callback of the training run, and ``total`` the number of decisions in the whole run.
         """
         actor = self.policy
         seen, moments = self._visit(callback, actor.act)
@@ -95,7 +95,7 @@ class VineModel(BaseAlgorithm):
     def _visit(self, callback: BaseCallback, act: Act) -> tuple[Float32s, State]:
         """Drive all worlds for ``n_steps`` decisions with the policy ``act``; call ``callback`` after each decision.
 
-        Returns the observations [n_steps, rows, F], and the states of the worlds at these decisions.
+        Returns the observations [n_steps, rows, F], and the states of the worlds at the visited decisions.
         """
         seen, moments, numbers = [], [], []
         for _ in range(self.recipe.n_steps):
@@ -115,12 +115,12 @@ class VineModel(BaseAlgorithm):
         return np.stack(seen), State.join(moments)
 
     def _try_out(self, seen: Float32s, moments: State, actor: Deterministic) -> Tried:
-        """At some of the visited decisions, try a higher and a lower action, both to the end of the episode.
+        """At some visited decisions, try a higher and a lower action, and simulate both to the end of the episode.
 
         Args:
             seen: [steps, rows, F] observations at the visited decisions.
-            moments: states of the worlds at these decisions.
-            actor: policy to whose actions the offsets are added.
+            moments: states of the worlds at the visited decisions.
+            actor: policy; a tried action is the policy's action plus or minus an offset.
 
         Returns the decisions at which the two actions were tried, with the measured gradients.
 
@@ -156,7 +156,7 @@ class VineModel(BaseAlgorithm):
         return Tried(then, actor.means(then), gradient[good].astype(np.float32), importance[good])
 
     def _train(self, actor: AveragedActor, tried: Tried) -> None:
-        """Train the actor on the decisions and gradients of ``tried``, with the targets of ``trusted_targets``."""
+        """Train the actor: at the decisions in ``tried``, move its outputs towards ``trusted_targets``."""
         recipe = self.recipe
         self._update_learning_rate(actor.optimizer)
         target, weight = trusted_targets(tried, recipe.trust_radius, recipe.anchor)

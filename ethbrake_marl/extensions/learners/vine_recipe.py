@@ -26,7 +26,7 @@ _RIGHT_START = "must be the name of a shipped policy, for instance ppo, or ppo@P
 
 
 class ActorShape(Shape):
-    """Network of an actor. The algorithm vine needs no critic."""
+    """Network of the actor. The algorithm vine has no critic."""
 
     policy: Layers = Field(description=ACTOR_LAYERS)
     activation: Activation = "relu"  # activation function of the hidden layers
@@ -38,12 +38,12 @@ class ActorShape(Shape):
 class VineRecipe(TrainingRecipe):
     """Recipe of vine: at some decisions, a higher and a lower action are tried, and both are simulated to the end.
 
-    A round of the training has ``n_envs x n_steps`` decisions. The two actions are tried at ``tried`` of these
-    decisions. The policy learns from the difference of the two returns.
+    A round of the training run has ``n_envs x n_steps`` decisions. At ``tried`` of these decisions the two actions are
+    tried. The policy learns from the difference between the two returns.
 
-    ``start`` names the trained policy whose weights the training begins with; without this key the weights are random.
-    ``start: ppo`` means the shipped policy ``ppo`` or ``ppo-...`` that was trained on the scenario of this training. If
-    no such policy is shipped, the weights are random.
+    ``start`` names a trained policy, whose weights are the initial weights; without this key, the initial weights are
+    random. ``start: ppo`` means the shipped policy ``ppo`` or ``ppo-...`` that was trained on the scenario of this
+    training run. If there is no such shipped policy, the initial weights are random.
     """
 
     most_decisions = 2**22
@@ -120,9 +120,9 @@ class VineRecipe(TrainingRecipe):
         return self.network.spec(observation_size, **mixture)
 
     def policy_to_start_from(self, scenario: Scenario) -> str | None:
-        """Return the policy whose weights a training on ``scenario`` begins with; None: random weights.
+        """Return the name of the policy whose weights are the initial weights of a training run on ``scenario``.
 
-        The policy is a text such as ``ppo-obstacle`` or ``ppo@runs/x``.
+        The name is a text such as ``ppo-obstacle`` or ``ppo@runs/x``; None: the initial weights are random.
         """
         if self.start is None or "@" in self.start:
             return self.start
@@ -132,13 +132,14 @@ class VineRecipe(TrainingRecipe):
     def begins(self, scenario: Scenario) -> str:
         """Return the origin of the initial weights, for messages: a policy such as ``ppo``, or ``random weights``.
 
-        If the weights are random because no policy ``start`` is shipped for ``scenario``, the phrase says so.
+        If the weights are random because the policy that ``start`` names is not shipped for ``scenario``, the text
+        gives this reason.
         """
         why = "" if self.start is None else f", because no {self.start} is shipped for scenario {scenario.name!r}"
         return self.policy_to_start_from(scenario) or f"random weights{why}"
 
     def check_learners(self, learners: int) -> None:
-        """Raise ``InvalidInput`` if the recipe has a mixture of experts and the training has several learners."""
+        """Raise ``InvalidInput`` if the recipe has a mixture of experts but the training run has several learners."""
         if self.experts is not None and learners != 1:
             raise InvalidInput(
                 f"recipe {self.name!r}: experts: a mixture of experts can drive only one learner, but the scenario has"

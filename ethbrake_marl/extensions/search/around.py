@@ -24,15 +24,15 @@ from ethbrake_marl.scenario.schema import Scenario
 class Searched(AgentAround):
     """Agent that searches around the commands of another agent at the alert, and then drives the best commands found.
 
-    The search simulates the line, with the scripts of the other vehicles. The agent does not react to unexpected
-    motion. ``predicted_harm`` [n] (m2/s2) is never above the harm of the other agent. It equals the simulated harm
-    exactly if the other vehicles follow their scripts. Raises ``InvalidInput`` if ``policy`` is not an agent, or if
-    ``candidates`` is outside 1 to 1,000,000. ``begin`` raises ``InvalidInput`` if the command of another vehicle's
-    script is not fixed at the alert.
+    The search simulates the line; all vehicles but the controlled one follow their scripts. After the search the agent
+    does not react to what it observes. ``predicted_harm`` [n] (m2/s2) is never above the harm of the agent ``policy``.
+    If the other vehicles follow their scripts, ``predicted_harm`` equals the simulated harm exactly. Raises
+    ``InvalidInput`` if ``policy`` is not an agent, or if ``candidates`` is outside 1 to 1,000,000. ``begin`` raises
+    ``InvalidInput`` if the command of another vehicle's script is not fixed at the alert.
 
     Args:
-        policy: agent whose commands the search starts from.
-        scenario: scenario of the worlds; the search minimises its objective.
+        policy: agent; the search starts from the commands of this agent.
+        scenario: scenario of the worlds; the search minimises the scenario's objective.
         candidates: number of command sequences that the search simulates in each world.
         harm_count: harm count to minimise, ``first`` or ``total``.
 
@@ -82,7 +82,7 @@ class Searched(AgentAround):
 
         Args:
             worlds: worlds in their present state, [n]; only the time is read.
-            memory: result of ``begin``.
+            memory: memory that ``begin`` returned.
             vehicle: not used.
 
         """
@@ -90,9 +90,9 @@ class Searched(AgentAround):
 
 
 def search_around(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
-    """Return the agent ``+search``, which searches around the commands of ``policy``.
+    """Return the agent ``+search``, which improves the commands of ``policy`` by a search at the alert.
 
-    ``argument`` is not used. ``settings`` hold the scenario and the harm count to minimise.
+    ``argument`` has no effect. ``settings`` contain the scenario and the harm count to minimise.
     """
     return Searched(policy, settings.needed_scenario(), harm_count=settings.harm_count)
 

@@ -58,11 +58,11 @@ def best_harm(
 ) -> BestHarmTable:
     """Search for the profile with the least harm in each world and under each count. Return the profiles as a table.
 
-    With two counts, there are two searches, one for each count; for each count the table then gets whichever of the two
-    profiles has less harm. The harm in the table is never above the harm in ``known``. With one controlled vehicle it
-    is never above the harm of the best constant deceleration. With several it is never above the result of the same
-    search for any single one of them while the others brake fully. The result for a world does not depend on
-    ``threads`` or on the other worlds. Raises ``InvalidInput`` if ``vehicles`` or ``counts`` is empty, if the command
+    With two harm counts, there are two searches; the table stores for each count the better of the two profiles. The
+    harm in the table is at most the harm in ``known`` and, with one controlled vehicle, the harm of the best constant
+    deceleration. With several controlled vehicles, the harm is also at most the result of the same search for one of
+    these vehicles while the others brake fully. The result for a world does not depend on ``threads`` or on the other
+    worlds. Raises ``InvalidInput`` if ``vehicles`` or ``counts`` is empty, if the command
     of a script is not fixed at the alert, or if ``budget`` is below 1.
 
     Args:
@@ -71,12 +71,13 @@ def best_harm(
         counts: harm counts to minimise: ``first``, ``total``, or both.
         vehicles: indices of the controlled vehicles; None: the learners of the scenario. All other
             vehicles follow scripts.
-        budget: number of candidate profiles that are simulated per world and count.
+        budget: number of profiles that are simulated in each world for each harm count.
         seed: seed of the random search.
         threads: number of threads; None: one for each core.
-        known: table of the same vehicles, whose profiles the search starts with; None: no table.
-        objective: objective to minimise, as a scenario declares it. With any objective but ``total``, the table
-            contains the values of this objective instead of the harm of the line, and its header names the objective.
+        known: table for the same controlled vehicles; the search starts from its profiles. None: no table.
+        objective: objective to minimise, as under a scenario's key ``objective``. If the objective is not ``total``,
+            the table contains the objective's values instead of the harm of the line, and its header names the
+            objective.
 
     """
     if not counts or not set(counts) <= set(HARM_COUNTS) or len(set(counts)) != len(counts):
@@ -136,24 +137,25 @@ def search_list(
 ) -> BestHarmTable:
     """Run ``best_harm`` on a long list of worlds, ``CHUNK`` worlds at a time. An interrupted run can be continued.
 
-    The table does not contain worlds that the physics cannot advance because of a defect. The header of the table names
-    these worlds under the key ``LEFT_OUT``. Raises ``InvalidInput`` in the same cases as ``best_harm``, and if
-    ``known`` contains no world of the list. Raises ``PhysicsError`` if the physics can advance no world of the list.
+    The table leaves out worlds that cannot be simulated because of a defect of the physics. The table's header names
+    the worlds that are left out, under the key ``LEFT_OUT``. Raises ``InvalidInput`` in the same cases as
+    ``best_harm``, and if ``known`` contains no world of the list. Raises ``PhysicsError`` if no world of the list can
+    be simulated.
 
     Args:
         scenario: scenario of the worlds.
         sample: worlds of the list, with their numbers.
         counts: harm counts to minimise: ``first``, ``total``, or both.
         vehicles: indices of the controlled vehicles; None: the learners of the scenario.
-        budget: number of candidate profiles that are simulated per world and count.
+        budget: number of profiles that are simulated in each world for each harm count.
         seed: seed of the random search.
         threads: number of threads; None: one for each core.
-        known: table whose profiles the search starts with; None: no table.
+        known: table of best known harm; the search starts from its profiles. None: no table.
         chunks: folder in which the table of each finished chunk (``CHUNK`` worlds of the list) is stored as a file. A
-            later call with the same arguments reads these files; a call with other arguments overwrites them. None:
-            nothing is stored.
+            later call with the same arguments reads these files; a call with other arguments overwrites them. If
+            ``chunks`` is None, no files are read or written.
         on_progress: function that is called with the number of finished worlds and the number of all worlds.
-        objective: objective to minimise, see ``best_harm``.
+        objective: objective to minimise, as in ``best_harm``.
 
     """
     parts: list[BestHarmTable] = []
@@ -190,15 +192,17 @@ def search_list(
 def _kept_or_searched(
     task: Task, every: Worlds, file: Path | None, options: dict[str, Any], rows: Ints
 ) -> BestHarmTable:
-    """Return the table of a chunk (``CHUNK`` worlds of the list). If ``file`` was made with the same options, it is
-    read; otherwise the worlds are searched and ``file`` is written.
+    """Return the table of best known harm for one chunk (at most ``CHUNK`` worlds of the list).
+
+    If ``file`` contains a table of these worlds that was made with the same options, this table is returned. If
+    ``file`` contains no such table, the worlds are searched, and the new table is written to ``file``.
 
     Args:
         task: scenario and controlled vehicles.
         every: all worlds of the list.
-        file: file that stores the table of the chunk; None: nothing is read or written.
-        options: keyword arguments of ``best_harm``.
-        rows: indices of the chunk's worlds in the list.
+        file: file with the table of these worlds; None: no file is read or written.
+        options: keyword arguments with which ``best_harm`` is called.
+        rows: indices of the chunk's worlds in the list of worlds.
 
     """
     worlds = every.take(rows)
@@ -224,8 +228,8 @@ def chunks_left(scenario: Scenario, sample: Sample, *, budget: int, chunks: Path
     Args:
         scenario: scenario of the worlds.
         sample: worlds of the list.
-        budget: number of candidate profiles that are simulated per world and count.
-        chunks: folder of the chunk files.
+        budget: number of profiles that are simulated in each world for each harm count.
+        chunks: folder with the files that ``search_list`` has written, one file for each ``CHUNK`` worlds.
 
     """
     left, damaged = 0, []
@@ -243,19 +247,19 @@ def chunks_left(scenario: Scenario, sample: Sample, *, budget: int, chunks: Path
 
 
 def chunk_file(chunks: Path, first: int) -> Path:
-    """Return the path of the file in the folder ``chunks`` for the chunk whose first world has the index ``first``."""
+    """Return the path of the file for the ``CHUNK`` worlds from index ``first`` on, in the folder ``chunks``."""
     return chunks / f"{first:07d}.npz"
 
 
 def kept_chunk(file: Path, identity: UInt64s, question: Mapping[str, object]) -> BestHarmTable | None:
-    """Return the stored table of a chunk. Return None if the file is missing or was made for other worlds or options.
+    """Return the table in ``file``; None if the file is missing or was made for other worlds or with other options.
 
     Raises ``CorruptBundle`` if the file is damaged.
 
     Args:
-        file: file that stores the table of the chunk.
+        file: file with the table of best known harm for one chunk (at most ``CHUNK`` worlds of the list).
         identity: hash of each world of the chunk.
-        question: options of the search (counts, budget, seed). The header of the file must contain the same options.
+        question: options of the search (counts, budget, seed), which are compared with the options in the file.
 
     """
     if not file.is_file():
@@ -267,20 +271,20 @@ def kept_chunk(file: Path, identity: UInt64s, question: Mapping[str, object]) ->
 
 
 def scripted_commands(worlds: Worlds, task: Task) -> Floats:
-    """Return the commands of all vehicles while they follow their scripts, [n, N] m/s2.
+    """Return the constant command of each vehicle that follows a script, [n, N] m/s2.
 
-    The controlled vehicles, named by ``task``, get full braking. Raises ``InvalidInput`` if the command of a script is
-    not fixed at the alert.
+    For the controlled vehicles, which ``task`` names, the command is full braking. Raises ``InvalidInput`` if the
+    command of a script is not fixed at the alert.
     """
     others = {i: script for i, script in script_agents(task.scenario).items() if i not in task.vehicles}
     return fixed_commands(others, worlds, f"scenario {task.scenario.name!r}, search for the best profiles")
 
 
 def task_problem(worlds: Worlds, task: Task) -> ProfileProblem:
-    """Return the search problem of a task in worlds at t = 0: choose the profiles of the controlled vehicles.
+    """Return the problem of a search for the best profiles of the controlled vehicles, in worlds at t = 0.
 
-    The field ``identity`` [n] of the problem is a hash of everything that affects the harm of a world. This hash does
-    not depend on the harm count.
+    The field ``identity`` [n] of the problem is a hash of everything that affects the harm of a world. The hash does
+    not depend on the harm count (``first`` or ``total``).
     """
     return _problem(worlds, task, scripted_commands(worlds, task), task.vehicles)
 
@@ -297,18 +301,19 @@ def _searched(
     worlds: Worlds, task: Task, others: Floats, given: Sequence[Profiles], deciders: Sequence[int],
     effort: dict[str, int], aimed: Callable[[ProfileProblem], ProfileProblem],
 ) -> Found:  # fmt: skip
-    """Search each world, and return the best profiles and their harm under each count.
+    """Search each world, and return the best profiles and their harm under each harm count.
 
-    With several controlled vehicles, the search also starts from the best profile of each vehicle alone.
+    With several controlled vehicles, the search also starts from the best profile of each one while the others brake
+    fully.
 
     Args:
         worlds: worlds at t = 0, [n].
         task: scenario, controlled vehicles and harm count to minimise.
         others: commands of the vehicles that follow scripts, [n, N] m/s2.
         given: additional profiles from which the search starts.
-        deciders: indices of the vehicles whose latency fixes the times of the decisions.
+        deciders: indices of vehicles; the first decision comes when the first of these vehicles may act.
         effort: keyword arguments ``budget``, ``seed`` and ``threads`` of ``search_profiles``.
-        aimed: function from a problem to the same problem with the objective of all controlled vehicles.
+        aimed: function that replaces the harm that a problem minimises by the objective of the controlled vehicles.
 
     """
     problem = aimed(_problem(worlds, task, others, deciders))
@@ -331,7 +336,7 @@ def starting_profiles(
     With one controlled vehicle, the list also contains coupled E-V2X-BM and the extreme profiles.
 
     Args:
-        problem: search problem of the worlds.
+        problem: search problem that was made from ``worlds``.
         worlds: worlds at t = 0, [n].
         task: scenario, controlled vehicles and harm count to minimise.
         others: commands of the vehicles that follow scripts, [n, N] m/s2.
@@ -352,10 +357,9 @@ def starting_profiles(
 
 
 def startable(profiles: Profiles) -> Profiles:
-    """Return the profiles with at most ``MOST_PHASES`` phases, so that a search can start from them.
+    """Shorten profiles to at most ``MOST_PHASES`` phases (intervals of constant command), as a search needs them.
 
-    A profile with more phases (intervals of constant command) is replaced by a constant profile: its first command for
-    the whole episode.
+    A profile with more phases is replaced by its first command for the whole episode.
     """
     ends, commands = Profiles.padded([profiles], MOST_PHASES)[0]
     last = ends[:, -1:]
@@ -387,7 +391,7 @@ def driven_profiles(agent: Driver, worlds: Worlds, task: Task, last_step: Ints) 
         agent: agent that drives the controlled vehicle.
         worlds: worlds at t = 0, [n].
         task: scenario and controlled vehicle.
-        last_step: number of steps of each episode, [n].
+        last_step: number of time steps of the episode in each world, [n].
 
     """
     commands = record_commands(agent, worlds, task.scenario, task.vehicle, int(last_step.max()))
@@ -403,19 +407,19 @@ def driven_profiles(agent: Driver, worlds: Worlds, task: Task, last_step: Ints) 
 def fold_episodes(
     table: BestHarmTable, scenario: Scenario, worlds: Worlds, name: str, agents: Mapping[HarmCount, Agent]
 ) -> BestHarmTable:
-    """Let agents drive the worlds; return the table in which a harm is replaced wherever an agent does less harm.
+    """Let agents drive the worlds; return a table with the lower harm wherever an agent does less harm than ``table``.
 
-    The recorded commands are simulated again, and the table stores the harm of this simulation. The header of the table
-    says in how many worlds the harm was replaced. If the simulation with an agent fails in a world, the harm of this
-    world is not replaced. Raises ``InvalidInput`` unless the scenario has exactly one learner.
+    The agents' commands are recorded and simulated again; the table stores the harm of the second simulation. The
+    table's header says in how many worlds the harm was lowered. If the simulation with an agent fails in a world, the
+    harm of this world stays as it was. Raises ``InvalidInput`` unless the scenario has exactly one learner.
 
     Args:
         table: table to improve.
         scenario: scenario of the worlds.
         worlds: worlds at t = 0; worlds with best known harm 0 are skipped.
         name: name of the agent, for the header.
-        agents: for each harm count, the agent that minimises this count. Every episode is compared with the table under
-            both counts.
+        agents: for each harm count, an agent that minimises this count. Every episode is compared with the table under
+            both harm counts.
 
     """
     if OBJECTIVE in table.header:

@@ -1,9 +1,9 @@
 """Starting profiles for a search; they consist of full drive and full braking.
 
-The proof of the lower bound shows that profiles with the least harm have one of two forms. Either the vehicle drives
-fully for a while, brakes fully until it meets the vehicle ahead, and drives fully again. Or it brakes fully, drives
-fully until the vehicle behind meets it, and brakes fully again. A random search seldom
-finds these profiles.
+The proof of the lower bound shows that profiles with the least harm have one of two forms. In the first form, the
+vehicle drives fully for a while, brakes fully until it meets the vehicle ahead, and drives fully again. In the second
+form, the vehicle brakes fully, drives fully until the vehicle behind meets it, and brakes fully again. A random search
+seldom finds profiles of these two forms.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ _PHASES = 5  # before the first change, step of the first change, between, step 
 
 
 def extreme_profiles(problem: ProfileProblem, states: Floats, has_front: Bools, has_rear: Bools) -> Profiles:
-    """Return the ``KEPT`` best extreme profiles of the controlled vehicle in each world, [n * KEPT].
+    """Return the ``KEPT`` extreme profiles with the least harm in each world, [n * KEPT].
 
     The profiles of world 0 come first, then the profiles of world 1, and so on. An *extreme* profile changes between
     full drive and full braking. The times at which two vehicles meet are computed from ``states``, as if the neighbours
-    braked fully. If the neighbours brake less, the profiles are valid but not the best of their form.
+    of the controlled vehicle braked fully. If a neighbour brakes less, other extreme profiles may have less harm.
 
     Args:
         problem: worlds, with the commands of the other vehicles and the harm to minimise.
-        states: state of each world at the first decision, [n, WIDTH], with the columns of ``proofs.line.LINE``.
+        states: state of each world at the first decision, [n, WIDTH]; the columns are named in ``proofs.line.LINE``.
         has_front: True if there is a vehicle ahead of the controlled one, [n].
         has_rear: True if there is a vehicle behind the controlled one, [n].
 
@@ -64,14 +64,14 @@ def extreme_profiles(problem: ProfileProblem, states: Floats, has_front: Bools, 
 def _fill_extremes(
     problem: ProfileProblem, states: Floats, has_front: Bools, has_rear: Bools, ends: Ints, commands: Floats
 ) -> None:
-    """Write the best extreme profiles of each world to ``ends`` and ``commands``.
+    """Write the extreme profiles with the least harm in each world to ``ends`` and ``commands``.
 
     Args:
         problem: worlds, with the commands of the other vehicles and the harm to minimise.
-        states: state of each world at the first decision, [n, WIDTH], with the columns of ``proofs.line.LINE``.
+        states: state of each world at the first decision, [n, WIDTH]; the columns are named in ``proofs.line.LINE``.
         has_front: True if there is a vehicle ahead of the controlled one, [n].
         has_rear: True if there is a vehicle behind the controlled one, [n].
-        ends: output: number of the step at which each phase ends, [n, KEPT, K].
+        ends: output: time step at which each phase ends, [n, KEPT, K].
         commands: output: command of each phase, [n, KEPT, K, 1] m/s2.
 
     """
@@ -94,16 +94,16 @@ def try_changes(
 ) -> float:  # fmt: skip
     """Simulate profiles whose first change of command is between ``low`` and ``high``; keep the best profiles.
 
-    Returns the time of the first change in the profile with the least harm (s).
+    Returns the time (s) at which the command first changes in the profile with the least harm.
 
     Args:
-        world: world to simulate, with its bounds and random stream.
-        kind: neighbour to meet: ``FRONT_FIRST`` for the vehicle ahead, ``REAR_FIRST`` for the vehicle behind.
-        at: state of the world at the first decision, with the columns of ``proofs.line.LINE``, [WIDTH].
+        world: world to simulate, with the bounds of the commands and a random stream.
+        kind: which vehicle the controlled vehicle meets: ``FRONT_FIRST`` the one ahead, ``REAR_FIRST`` the one behind.
+        at: state of the world at the first decision, [WIDTH], in the order of the columns ``proofs.line.LINE``.
         start: state of the simulation at the first decision, [S].
-        low: earliest time of the first change, s.
-        high: latest time of the first change, s.
-        ends: number of the step at which each phase of the best profiles ends, [KEPT, K]; changed in place.
+        low: earliest time at which the command first changes, s.
+        high: latest time at which the command first changes, s.
+        ends: time step at which each phase of the best profiles ends, [KEPT, K]; changed in place.
         commands: commands of the best profiles, [KEPT, K, 1] m/s2; changed in place.
         values: harm of the best profiles, [KEPT] m2/s2; changed in place.
 
@@ -138,17 +138,17 @@ def fill_extreme(
 ) -> None:
     """Write one profile: a first command, the opposite command from ``change`` to ``meeting``, the first command again.
 
-    Commands can change only between steps. If ``change`` is within a step, this step gets the mean of the two commands,
-    weighted with their durations. The speed at the end of the step is then exact.
+    Commands can change only between time steps. If the time ``change`` is within a time step, the command of this step
+    is the mean of the two commands, weighted with their durations. The speed at the end of the step is then exact.
 
     Args:
-        world: world of the profile, with its bounds and its time step.
-        kind: ``FRONT_FIRST`` to drive first; ``REAR_FIRST`` to brake first.
-        change: time of the first change, s.
-        meeting: time of the second change, s.
-        early: number of steps by which the second change comes before ``meeting``.
-        share: weight of the first command in the mean command of the step of the second change, 0 to 1.
-        ends: output: number of the step at which each phase ends, [5].
+        world: world of the profile, with the bounds of the commands and the time step.
+        kind: the first command: ``FRONT_FIRST`` for full drive, ``REAR_FIRST`` for full braking.
+        change: time at which the command first changes, s.
+        meeting: time of the second change of the command, s.
+        early: number of time steps by which the second change of the command comes before ``meeting``.
+        share: weight of the first command, from 0 to 1, in the time step in which the command changes back to it.
+        ends: output: time step at which each phase ends, [5].
         commands: output: command of each phase, [5, 1] m/s2.
 
     """

@@ -24,8 +24,8 @@ KNOWN, BELOW = "known", "below_best_known"
 class LimitMeasures(MeasureSet):
     """Measures of unavoidable contact, of the best known harm, and of each agent's regret.
 
-    The functions of the measures receive the outcome of an agent and a ``Regrets`` object with the best known harm of
-    every world.
+    Each measure is computed from the outcome of an agent and a ``Regrets`` object, which contains the best known harm
+    of every world.
     """
 
     measures = (
@@ -112,7 +112,7 @@ class LimitMeasures(MeasureSet):
     not_in_long_lists = f"proofs and regrets are computed for lists of at most {HELD:,} worlds"
 
     def prepare(self, evaluation: Evaluation) -> Regrets | Silent:
-        """Return the best known harm of every world. Return ``Silent`` with the reason if the proofs do not apply."""
+        """Return the best known harm of every world; if the proofs do not apply, return ``Silent`` with the reason."""
         limits, regrets = limits_of(evaluation), regrets_of(evaluation)
         if isinstance(limits, Unproven):
             return Silent(limits.because)
@@ -120,17 +120,17 @@ class LimitMeasures(MeasureSet):
         return regrets
 
     def row(self, tally: AgentTally, worlds: int, context: Regrets | Silent) -> dict[str, Any]:
-        """Return additional values for one agent's row of the summary, by name.
+        """Return additional values for an agent in the summary, by name.
 
-        ``known_best_share`` is the share of worlds whose best harm was known before the evaluation.
-        ``below_best_known`` is the number of worlds in which the agent does less harm. ``best_known_warning`` is a
-        warning text or None. ``impact_unproven`` is the summary of worlds with proven contact but no proven impact
-        (``Between``).
+        ``known_best_share`` is the share of the worlds for which a best known harm existed before the evaluation.
+        ``below_best_known`` is the number of worlds in which the agent does less than this earlier best known harm.
+        ``best_known_warning`` is a warning text or None. ``impact_unproven`` describes the worlds in which contact is
+        proven unavoidable but an impact is not, with the fields of ``Between``.
 
         Args:
-            tally: counts and means of the agent.
-            worlds: number of worlds.
-            context: result of ``prepare``.
+            tally: counts and means over the agent's episodes.
+            worlds: number of worlds in the evaluation.
+            context: value that ``prepare`` returned.
 
         """
         between = None if isinstance(context, Silent) else context.between
@@ -142,9 +142,9 @@ class LimitMeasures(MeasureSet):
         }
 
     def warnings(self, rows: Sequence[SummaryRow]) -> Sequence[str]:
-        """Return a list with the warning that a table of best known harm covers only some of the worlds.
+        """Return a list with a warning if the best known harm is known for only some of the worlds; else an empty list.
 
-        The list is empty if there is no such warning. ``rows`` are the summaries of the agents.
+        ``rows`` are the summaries, one for each agent.
         """
         warning = rows[0].more[NAME]["best_known_warning"]
         return [warning] if warning else []
@@ -152,7 +152,7 @@ class LimitMeasures(MeasureSet):
     def notes(self, rows: Sequence[SummaryRow]) -> Sequence[str]:
         """Return a list with one note about unavoidable harm and the best known harm; empty if nothing is proven.
 
-        ``rows`` are the summaries of the agents.
+        ``rows`` are the summaries, one for each agent.
         """
         row, first, total = rows[0], rows[0]["best_known_first_impact_harm"], rows[0]["best_known_total_harm"]
         if first is None or total is None:
@@ -181,7 +181,7 @@ def best_known_words(row: SummaryRow) -> str:
 
 
 def _unavoidable(row: SummaryRow) -> str:
-    """Return sentences about the shares of worlds with proven contact, with proven impact, and with only contact."""
+    """Return sentences about the shares of worlds in which contact, or an impact, is proven unavoidable."""
     vehicle = row.parameters.get("controlled_vehicle")
     command = f"command of {str(vehicle).replace('vehicle_', 'Vehicle ')}" if vehicle else "joint command"
     share = Column("", digits=1, scale=100.0, unit=" %")

@@ -28,7 +28,7 @@ class IncompleteTable(UserWarning):
 
 @dataclass(frozen=True, slots=True)
 class Unproven:
-    """Result of ``prove`` and ``known_limits`` if the proofs do not cover a task in some worlds."""
+    """Result of ``prove`` and ``known_limits`` if the proofs do not cover some of the worlds."""
 
     because: str  # the reason, such as "brakes build up; the proofs assume instant brakes"
 
@@ -63,12 +63,12 @@ class Limits:
 
     @property
     def known(self) -> Bools:
-        """True for worlds whose best harm was known under both counts before the evaluation, [n]."""
+        """True for worlds for which a best known harm, under both counts, existed before the evaluation, [n]."""
         return np.isfinite(self.first_impact_harm) & np.isfinite(self.total_harm)
 
     @property
     def warning(self) -> str:
-        """Warning that a table of best known harm covers only some worlds; empty if it covers all or none."""
+        """Warning text if a table contains the best known harm of only some of the worlds; otherwise empty."""
         known, avoidable = self.known, self.proof.avoidable
         listed = known if avoidable is None else known & ~avoidable
         missing = int((~known).sum())
@@ -85,7 +85,7 @@ class Limits:
 def known_limits(worlds: Worlds, task: Task) -> Limits | Unproven:
     """Return the proven facts and the best known harm of worlds at the alert.
 
-    Returns ``Unproven`` if the proofs do not cover the task. ``task`` names the scenario and the controlled vehicles.
+    Returns ``Unproven`` if the proofs do not cover the scenario and the controlled vehicles, which ``task`` names.
     """
     proof = prove(worlds, task)
     if isinstance(proof, Unproven):
@@ -97,9 +97,9 @@ def known_limits(worlds: Worlds, task: Task) -> Limits | Unproven:
 
 
 def prove(worlds: Worlds, task: Task) -> Proof | Unproven:
-    """Return the proven facts about worlds at the alert. Return ``Unproven`` if the proofs do not cover the task.
+    """Return what is proven about each world at the alert: whether contact is avoidable, and a lower bound on harm.
 
-    ``task`` names the scenario and the controlled vehicles.
+    Returns ``Unproven`` if the proofs do not cover the scenario and the controlled vehicles, which ``task`` names.
     """
     because = unproven_because(worlds, task)
     if because is not None:
@@ -118,10 +118,9 @@ def prove(worlds: Worlds, task: Task) -> Proof | Unproven:
 
 
 def unproven_because(worlds: Worlds, task: Task) -> str | None:
-    """Return the reason why the proofs do not cover the task in these worlds, as a clause. Return None if they cover
-    the task.
+    """Return the reason why nothing is proven for ``task`` in these worlds; None if a lower bound on harm is proven.
 
-    ``task`` names the scenario and the controlled vehicles.
+    The reason is a clause without a full stop. ``task`` names the scenario and the controlled vehicles.
     """
     if worlds.vehicles.in_pieces.any() or (_is_team(task) and worlds.vehicles.build_up.any()):
         return _uneven_because(worlds)
@@ -131,17 +130,17 @@ def unproven_because(worlds: Worlds, task: Task) -> str | None:
 
 
 def undecided_because(worlds: Worlds, task: Task) -> str | None:
-    """Return the reason why it is unknown whether contact is avoidable, as a clause. Return None if this is known.
+    """Return the reason why it is not known whether contact is avoidable, as a clause; None if it is known.
 
-    ``worlds`` are at the alert. ``task`` names the scenario and the controlled vehicles.
+    ``worlds`` must be at the alert. ``task`` names the scenario and the controlled vehicles.
     """
     return _uneven_because(worlds) if worlds.vehicles.build_up.any() else _uncovered_because(worlds, task)
 
 
 def _uncovered_because(worlds: Worlds, task: Task) -> str | None:
-    """Return the reason why ``avoidability`` does not cover the task, as a clause; None if it covers the task.
+    """Return the reason why the proof ``avoidability`` does not cover ``task``, as a clause; None if it does.
 
-    The function ignores whether brakes build up.
+    The function does not check whether the brakes act at once, as this proof assumes.
     """
     scenario, names = task.scenario, task.scenario.vehicle_names
     if not task.vehicles or (len(task.vehicles) > 1 and set(task.vehicles) not in _DECIDED):
@@ -170,15 +169,15 @@ def _uneven_because(worlds: Worlds) -> str:
 
 
 def _is_team(task: Task) -> bool:
-    """Return whether the task needs ``team_bound``, the bound for several controlled vehicles or a long line."""
+    """Return whether several vehicles are controlled, or one vehicle in a line of more than three vehicles."""
     return len(task.vehicles) > 1 or (len(task.vehicles) == 1 and task.scenario.vehicles > _VEHICLES)
 
 
 def _script_because(task: Task, proven: str) -> str | None:
     """Return a clause that names a vehicle with a script other than full_brake; None if there is no such vehicle.
 
-    ``task`` names the scenario and the controlled vehicles. ``proven`` is part of the clause, for instance
-    "avoidability is proven".
+    ``task`` names the scenario and the controlled vehicles. ``proven`` is the part of the clause that says what is
+    proven if the vehicle follows full_brake, for instance "avoidability is proven".
     """
     scenario = task.scenario
     for i in range(scenario.vehicles):

@@ -27,9 +27,7 @@ MOST_CANDIDATES = 1_000_000  # most candidates per world and decision
 
 
 class Outlook(NamedTuple):
-    """Settings of an agent that searches, with methods that say which worlds need a new plan and which command applies
-    now.
-    """
+    """Settings of an agent that searches for commands, and methods that read the agent's plan at the present time."""
 
     harm_count: HarmCount  # harm count to minimise: ``first`` or ``total``
     horizon_s: float  # end of the simulated episode, s
@@ -38,13 +36,13 @@ class Outlook(NamedTuple):
 
     @property
     def decisions(self) -> int:
-        """Largest number of decisions in an episode."""
+        """Largest possible number of decisions in an episode."""
         return int(np.ceil(self.horizon_s / self.time_step_s)) + 1
 
     def problem(self, worlds: Worlds, vehicle: int, others_mps2: Floats) -> ProfileProblem:
-        """Return the search problem for ``vehicle``, from the present time of ``worlds`` until the horizon.
+        """Return the problem of a search for the best commands of ``vehicle`` from the present time to the horizon.
 
-        ``others_mps2`` [n, N] are the commands of the other vehicles.
+        ``worlds`` are in their present state; ``others_mps2`` [n, N] are the commands of the other vehicles.
         """
         problem = profile_problem(
             worlds, [vehicle], harm_count=self.harm_count, horizon_s=self.horizon_s, time_step_s=self.time_step_s,
@@ -55,14 +53,14 @@ class Outlook(NamedTuple):
     def due(self, worlds: Worlds, planned_s: Floats) -> Ints:
         """Return the indices of worlds that need a new plan.
 
-        In these worlds a vehicle moves, the horizon is not reached, and time has passed since the last plan.
-        ``planned_s`` [n] is the time of the last plan, s.
+        A world needs a new plan if a vehicle moves, the horizon is not reached, and time has passed since the last
+        plan. ``planned_s`` [n] is the time of the last plan, s.
         """
         moving = (worlds.speeds_mps != 0.0).any(axis=1)
         return np.flatnonzero((worlds.time_s > planned_s) & (worlds.time_s < self.horizon_s) & moving)
 
     def command(self, worlds: Worlds, memory: Memory) -> Floats:
-        """Return the present command in each world, [n] m/s2.
+        """Return the command of the agent's plan for the present time of each world, [n] m/s2.
 
         Args:
             worlds: worlds in their present state, [n]; only the time is read.
@@ -76,9 +74,7 @@ class Outlook(NamedTuple):
 
 
 def budget_of(argument: str) -> int | None:
-    """Return ``argument`` as a number of candidates, or None if ``argument`` is no whole number from 1 to
-    ``MOST_CANDIDATES``.
-    """
+    """Convert ``argument`` to a number; return None if it is no whole number from 1 to ``MOST_CANDIDATES``."""
     number = int(argument) if re.fullmatch("[0-9]{1,7}", argument) else 0
     return number if 1 <= number <= MOST_CANDIDATES else None
 
@@ -89,18 +85,18 @@ CANDIDATES = 256  # default number of candidates per world and decision
 class Planner:
     """Receding-horizon planner: at each decision it searches for the best commands until the horizon.
 
-    Each search starts from the previous plan and from constant commands. The first search starts from the pairwise
-    optimum instead of a previous plan. The planner expects that the other vehicles follow their scripts, and that other
-    learners brake fully. ``predicted_harm`` [n] is the harm of the first plan, m2/s2. If the other vehicles do what the
-    planner expects, the simulated harm is at most ``predicted_harm``. Raises ``InvalidInput`` if ``argument`` or
-    ``harm_count`` is invalid. ``begin`` raises ``InvalidInput`` if the command of another vehicle's script is not fixed
-    at the alert.
+    Each search starts from constant commands and the previous plan; the first search starts from constant commands and
+    the pairwise optimum. The planner expects that the other vehicles follow their scripts, and that other learners
+    brake fully. ``predicted_harm`` [n] is the harm of the first plan, m2/s2. If the other vehicles do what the planner
+    expects, the simulated harm is at most ``predicted_harm``. Raises ``InvalidInput`` if ``argument`` is not a whole
+    number from 1 to ``MOST_CANDIDATES``, or if ``harm_count`` is unknown. ``begin`` raises ``InvalidInput`` if the
+    command of another vehicle's script is not fixed at the alert.
 
     Args:
-        argument: number of candidates per world and decision, as text; None: ``CANDIDATES``.
+        argument: number of profiles that are simulated in each world at each decision, as text; None: ``CANDIDATES``.
         harm_count: harm count to minimise, ``first`` or ``total``.
         horizon_s: end of the simulated episode, s.
-        most_candidates: upper limit of the number of candidates in ``argument``; None: no limit.
+        most_candidates: a number in ``argument`` above this limit is lowered to this limit; None: no limit.
         time_step_s: time between two decisions, s.
         objective: objective to minimise; ``predicted_harm`` is the value of this objective.
 
@@ -155,7 +151,7 @@ class Planner:
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
         """Return the first command of each world's plan, [n] m/s2, and the new memory.
 
-        In worlds in which a decision is due, the plan is the result of a new search.
+        Worlds in which a decision is due get a new plan from a new search.
 
         Args:
             worlds: worlds in their present state, [n].
@@ -172,12 +168,12 @@ class Planner:
         return Profiles(*memory["plan"]).commands_mps2[:, 0, 0], memory
 
     def _rest(self, held: Memory, time_s: Floats, problem: ProfileProblem) -> Profiles:
-        """Return the part of each stored plan after the present time, as profiles [m] of the new problem.
+        """Return the rest of each stored plan, from the present time on, as profiles [m].
 
         Args:
-            held: memory of the m worlds that need a new plan.
+            held: memory of the m worlds that need a new plan, with the stored plans.
             time_s: present time, [m] s.
-            problem: search problem from the present time on.
+            problem: problem of the search for the new plans, from the present time to the horizon.
 
         """
         plan = Profiles(*held["plan"])
@@ -187,8 +183,8 @@ class Planner:
         return Profiles(ends, plan.commands_mps2)
 
     def _search(self, problem: ProfileProblem, plan: Profiles) -> tuple[Profiles, Floats]:
-        """Search for the best profiles; the search starts from ``plan`` and constant commands. Return the best plan of
-        each world, and its harm, [n] m2/s2.
+        """Search each world, starting from ``plan`` and constant commands; return the best profile and its harm, [n]
+        m2/s2.
         """
         constants = problem.constant(problem.even_grid(15))
         n, K = plan.ends.shape  # [n * Q]: for each world its plan, then constants
@@ -201,7 +197,7 @@ class Planner:
 
 
 def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
-    """Return the agent ``planner`` or ``planner:CANDIDATES``. ``argument`` is the number of candidates, or None."""
+    """Return the agent ``planner`` or ``planner:CANDIDATES``. ``argument`` is CANDIDATES as text, or None."""
     return Planner(
         argument, harm_count=settings.harm_count, horizon_s=settings.horizon_s,
         most_candidates=settings.most_candidates, time_step_s=settings.time_step_s,
@@ -210,9 +206,10 @@ def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
 
 
 def make_estimating_planner(argument: str | None, settings: AgentSettings) -> Agent:
-    """Return the agent ``planner:estimated`` or ``planner:CANDIDATES:estimated``, which searches the estimated world.
+    """Return the agent ``planner:estimated`` or ``planner:CANDIDATES:estimated``, which searches in the world as it is
+    estimated from messages and sights.
 
-    ``argument`` is the number of candidates, or None.
+    ``argument`` is CANDIDATES as text, or None.
     """
     return Estimating(make_planner(argument, settings), settings.needed_scenario(), shows=True)
 

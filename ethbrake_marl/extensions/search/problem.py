@@ -27,15 +27,15 @@ def seeded(identity: UInt64s, seed: int) -> UInt64s:
 
 
 def minimising(problem: ProfileProblem, worlds: Worlds, declared: Declared, vehicles: Sequence[int]) -> ProfileProblem:
-    """Return ``problem`` with the objective of the controlled vehicles instead of the harm of the line.
+    """Return a copy of ``problem`` in which the search minimises the objective of the controlled vehicles.
 
     Raises ``InvalidInput`` if the objective is neither a weighted sum of the vehicles' harm nor ``maximin``, or if the
     controlled vehicles have different objectives.
 
     Args:
-        problem: search problem of n worlds, in which a search minimises the harm of the line.
-        worlds: worlds of the problem, [n].
-        declared: one objective for all vehicles, or one for each vehicle, as a scenario declares it.
+        problem: search problem of n worlds, in which the search minimises the harm of the line.
+        worlds: the n worlds of ``problem``.
+        declared: one objective for all vehicles, or one for each vehicle, as under a scenario's key ``objective``.
         vehicles: indices of the controlled vehicles, from 0.
 
     """
@@ -56,17 +56,17 @@ Found = tuple[Profiles, dict[HarmCount, Floats]]
 
 
 def search_profiles(problem: ProfileProblem, given: Profiles, *, budget: int, seed: int = 0, threads: int = 1) -> Found:
-    """Search each world, and return the best profiles found and their harm [n] (m2/s2) under each count.
+    """Search each world; return the best profile of each world, and its harm [n] (m2/s2) under each harm count.
 
-    A profile has at most ``MOST_PHASES`` phases of constant command. The result is never worse than any profile of
-    ``given``. The harm is the quantity that the problem minimises. Raises ``InvalidInput`` for ``budget`` or
+    A profile has at most ``MOST_PHASES`` phases of constant command. The best profile is never worse than any profile
+    of ``given``. The harm is the quantity that ``problem`` minimises. Raises ``InvalidInput`` for ``budget`` or
     ``threads`` below 1 or a negative seed, and ``PhysicsError`` with the worlds in which the physics could simulate no
     profile.
 
     Args:
         problem: n worlds, with the commands of the other vehicles and the harm to minimise.
         given: starting profiles, [n * Q]: first the Q profiles of world 0, then the Q profiles of world 1, and so on.
-        budget: approximate number of candidates per world.
+        budget: approximate number of profiles that are simulated in each world.
         seed: seed of the random search.
         threads: number of threads.
 

@@ -1,8 +1,8 @@
 """Compiled random search for the best profile of one world. Each world has its own random stream.
 
-A *profile* has at most K phases of constant command: ``ends`` [K] are the steps at which the phases end, ``commands``
-[K, C] the commands of the C controlled vehicles (m/s2). ``bounds`` [C, 2] are the least and the largest command of each
-vehicle (m/s2). S is the length of the array with the state of one world.
+A *profile* has at most K phases (intervals of constant command). ``ends`` [K] are the time steps at which the phases
+end, and ``commands`` [K, C] are the commands of the C controlled vehicles in each phase (m/s2). ``bounds`` [C, 2] are
+the least and the largest command of each vehicle (m/s2). The state of one world is an array of S numbers.
 """
 
 from __future__ import annotations
@@ -61,8 +61,9 @@ def allowed(command: float, low: float, high: float) -> float:
 def draw_command(random: UInt64s, low: float, high: float) -> float:
     """Return a random command, m/s2.
 
-    The command is ``low`` with probability 0.35, ``high`` with probability 0.15 and 0 with probability 0.1; otherwise
-    it is uniform between ``low`` and ``high``. ``random`` [1] is the state of the random stream.
+    The command is ``low`` with probability 0.35, ``high`` with probability 0.15, and 0 with probability 0.1. With the
+    remaining probability 0.4, the command is uniformly distributed between ``low`` and ``high``. ``random`` [1] is the
+    state of the random stream.
     """
     u = draw(random)
     if u < 0.35:
@@ -76,16 +77,17 @@ def draw_command(random: UInt64s, low: float, high: float) -> float:
 
 @compiled
 def apply_change(change: Floats, bounds: Floats, ends: Ints, commands: Floats) -> bool:
-    """Apply one change to a profile, in place. Return False if the change has no effect.
+    """Apply one change to a profile, in place. Return False if the change leaves the profile as it was.
 
-    There are four kinds of change. COMMAND_CHANGE adds an amount to one command. TRADE adds an amount to one command
-    and changes the next command by the opposite impulse: the vehicle has the same speed after the two phases, but
-    another position. SET_COMMAND replaces one command. MOVE_END moves the border between two phases by whole steps.
+    There are four kinds of change to a profile. COMMAND_CHANGE adds an amount to the command of one phase. TRADE adds
+    an amount to the command of one phase, and changes the command of the next phase so that the vehicle has the same
+    speed after both phases, but another position. SET_COMMAND replaces the command of one phase. MOVE_END moves the
+    border between two phases by whole time steps.
 
     Args:
-        change: the change, [CHANGE_WIDTH], with the columns KIND, VEHICLE, PHASE and AMOUNT (m/s2, or steps).
+        change: four numbers that describe the change: KIND, VEHICLE, PHASE and AMOUNT (in m/s2; for MOVE_END in steps).
         bounds: least and largest command of each vehicle, [C, 2] m/s2.
-        ends: steps at which the phases end, [K]; changed in place.
+        ends: time steps at which the phases end, [K]; changed in place.
         commands: commands of the phases, [K, C] m/s2; changed in place.
 
     """
@@ -119,9 +121,9 @@ def compact(ends: Ints, commands: Floats, phases: int) -> int:
     phases that remain.
 
     Args:
-        ends: steps at which the phases end, [K]; changed in place.
+        ends: time steps at which the phases end, [K]; changed in place.
         commands: commands of the phases, [K, C] m/s2; changed in place.
-        phases: number of phases in use before the call.
+        phases: number of phases that the profile uses before the call.
 
     """
     last, count = ends[ends.shape[0] - 1], 0
@@ -161,7 +163,7 @@ ATTENTION_STEPS = 30  # phases are divided within this number of steps from the 
 
 
 class Population(NamedTuple):
-    """The M profiles that are improved together (the *field*). A profile has up to K phases of constant command."""
+    """The *field*: the M profiles that the search improves at the same time. A profile has up to K phases."""
 
     ends: Ints  # [M, K] steps at which the phases end
     commands: Floats  # [M, K, C] commands of the C controlled vehicles in each phase, m/s2
@@ -175,16 +177,16 @@ def search_world(
 ) -> int:
     """Search for the best profile of one world, and write the profile to ``ends`` and ``commands``.
 
-    Returns the number of phases of the profile; 0 if the physics could simulate no profile. The result is never worse
-    than any starting profile.
+    Returns the number of phases of the best profile; 0 if the physics could simulate no profile. The best profile is
+    never worse than any starting profile.
 
     Args:
-        world: world to simulate, with its bounds and random stream.
+        world: world to simulate, with the bounds of the commands and a random stream.
         start: state of the world at the first decision, [S].
-        seed_ends: steps at which the phases of the Q starting profiles end, [Q, K].
+        seed_ends: time steps at which the phases of the Q starting profiles end, [Q, K].
         seed_commands: commands of the starting profiles, [Q, K, C] m/s2.
-        budget: number of candidates to simulate.
-        ends: output: steps at which the phases end, [K].
+        budget: number of profiles to simulate.
+        ends: output: time steps at which the phases end, [K].
         commands: output: commands of the phases, [K, C] m/s2.
 
     """
@@ -227,7 +229,7 @@ def search_world(
 
 @compiled
 def copy_profile(ends: Ints, commands: Floats, to_ends: Ints, to_commands: Floats) -> None:
-    """Copy the phases of one profile into the first phases of a second profile (``to_ends``, ``to_commands``)."""
+    """Copy the phases of one profile over the first phases of another profile (``to_ends``, ``to_commands``)."""
     for k in range(ends.shape[0]):
         to_ends[k] = ends[k]
     copy_rows(commands, to_commands, commands.shape[0])
@@ -235,16 +237,17 @@ def copy_profile(ends: Ints, commands: Floats, to_ends: Ints, to_commands: Float
 
 @compiled(apart=True)
 def improve(world: SearchWorld, ends: Ints, commands: Floats, states: Floats, budget: int) -> float:
-    """Improve a profile in place by ``budget`` random candidates, and return its harm, m2/s2.
+    """Improve a profile in place by ``budget`` random changes, and return the harm of the improved profile, m2/s2.
 
     Returns infinity if the physics could not simulate the profile.
 
     Args:
-        world: world to simulate, with its bounds and random stream.
-        ends: steps at which the phases end, [K]; changed in place.
+        world: world to simulate, with the bounds of the commands and a random stream.
+        ends: time steps at which the phases end, [K]; changed in place.
         commands: commands of the phases, [K, C] m/s2; changed in place.
-        states: working memory, [K + 1, S]: state at the start of each phase; row 0 contains the first decision.
-        budget: number of candidates to simulate.
+        states: [K + 1, S] state of the world at the start of each phase; row 0: state at the first decision;
+            overwritten.
+        budget: number of changed profiles to simulate.
 
     """
     new_ends, new_commands, new_states = ends.copy(), commands.copy(), states.copy()
@@ -296,18 +299,18 @@ def improve(world: SearchWorld, ends: Ints, commands: Floats, states: Floats, bu
 def gather(
     world: SearchWorld, seed_ends: Ints, seed_commands: Floats, states: Floats, drawn: int, field: Population
 ) -> None:
-    """Fill the field (profiles that are improved together) with the best of the starting profiles and ``drawn`` random
-    profiles.
+    """Fill the field (profiles to improve) with the best of the starting profiles and of ``drawn`` random profiles.
 
-    No two profiles of the field have the same harm.
+    Any two profiles of the field differ in harm.
 
     Args:
-        world: world to simulate, with its bounds and random stream.
-        seed_ends: steps at which the phases of the Q starting profiles end, [Q, K].
+        world: world to simulate, with the bounds of the commands and a random stream.
+        seed_ends: time steps at which the phases of the Q starting profiles end, [Q, K].
         seed_commands: commands of the starting profiles, [Q, K, C] m/s2.
-        states: working memory, [K + 1, S]: state at the start of each phase; row 0 contains the first decision.
-        drawn: number of random profiles.
-        field: output: the profiles.
+        states: [K + 1, S] state of the world at the start of each phase; row 0: state at the first decision;
+            overwritten.
+        drawn: number of random profiles to simulate.
+        field: output: the best profiles.
 
     """
     Q, K = seed_ends.shape
@@ -344,7 +347,7 @@ def gather(
 
 @compiled(apart=True)
 def sort(field: Population, left: int) -> None:
-    """Sort the first ``left`` profiles of the field by harm, in place."""
+    """Sort the first ``left`` profiles of ``field`` by harm, least first, in place."""
     for here in range(1, left):
         m = here
         while m > 0 and field.values[m] < field.values[m - 1]:
@@ -380,10 +383,10 @@ def largest(values: Floats) -> int:
 
 @compiled(apart=True)
 def divide(world: SearchWorld, field: Population) -> None:
-    """Halve phases of the best profile of the field, in place, until the profile has K phases.
+    """Halve phases of the best profile of ``field``, in place, until this profile has K phases.
 
-    The longest phase is halved first. The length of a phase counts only its steps among the first ``ATTENTION_STEPS``
-    steps of the episode. ``world`` holds the number of steps.
+    The longest phase is halved first. Only the steps of a phase that are among the first ``ATTENTION_STEPS`` steps of
+    the episode count for its length. ``world`` contains the number of steps of the episode.
     """
     used = field.phases[0]
     if used > 0 and field.values[0] > 0.0:
@@ -412,18 +415,19 @@ def divide(world: SearchWorld, field: Population) -> None:
 def select_stepwise(
     world: SearchWorld, seed_ends: Ints, seed_commands: Floats, states: Floats, field: Population
 ) -> None:
-    """Switch to stepwise simulation, and write the best profile to the first place of the field.
+    """Switch to stepwise simulation, and write the profile with the least harm to the first place of ``field``.
 
-    The candidates are the profiles of the field and the starting profiles. Stepwise simulation goes from decision to
-    decision and rounds as the engine does. This matters where a tiny change of the commands changes harm by a jump:
-    rounding then decides how much harm a profile causes.
+    The profiles of ``field`` and the starting profiles are compared. Stepwise simulation computes one decision after
+    the other, with the same rounding errors as the engine. The rounding errors matter if harm is a discontinuous
+    function of the commands: rounding may then decide how much harm a profile causes.
 
     Args:
-        world: world to simulate, with its bounds and random stream.
-        seed_ends: steps at which the phases of the Q starting profiles end, [Q, K].
+        world: world to simulate, with the bounds of the commands and a random stream.
+        seed_ends: time steps at which the phases of the Q starting profiles end, [Q, K].
         seed_commands: commands of the starting profiles, [Q, K, C] m/s2.
-        states: working memory, [K + 1, S]: state at the start of each phase; row 0 contains the first decision.
-        field: profiles that are improved together; changed in place.
+        states: [K + 1, S] state of the world at the start of each phase; row 0: state at the first decision;
+            overwritten.
+        field: profiles that the search improves; the first one is overwritten.
 
     """
     world.episode.clock[CLOCK.STEPWISE] = 1.0

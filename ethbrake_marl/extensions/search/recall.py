@@ -34,20 +34,20 @@ Recall = Callable[[ProfileProblem, HarmCount], tuple[Profiles, Bools]]
 class BestHarm:
     """Agent that drives the command profile with the least known harm.
 
-    In a world without a stored profile, the agent searches at the alert. If the scenario has no other learner, a second
-    search with the same number of candidates follows. The second search starts from the better one of two profiles: the
-    result of the first search, and the commands of ``universal``, a trained policy of the package. The harm is
-    therefore never above the harm of ``universal``. ``predicted_harm`` [n] (m2/s2) equals the harm in the engine
-    exactly if the engine has the same time step. Raises ``InvalidInput`` if ``budget`` is below 1 or ``harm_count`` is
+    In a world without a stored profile, the agent searches for a profile at the alert. If the controlled vehicle is the
+    only learner, the agent then searches a second time. The second search starts from the better one of two profiles:
+    the result of the first search, and the commands of the shipped policy ``universal``. Therefore the result is never
+    worse than ``universal``. If the environment has the agent's time step, the simulated harm is exactly
+    ``predicted_harm`` [n] (m2/s2). Raises ``InvalidInput`` if ``budget`` is below 1 or ``harm_count`` is
     unknown. ``begin`` raises ``InvalidInput`` if the command of another vehicle's script is not fixed at the alert.
 
     Args:
         recall: function that returns the stored profile of each world, and a mask of the worlds that have one.
-        scenario: scenario of the worlds, whose objective the agent minimises. None: the agent minimises the harm of
-            the line, without the second search.
+        scenario: scenario of the worlds; the agent minimises the scenario's objective. None: the agent minimises the
+            harm of the line, and does not search a second time.
         harm_count: harm count to minimise, ``first`` or ``total``.
         horizon_s: end of the episode, s.
-        budget: number of candidates in a world without a stored profile.
+        budget: number of profiles that each search simulates in a world without a stored profile.
         time_step_s: time between two decisions, s.
 
     """
@@ -75,10 +75,10 @@ class BestHarm:
     def make(cls, argument: str | None, settings: AgentSettings, recall: Recall) -> BestHarm:
         """Return the agent ``best_harm`` or ``best_harm:CANDIDATES``.
 
-        Raises ``InvalidInput`` if ``argument`` is not a number of candidates.
+        Raises ``InvalidInput`` if ``argument`` is not a whole number from 1 to ``MOST_CANDIDATES``.
 
         Args:
-            argument: number of candidates, as text; None: ``PROFILE_BUDGET``.
+            argument: number of profiles that a search simulates, as text; None: ``PROFILE_BUDGET``.
             settings: scenario, harm count to minimise and other settings of agents.
             recall: function that returns the stored profile of each world, and a mask of the worlds that have one.
 
@@ -126,14 +126,14 @@ class BestHarm:
 
         Args:
             worlds: worlds in their present state, [n]; only the time is read.
-            memory: result of ``begin``.
+            memory: memory that ``begin`` returned.
             vehicle: not used.
 
         """
         return self._outlook.command(worlds, memory), memory
 
     def _search(self, worlds: Worlds, vehicle: int, others: Floats) -> tuple[Floats, Floats]:
-        """Search the worlds, and return the best commands, [n, decisions] m/s2, and their harm, [n] m2/s2.
+        """Search each world; return the best command at each decision, [n, decisions] m/s2, and the harm, [n] m2/s2.
 
         ``others`` [n, N] are the commands of the other vehicles, m/s2.
         """

@@ -1,9 +1,10 @@
 """Compiled random search around the commands of an episode.
 
-The search improves two episodes by random changes of a few neighbouring steps. The first episode has the given
-commands. The second episode is the best of some random templates, because changes of the given commands may miss the
-best commands. A *template* is one command, another command for a short while, then full braking. The simulation goes
-from decision to decision as the engine does, and therefore gives exactly the harm of the engine.
+The search improves two sequences of commands by random changes of a few neighbouring steps. The first sequence is given
+by the caller. The second sequence is the best of some random *templates*, because small changes of the given commands
+may miss the best commands. A template is a random braking profile of three phases: one command, then another command
+for a short while, then full braking. The search simulates one decision after the other, as the engine does, and
+therefore computes exactly the same harm as the engine.
 """
 
 from __future__ import annotations
@@ -45,24 +46,25 @@ NO_HARM = 1e-9  # m2/s2; less harm than this is treated as 0
 
 
 class Plan(NamedTuple):
-    """Commands of one world in every step, and the states that these commands lead to."""
+    """Commands of the controlled vehicle in every step of one world, and the states that these commands lead to."""
 
     commands: Floats  # [T] command of the controlled vehicle in each step, m/s2
     states: Floats  # [T + 1, S] state of the simulation at the start of each step
 
 
 def refine(problem: ProfileProblem, commands_mps2: Floats, *, budget: int, seed: int = 0) -> tuple[Floats, Floats]:
-    """Search around given commands, and return the best commands, [n, T] m/s2, and their harm, [n] m2/s2.
+    """Improve given commands by a search. Return the best commands, [n, T] m/s2, and their harm, [n] m2/s2.
 
-    The result is never worse than the given commands. The harm is the quantity that the problem minimises, computed as
-    in the engine. The result for a world does not depend on the other worlds. Raises ``InvalidInput`` if several
-    vehicles are controlled, if the commands have a wrong shape or exceed a capacity, or if ``budget`` is below 1.
-    Raises ``PhysicsError`` with the worlds in which the physics cannot simulate the given commands.
+    The result is never worse than the given commands. The harm is the quantity that ``problem`` minimises, and equals
+    the harm that the engine computes. The result for a world does not depend on the other worlds. Raises
+    ``InvalidInput`` if several vehicles are controlled, if the commands have a wrong shape or exceed a capacity, or if
+    ``budget`` is below 1. Raises ``PhysicsError`` with the worlds in which the physics cannot simulate the given
+    commands.
 
     Args:
         problem: n worlds with one controlled vehicle, the commands of the other vehicles, and the harm to minimise.
-        commands_mps2: command of each step, from which the search starts, [n, T].
-        budget: number of candidates per world.
+        commands_mps2: command of the controlled vehicle in each step, [n, T]; the search starts with these commands.
+        budget: number of candidates (sequences of commands) that are simulated in each world.
         seed: seed of the random search.
 
     """
@@ -95,9 +97,9 @@ def _refine_worlds(
     Args:
         problem: n worlds, with the commands of the other vehicles and the harm to minimise.
         random: initial state of each world's random stream, [n].
-        budget: number of candidates per world.
+        budget: number of candidates (sequences of commands) that are simulated in each world.
         commands: command of each step, [n, T] m/s2; changed in place.
-        value: output: harm that the problem minimises, [n] m2/s2.
+        value: output: harm of the improved commands, as ``problem`` counts it, [n] m2/s2.
         failed: output: True for worlds in which the physics cannot simulate the commands, [n].
 
     """
@@ -121,7 +123,7 @@ def _refine_worlds(
 def _refine_world(world: SearchWorld, mine: Plan, other: Plan, room: Plan, budget: int) -> bool:
     """Improve the commands ``mine`` of one world in place. Return False if the physics cannot simulate these commands.
 
-    ``other`` and ``room`` are working memory. ``budget`` is the number of candidates.
+    ``other`` and ``room`` are arrays for intermediate results. ``budget`` is the number of candidates to simulate.
     """
     templates, theirs = int(TEMPLATE_SHARE * budget), int(THEIR_CLIMB_SHARE * budget)
     value, reached = follow_steps(world.episode, mine, 0, math.inf)
@@ -140,10 +142,9 @@ def _refine_world(world: SearchWorld, mine: Plan, other: Plan, room: Plan, budge
 
 @compiled(apart=True)
 def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[float, int]:
-    """Simulate the commands of ``plan`` from step ``begin`` on, and write its later states.
+    """Simulate the commands of ``plan`` from step ``begin`` on, and write the later states into ``plan``.
 
-    Returns the harm (m2/s2) and the number of steps until the end of the episode. This number is -1 if the physics
-    fails.
+    Returns the harm (m2/s2) and the number of steps of the episode; -1 steps if the simulation fails.
 
     Args:
         world: world to simulate, with the commands of the other vehicles.
@@ -173,16 +174,16 @@ def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[
 def climb(world: SearchWorld, plan: Plan, room: Plan, value: float, reached: int, budget: int) -> tuple[float, int]:
     """Improve ``plan`` in place by random changes, and return its harm (m2/s2) and its number of steps.
 
-    A change adds an amount to the commands of some steps. If this lowers the harm, the next candidate adds twice the
-    amount to the commands of the same steps.
+    Most changes add an amount to the commands of some neighbouring steps; the others replace these commands. If adding
+    an amount lowers the harm, the next candidate adds twice this amount to the commands of the same steps.
 
     Args:
-        world: world to simulate, with its bounds and random stream.
-        plan: commands with their simulated states.
-        room: working memory.
+        world: world to simulate, with the bounds of the commands and a random stream.
+        plan: commands to improve, with their simulated states.
+        room: arrays for intermediate results.
         value: harm of ``plan``, m2/s2.
-        reached: number of steps of ``plan`` until the end of the episode.
-        budget: number of candidates.
+        reached: number of steps of the episode that ``plan`` leads to.
+        budget: number of candidates (sequences of commands) to simulate.
 
     """
     low, high = world.bounds[0, 0], world.bounds[0, 1]
@@ -224,17 +225,18 @@ def climb(world: SearchWorld, plan: Plan, room: Plan, value: float, reached: int
 
 @compiled(apart=True)
 def draw_templates(world: SearchWorld, best: Plan, room: Plan, bound: float, number: int) -> tuple[float, int]:
-    """Simulate random templates, and write the best template to ``best``. Return its harm (m2/s2) and number of steps.
+    """Simulate random templates (braking profiles), and write the one with the least harm to ``best``.
 
-    A *template* is one command, another command for a short while, then full braking. The number of steps is 0 if no
-    template does less harm than ``bound``.
+    A *template* has three phases: one command, then another command for a short while, then full braking. Returns the
+    harm of the best template (m2/s2) and the number of steps of its episode. The number of steps is 0 if no template
+    does less harm than ``bound``.
 
     Args:
-        world: world to simulate, with its bounds and random stream.
-        best: output: the best template.
-        room: working memory.
-        bound: harm above which a template is rejected, m2/s2.
-        number: number of templates.
+        world: world to simulate, with the bounds of the commands and a random stream.
+        best: output: commands and states of the best template.
+        room: arrays for intermediate results.
+        bound: a template with at least this harm is rejected, m2/s2.
+        number: number of templates to draw.
 
     """
     low, high, T = world.bounds[0, 0], world.bounds[0, 1], room.commands.shape[0]
@@ -262,6 +264,6 @@ def steps_in(world: Episode, duration_s: float) -> int:
 
 @compiled
 def copy_steps(commands: Floats, to: Floats, first: int) -> None:
-    """Copy commands into the array ``to``, from step ``first`` on."""
+    """Copy the commands of step ``first`` and of all later steps into the array ``to``."""
     for t in range(first, commands.shape[0]):
         to[t] = commands[t]

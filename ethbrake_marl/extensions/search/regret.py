@@ -49,7 +49,7 @@ class Regrets:
     def below(self, outcome: Outcome) -> Bools:
         """Return True for worlds in which an agent does less harm than the best harm known before the evaluation, [n].
 
-        The result is True if the harm is smaller under at least one of the two counts, by more than ``TOLERANCE``.
+        The agent's harm must be smaller by more than ``TOLERANCE``, under at least one of the two harm counts.
         """
         first, total = self.limits.first_impact_harm, self.limits.total_harm
         return (outcome.first_impact_harm < first - TOLERANCE) | (outcome.total_harm < total - TOLERANCE)
@@ -61,7 +61,10 @@ class Regrets:
 
     @property
     def between(self) -> Between | None:
-        """Summary of the worlds with proven contact but no proven impact; None if ``avoidable`` is None."""
+        """Summary of the worlds in which contact is proven unavoidable but an impact is not.
+
+        The result is None if it is not known whether contact is avoidable.
+        """
         if self.avoidable is None:
             return None
         return Between.of(~self.avoidable, self.limits.proof.impact, self.first_impact_harm, self.total_harm)
@@ -69,7 +72,7 @@ class Regrets:
 
 @dataclass(frozen=True, slots=True)
 class Between:
-    """Summary of the worlds with proven contact but no proven impact, with the best known harm in them (m2/s2)."""
+    """Summary of the worlds in which contact is proven unavoidable but an impact is not: share and best known harm."""
 
     rate: float  # share of all worlds
     mean_first: float | None  # mean best known first-impact harm; None if unknown in all of them
@@ -78,9 +81,7 @@ class Between:
 
     @property
     def text(self) -> str:
-        """Sentence about the worlds with proven contact but no proven impact: their share and best known harm. Empty if
-        there are none.
-        """
+        """Sentence about the worlds with unavoidable contact but no proven impact; empty if there are none."""
         if self.rate == 0.0:
             return ""
         text = f" In {100 * self.rate:.1f} % of the worlds, contact is proven unavoidable but an impact is not."
@@ -93,11 +94,11 @@ class Between:
 
     @classmethod
     def of(cls, contact: Bools, impact: Bools, first: Floats, total: Floats) -> Between:
-        """Return the summary of the worlds in which contact is proven but no impact.
+        """Return the summary of the worlds in which contact is proven unavoidable but an impact is not.
 
         Args:
-            contact: [n] True if contact is proven.
-            impact: [n] True if an impact is proven.
+            contact: [n] True if contact is proven unavoidable.
+            impact: [n] True if an impact is proven unavoidable.
             first: [n] best known first-impact harm, m2/s2; NaN if unknown.
             total: [n] best known total harm, m2/s2; NaN if unknown.
 
@@ -125,10 +126,10 @@ KNOWN_OF_WORLDS: dict[str, Callable[[Outcome, Regrets], Values | None]] = {
 
 
 def limits_of(evaluation: Evaluation) -> Limits | Unproven:
-    """Return the proofs and the best known harm of each world before any agent drives.
+    """Return what is proven about each world, and the harm that is known before the agents of this evaluation drive.
 
     Returns ``Unproven`` if the proofs do not cover the evaluation. The result is computed once per evaluation. Warns
-    with ``IncompleteTable`` if a table of best known harm covers only some of the worlds.
+    with ``IncompleteTable`` if a table contains the best known harm of only some of the worlds.
     """
     return evaluation.once(_limits)
 
@@ -143,9 +144,7 @@ def _limits(evaluation: Evaluation) -> Limits | Unproven:
 
 
 def regrets_of(evaluation: Evaluation) -> Regrets | None:
-    """Return the best known harm of every world, where the agents of this evaluation count too; None if nothing is
-    proven.
-    """
+    """Return the best known harm of every world after all agents of this evaluation; None if nothing is proven."""
     return evaluation.once(_regrets)
 
 

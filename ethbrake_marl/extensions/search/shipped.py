@@ -30,10 +30,10 @@ def shipped_tables() -> tuple[BestHarmTable, ...]:
 def best_known(worlds: Worlds, task: Task) -> dict[HarmCount, Floats]:
     """Return the best known harm of worlds at t = 0 from the shipped tables: an array [n] in m2/s2 for each harm count.
 
-    The value is NaN if no shipped table contains the world. A world is found by a hash of everything that affects its
-    harm: state, parameters, scripts of the other vehicles, time step, horizon and controlled vehicles. Raises
-    ``InvalidInput`` if the command of a script is not fixed at the alert. ``task`` names the scenario and the
-    controlled vehicles.
+    The best known harm of a world is NaN if no shipped table contains the world. The tables identify a world by a hash
+    of everything that affects its harm: state, parameters, scripts of the other vehicles, time step, horizon and
+    controlled vehicles. Raises ``InvalidInput`` if a script's command is not fixed at the alert. ``task`` names the
+    scenario and the controlled vehicles.
     """
     identity = task_problem(worlds, task).identity
     known = {harm_count: np.full(worlds.n, np.nan) for harm_count in HARM_COUNTS}
@@ -43,9 +43,10 @@ def best_known(worlds: Worlds, task: Task) -> dict[HarmCount, Floats]:
 
 
 def shipped_profiles(problem: ProfileProblem, harm_count: HarmCount) -> tuple[Profiles, Bools]:
-    """Return the stored profiles of a problem with one controlled vehicle, [n], and a mask [n] of worlds that have one.
+    """Return the stored profile of each of the n worlds of ``problem``, and a mask [n] of the worlds that have one.
 
-    ``harm_count`` is the count that the profiles minimise, ``first`` or ``total``.
+    ``problem`` has one controlled vehicle. ``harm_count`` is the harm count that the profiles minimise: ``first`` or
+    ``total``.
     """
     last_step, least = problem.last_step, np.full(problem.n, np.inf)
     profiles, known = Profiles(last_step[:, np.newaxis].copy(), np.zeros((problem.n, 1, 1))), np.zeros(problem.n, bool)
@@ -64,8 +65,8 @@ def shipped_profiles(problem: ProfileProblem, harm_count: HarmCount) -> tuple[Pr
 def make_best_harm(argument: str | None, settings: AgentSettings) -> Agent:
     """Return the agent ``best_harm`` or ``best_harm:CANDIDATES``, which drives the shipped profile of each world.
 
-    In a world without a shipped profile, the agent searches. ``argument`` is the number of candidates of this search,
-    or None.
+    In a world without a shipped profile, the agent searches for a profile at the alert. ``argument`` is the number of
+    profiles that this search simulates, as text; None: the default number.
     """
     return BestHarm.make(argument, settings, shipped_profiles)
 

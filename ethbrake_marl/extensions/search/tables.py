@@ -1,4 +1,4 @@
-"""Tables of best known harm: small files in which a world is found by a hash of everything that affects its harm."""
+"""Tables of best known harm: small files that identify a world by a hash of everything that affects its harm."""
 
 from __future__ import annotations
 
@@ -90,11 +90,11 @@ class BestHarmTable:
 
     @property
     def left_out(self) -> Mapping[str, str]:
-        """Worlds that are missing from the table because of a failure: number of the world -> reason."""
+        """Worlds that are missing because their simulation failed: number of the world -> reason of the failure."""
         return dict(self.header.get(LEFT_OUT, {}))
 
     def rows(self, identity: UInt64s) -> NDArray[np.int64]:
-        """Return the row of each world with hash ``identity`` [m]; -1 if the table does not contain the world."""
+        """Return the index in the table of each world with hash ``identity`` [m]; -1 if the table lacks the world."""
         order = np.argsort(self.identity, kind="stable")
         place = np.minimum(np.searchsorted(self.identity[order], identity), len(order) - 1)
         rows = order[place]
@@ -110,7 +110,7 @@ class BestHarmTable:
             )
 
     def check_fits(self, problem: ProfileProblem) -> None:
-        """Raise ``InvalidInput`` if the stored profile of a world is not a valid profile in ``problem``."""
+        """Raise ``InvalidInput`` if a stored profile is impossible in ``problem``, for instance exceeds a capacity."""
         for harm_count in self.best:
             try:
                 problem.check(self.profiles(problem.identity, harm_count, problem.last_step)[0])
@@ -130,12 +130,12 @@ class BestHarmTable:
     def profiles(self, identity: UInt64s, harm_count: HarmCount, last_step: Ints) -> tuple[Profiles, Bools]:
         """Return the stored profile of each world, [m], and a mask [m] of the worlds that have one.
 
-        For a world without a stored profile the result is coasting.
+        A world without a stored profile gets the profile of coasting.
 
         Args:
             identity: hash of each world, [m].
-            harm_count: count that the profiles minimise, ``first`` or ``total``.
-            last_step: number of steps of each episode, [m].
+            harm_count: harm count that the profiles minimise, ``first`` or ``total``.
+            last_step: number of time steps of each world's episode, [m].
 
         """
         rows = self.rows(identity)
@@ -151,17 +151,17 @@ class BestHarmTable:
     def improved(
         self, identity: UInt64s, harm_count: HarmCount, harm: Floats, profiles: Profiles | None = None
     ) -> tuple[BestHarmTable, Bools]:
-        """Return the table with each harm replaced by the value in ``harm`` if this is smaller, and a mask [m] of the
-        worlds with a new value.
+        """Return a copy of the table with all smaller values from ``harm``, and a mask [m] of the changed worlds.
 
-        A value is replaced if ``harm`` is smaller by more than ``TOLERANCE``. Worlds that are not in the table are
-        ignored. Raises ``InvalidInput`` if the table does not contain the count, or if the shapes do not match.
+        A value in ``harm`` must be smaller than the value in the table by more than ``TOLERANCE``. Worlds that are not
+        in the table are ignored. Raises ``InvalidInput`` if the table does not contain ``harm_count``, or if ``harm``
+        and ``identity`` have different shapes.
 
         Args:
             identity: hash of each world, [m].
-            harm_count: harm count, ``first`` or ``total``.
+            harm_count: harm count of ``harm``: ``first`` or ``total``.
             harm: harm of each world, [m] m2/s2.
-            profiles: command profiles that cause this harm, [m]; None: the table stores the harm without a profile.
+            profiles: command profiles with the harm ``harm``, [m]; None: the table gets the harm without a profile.
 
         """
         if harm_count not in self.best:
@@ -191,8 +191,8 @@ class BestHarmTable:
 def table_bytes(table: BestHarmTable) -> bytes:
     """Return the content of a table file: a compressed .npz without pickles.
 
-    The file contains only those phases of a profile that are in use. The bytes of the commands are grouped by
-    significance, because the file is then smaller.
+    The unused phases of a profile are left out. The file first contains the first byte of every command, then the
+    second byte of every command, and so on, because the file is then smaller.
     """
     arrays: dict[str, NDArray[Any]] = {
         "header": np.frombuffer(json.dumps({"format": TABLE_FORMAT, **table.header}).encode(), np.uint8),
@@ -215,7 +215,8 @@ def table_bytes(table: BestHarmTable) -> bytes:
 def _rows(harm_count: HarmCount) -> list[ArrayRow]:
     """Return the name, type and shape of each array that a table file contains for one harm count.
 
-    There are n worlds, m phases in all worlds together, and C controlled vehicles.
+    In the shapes, n is the number of worlds, m the number of phases of all worlds together, and C the number of
+    controlled vehicles.
     """
     return [
         ArrayRow("header", "|u1", ("bytes",)),
@@ -228,7 +229,7 @@ def _rows(harm_count: HarmCount) -> list[ArrayRow]:
 
 
 class _Header(BaseModel):
-    """Entries of a table's header that other code reads. A header may have more entries."""
+    """Header of a table file: entries that are checked when the file is read. Further entries are allowed."""
 
     model_config = ConfigDict(strict=True, extra="allow")
 
@@ -244,9 +245,9 @@ class _Header(BaseModel):
 
 
 def _read_best(arrays: Mapping[str, NDArray[Any]], harm_count: HarmCount) -> BestKnown:
-    """Return the harm and the profiles of one count from the arrays of a table file.
+    """Return the harm and the profiles of one harm count from the arrays of a table file.
 
-    Raises ``ValueError`` for numbers that no harm and no profile can have.
+    Raises ``ValueError`` if a number in the file is not possible, for instance a negative harm.
     """
     harm = arrays[f"{harm_count}_harm"].astype(np.float64)
     used = arrays[f"{harm_count}_phases"].astype(np.int64)

@@ -1,8 +1,8 @@
 """Draw random templates of commands, and return the best template of each world.
 
-A *template* is one command, another command for a short while, then full braking. A policy can learn from templates
-different ways to drive in a world. The best template is not improved further: a random template with little harm
-tolerates small errors, so a policy can imitate it.
+A *template* is a random braking profile of three phases: one command, then another command for a short while, then full
+braking. From templates a policy can learn different ways to drive in a world. The best template is not improved by a
+search: a random template with little harm tolerates small errors of the commands, so a policy can imitate it.
 """
 
 from __future__ import annotations
@@ -18,16 +18,17 @@ from ethbrake_marl.physics.state import Floats, Ints, UInt64s
 
 
 def best_templates(problem: ProfileProblem, bound: Floats, *, number: int, seed: int = 0) -> tuple[Floats, Ints]:
-    """Draw random templates in each world. Return the best commands, [n, T] m/s2, and their number of steps, [n].
+    """Draw random templates (braking profiles) in each world, and return the template with the least harm.
 
+    Returns the commands of the best template of each world, [n, T] m/s2, and the number of steps of its episode, [n].
     The number of steps is 0 if no template does less harm than ``bound``. The result for a world does not depend on the
     other worlds. Raises ``InvalidInput`` if several vehicles are controlled, or if ``number`` is below 1.
 
     Args:
         problem: n worlds, with the commands of the other vehicles and the harm to minimise.
-        bound: harm above which a template is rejected, [n] m2/s2.
-        number: number of templates per world.
-        seed: seed of the random draws.
+        bound: a template with at least this harm is rejected, [n] m2/s2.
+        number: number of templates that are drawn in each world.
+        seed: seed with which the templates are drawn.
 
     """
     check_whole_number("templates", number, 1)
@@ -46,10 +47,11 @@ def best_templates(problem: ProfileProblem, bound: Floats, *, number: int, seed:
 def _best_templates(
     problem: ProfileProblem, random: UInt64s, bound: Floats, number: int, commands: Floats, steps: Ints
 ) -> None:
-    """Write the best random template of each world to ``commands`` [n, T] and its number of steps to ``steps`` [n].
+    """Write the template with the least harm in each world to ``commands`` [n, T].
 
-    ``random`` [n] is the initial state of each world's random stream. ``bound`` [n] is the harm above which a template
-    is rejected, ``number`` the number of templates per world.
+    The number of steps of this template's episode is written to ``steps`` [n]. ``random`` [n] is the initial state of
+    each world's random stream. A template whose harm is at least ``bound`` [n] is rejected. ``number`` templates are
+    drawn in each world.
     """
     start, T, S = problem.start, commands.shape[1], problem.start.shape[1]
     best, room = Plan(np.zeros(T), np.zeros((T + 1, S))), Plan(np.zeros(T), np.zeros((T + 1, S)))
