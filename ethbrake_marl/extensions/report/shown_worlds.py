@@ -38,8 +38,8 @@ def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS)
 
     The worlds are chosen in this order: worlds in which the agent ``focus`` did worst, worlds with an avoidable
     collision, worlds with the largest reduction of harm compared with full braking, worlds with more harm than full
-    braking, worlds with typical harm of this agent, and random worlds. The entries contain no motion of vehicles yet;
-    ``Played.drive`` adds it.
+    braking, worlds with typical harm of the agent ``focus``, and random worlds. The entries contain no motion of
+    vehicles yet; the method ``Played.drive`` adds the motion.
     """
     outcome = evaluation.outcome(focus)
     chosen: dict[int, Played] = {}

@@ -1,4 +1,4 @@
-"""The commands ``study sweep``, ``study tune`` (both do many training runs) and ``study falsify`` (tries many worlds)."""
+"""The commands ``study sweep`` and ``study tune`` for many training runs, and ``study falsify`` for many worlds."""
 
 from __future__ import annotations
 
