@@ -28,11 +28,11 @@ _NUMERAL = re.compile(r"[-+−]?\d[\d,.]*( ?%)?|–|")
 
 
 def _account(results: Sequence[Result]) -> tuple[str, str, str, list[str]]:
-    """Return texts about the results and about how they were made.
+    """Return four things about the results and about how they were made.
 
-    There are four: the first sentence of the page; the command that makes the results; date, machines and processor
-    time; and a list of remarks. The list contains one remark if fewer worlds were used than in the paper; otherwise it
-    is empty.
+    The first is the first sentence of the page. The second is the command that makes the results. The third is a text
+    with date, machines and processor time. The fourth is a list of remarks: one remark if fewer worlds were used than
+    in the paper, else none.
     """
     every = len(results) == len(ITEMS)
     most = max((result.episodes for result in results), default=MOST_EPISODES)
@@ -125,8 +125,8 @@ def write_docs(file: Path, folder: Path, results: Sequence[Result]) -> None:
 
     Args:
         file: JSON file to write.
-        folder: folder of the reproduction, from which the figures are copied.
-        results: results to write.
+        folder: folder of the reproduction, which contains the figures.
+        results: results of all reproduced figures and tables.
 
     """
     figures = file.parent / FIGURES

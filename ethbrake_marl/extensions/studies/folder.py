@@ -1,4 +1,4 @@
-"""The folder of a study: a sweep, a tuning or a reproduction of the paper.
+"""The folder of a study, for instance of a sweep or of a reproduction of the paper.
 
 Only one process at a time may work in the folder, and all processes must use the same settings.
 """
