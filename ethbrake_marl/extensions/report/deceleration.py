@@ -62,10 +62,10 @@ class DecelerationCurve:
 def deceleration_curve(world: Worlds, task: Task, *, points: int = POINTS) -> DecelerationCurve:
     """Compute predicted, first-impact and total harm of one world at many constant decelerations of one vehicle.
 
-    The decelerations are ``points`` evenly spaced values. Added are the values at which the predicted harm (the
-    pairwise closed form) has a kink or jump. The prediction assumes that all other vehicles brake fully. In the
-    simulation, the other vehicles follow the scripts of the scenario. Raises ``InvalidInput`` if there is not exactly
-    one world, if ``points`` is below 2, or if a script reacts to what happens after the alert.
+    The decelerations are ``points`` evenly spaced values. Further decelerations are the values at which the predicted
+    harm (the pairwise closed form) has a kink or jump. The prediction assumes that all other vehicles brake fully. In
+    the simulation, the other vehicles follow the scripts of the scenario. Raises ``InvalidInput`` if there is not
+    exactly one world, if ``points`` is below 2, or if a script reacts to what happens after the alert.
 
     Args:
         world: world at the alert, n = 1.

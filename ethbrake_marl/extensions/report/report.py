@@ -206,8 +206,8 @@ class Report:
     def about(self) -> str:
         """Name of the agent that the page is mainly about.
 
-        If ``focus`` is not empty, this agent is ``focus``. Otherwise it is the last agent with a trained policy, or the
-        last agent if no agent has a trained policy.
+        If ``focus`` is not empty, this agent is ``focus``. If ``focus`` is empty, this agent is the last one with a
+        trained policy, or the last one of all if no agent has a trained policy.
         """
         learned = [row.agent for row in self.rows if row.policy_sha256]
         return self.focus or (learned or [row.agent for row in self.rows] or [""])[-1]
@@ -256,9 +256,9 @@ class Report:
     def first_sentence(self) -> str:
         """First sentence of the page, which compares the harm of one agent with full braking and the best known harm.
 
-        The agent is ``about``. If the agent does about as much harm as full braking, or more, in some other tests, the
-        sentence names these tests. Otherwise the sentence says in how many worlds the agent does more harm than full
-        braking.
+        The sentence is about the agent ``about``. If this agent does about as much harm as full braking, or more, in
+        some other tests, the sentence names these tests. If there are no such tests, the sentence says in how many
+        worlds the agent does more harm than full braking.
         """
         rows, harm = {row.agent: row for row in self.rows}, NAMES[self.harm_count]
         if self.about not in rows:
@@ -280,11 +280,11 @@ class Report:
         return f"{name} does {words} full braking ({numbers}){joined}{fails or 'in no world more'}."
 
     def _fails(self, harm: str) -> str:
-        """Return the end of ``first_sentence``, which says where the agent does much harm; empty if nowhere.
+        """Return the end of ``first_sentence``, which names tests or worlds in which the agent does badly, if any.
 
         The text names the other tests in which the agent's harm is not clearly less than the harm of full braking (see
         ``_change``). If there is no such test, the text says in how many worlds of the evaluation the agent does more
-        harm than full braking. ``harm`` is the measure to compare, for instance ``total_harm``.
+        harm than full braking. ``harm`` is the name of the compared measure, for instance ``total_harm``.
         """
         reasons = []
         for title, _, others in self.tests:
@@ -363,7 +363,7 @@ def _change(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
     """Compare the harm of an agent with the harm of full braking in the same worlds: "less", "more" or "as much".
 
     The result is "as much" if the 95 % interval of the difference contains 0, or if no interval is known although there
-    are several worlds. ``harm`` is the measure to compare, for instance ``total_harm``.
+    are several worlds. ``harm`` is the name of the compared measure, for instance ``total_harm``.
     """
     difference = row[f"{harm}_difference"]
     unknown = difference is None or (difference.interval is None and row.episodes > 1)
@@ -420,7 +420,7 @@ def _empty(rows: SummaryTable) -> list[str]:
 
 
 def _table(sheet: Sheet, caption: str, names: set[str]) -> Part:
-    """Return a table with the column of agents, and those columns of ``sheet`` in ``names`` that have values.
+    """Return a table with the agents, and with those columns of ``sheet`` that are in ``names`` and have values.
 
     ``caption`` is the title of the table.
     """

@@ -29,8 +29,8 @@ def estimates_figure(
         panels: nested mapping: title of the panel -> label of the series -> x (a number or a text) -> estimate.
         y_label: label of the y axis.
         caption: text below the figure.
-        x_label: label of the x axis. If it is given, the x values must be numbers, and lines with bands are drawn. If
-            it is empty, the x values must be texts, and groups of bars are drawn.
+        x_label: label of the x axis. If ``x_label`` is given, the x values must be numbers, and lines with bands are
+            drawn. If ``x_label`` is empty, the x values must be texts, and groups of bars are drawn.
 
     """
     figure, every = new_panels((4.6 * len(panels), 4.2), columns=len(panels), sharey=True)

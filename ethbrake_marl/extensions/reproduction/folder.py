@@ -99,7 +99,7 @@ class Reproduction:
         )
 
     def train(self, wanted: Collection[str]) -> bool:
-        """Run those trainings of the groups named in ``wanted`` that are not finished.
+        """Do those training runs of the groups named in ``wanted`` that are not finished.
 
         Return False if Ctrl-C stopped a run.
         """
@@ -255,8 +255,8 @@ def scenario_parameters(scenario: Scenario, **places: str) -> list[Parameter]:
 
     Args:
         scenario: the scenario.
-        places: for a key of the scenario, the place where the paper states the value, if this place is not the one in
-            ``_QUANTITIES``. If the text is empty, the paper does not state the value, and the value is our default.
+        places: place where the paper states the value, by key of the scenario. A missing key has the place in
+            ``_QUANTITIES``. If a place is empty, the paper does not state the value, and the value is our default.
 
     """
     content = scenario.model_dump(mode="json", exclude_none=True)

@@ -58,9 +58,9 @@ _ENDS_M = (10.0, 12.0, 14.0, 16.0, 18.0, 20.0)  # limits of the groups, for the 
 def by_distance(evaluation: Evaluation) -> tuple[list[float], Groups]:
     """Group the worlds by the sum of the two gaps.
 
-    Return the mean of this sum in each group (m), and the harm of each strategy in each world of each group. The harm
-    has the form ``{"10-12 m": {"PPO": harm, ...}, ...}``, in which ``harm`` is an array with one value for each world
-    of the group. Groups without worlds are omitted.
+    Return the mean sum of the gaps in each group (m), and the harm of each strategy in each world of each group. The
+    harm has the form ``{"10-12 m": {"PPO": harm, ...}, ...}``, in which ``harm`` is an array with one value for each
+    world of the group. Groups without worlds are omitted.
     """
     total, each_harm = evaluation.worlds.gaps_m.sum(axis=1), harms(evaluation)
     inner, at, groups = np.digitize(total, _ENDS_M[1:-1]), [], {}

@@ -67,9 +67,9 @@ def _drive_hybrid(name: str, settings: Reproduction, reading: Reading) -> Evalua
 def _driven_hybrid(name: str, settings: Reproduction, reading: Reading, about: str) -> Evaluation:
     """Return the evaluation that ``_drive_hybrid`` describes, from the cache if it is there.
 
-    ``about`` is the description of the policy that has not converged. The description is part of the cache key, because
-    the policy may change between two calls: once its training run has ended, it replaces a shipped policy. Then the
-    strategies are evaluated again.
+    ``about`` is the description of the policy that has not converged. The description is part of the cache key. If the
+    training run of this policy ends after the first call, the trained policy replaces a shipped policy, the description
+    changes, and the strategies are evaluated again.
     """
     scenario, (policy, _) = reading.scenario(name), unconverged_policy(settings)
     agents: dict[str, Agent] = {
@@ -87,7 +87,8 @@ def reproduce_illustration(settings: Reproduction) -> Made:
     The figure shows the harm of E-V2X-BM, of a policy that has not converged, and of the hybrid of the two, against the
     sum of the two gaps. The *hybrid* is the paper's Algorithm 1: at the alert the hybrid chooses whether E-V2X-BM or
     the policy drives. The paper says that the hybrid "consistently selects the strategy that results in lower harm".
-    The verdicts check in each world, and in groups of worlds, whether the hybrid's harm is the lower one.
+    The verdicts check in each world, and in groups of worlds, whether the hybrid does no more harm than E-V2X-BM and no
+    more harm than the policy.
     """
     curves, verdicts = {}, []
     for reading in READINGS:

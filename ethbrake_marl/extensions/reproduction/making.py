@@ -44,7 +44,7 @@ def choose_items(names: Sequence[str]) -> list[Item]:
 
 
 def open_folder(asked: Reproduction, *, force: bool = False) -> StudyFolder:
-    """Return the object that checks and locks the folder of a reproduction.
+    """Return a ``StudyFolder`` that checks and locks the folder of a reproduction.
 
     If the folder contains a reproduction with the same settings, the work continues this reproduction.
 
@@ -72,8 +72,8 @@ def open_folder(asked: Reproduction, *, force: bool = False) -> StudyFolder:
 def make_items(asked: Reproduction, items: Sequence[Item], *, force: bool = False) -> tuple[list[Result], bool]:
     """Reproduce items (figures and tables of the paper).
 
-    Items that need no trainings are reproduced first. An item is not reproduced again if its stored result comes from
-    the same training runs. The HTML page with all results is written again after each item.
+    Items that need no training runs are reproduced first. An item is not reproduced again if its stored result comes
+    from the same training runs. The HTML page with all results is written again after each item.
 
     Ctrl-C during a training run stops all training runs; afterwards the items are reproduced with the finished runs. A
     second Ctrl-C stops the command at once.

@@ -1,4 +1,4 @@
-"""How much the results of the random test depend on the quantities that the paper leaves open.
+"""Sensitivity of the random test's results to the quantities that the paper leaves open.
 
 The result states for each quantity: what the paper says, our default, alternatives, and how much the main results
 change with each alternative.

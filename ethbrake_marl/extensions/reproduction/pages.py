@@ -28,11 +28,10 @@ _NUMERAL = re.compile(r"[-+−]?\d[\d,.]*( ?%)?|–|")
 
 
 def _account(results: Sequence[Result]) -> tuple[str, str, str, list[str]]:
-    """Return four things about the results and about how they were made.
+    """Return the first sentence of the page, the command that makes the results, how they were made, and remarks.
 
-    The first is the first sentence of the page. The second is the command that makes the results. The third is a text
-    with date, machines and processor time. The fourth is a list of remarks: one remark if fewer worlds were used than
-    in the paper, else none.
+    The third text states date, machines and processor time. There is one remark if fewer worlds were used than in the
+    paper, else none.
     """
     every = len(results) == len(ITEMS)
     most = max((result.episodes for result in results), default=MOST_EPISODES)

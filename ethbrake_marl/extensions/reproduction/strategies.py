@@ -55,10 +55,9 @@ class Reading:
     acts_s: float | None = None  # time at which Vehicle 2 may act (s); None: the latency of the scenario
 
     def scenario(self, name: str, **changes: object) -> Scenario:
-        """Load the shipped scenario ``name``.
+        """Load the shipped scenario ``name``, and return it with Vehicle 2's latency under this assumption.
 
-        Return it with Vehicle 2's latency under this assumption, and with the new values in ``changes`` for further
-        keys of the scenario.
+        ``changes`` gives new values for further keys of the scenario.
         """
         scenario = load_scenario(name).replace(**changes) if changes else load_scenario(name)
         if self.acts_s is None:

@@ -69,8 +69,8 @@ class Beside:
     def candidates(self, row: str, quantity: str) -> Iterator[tuple[str, Estimate]]:
         """Yield those of our results that a printed number of the paper may mean, each as (name, estimate).
 
-        The printed number is compared with the first of these results. If they differ, the verdict also names that one
-        of all results that is nearest to the printed number.
+        The printed number is compared with the first of these results. If the printed number and the first result
+        differ, the verdict also names the result that is nearest to the printed number.
 
         Args:
             row: name that the paper gives the strategy.
@@ -121,9 +121,9 @@ def compare_rows(printed: Sequence[PaperRow], besides: Sequence[Beside]) -> list
 def selection_verdict(one: PaperRow, other: PaperRow, chosen: PaperRow) -> Verdict:
     """Return a verdict on the printed number of collisions of the hybrid, which chooses between two strategies.
 
-    In each world the hybrid chooses one of the two strategies. So it avoids a collision only in worlds in which at
-    least one of the two strategies avoids a collision. Therefore the hybrid cannot avoid more collisions than the two
-    strategies together.
+    In each world the hybrid chooses one of the two strategies. Therefore the hybrid avoids a collision only in worlds
+    in which at least one of the two strategies avoids a collision. So the hybrid cannot avoid more collisions than the
+    two strategies together.
 
     Args:
         one: row of the paper's table for the first of the two strategies.

@@ -34,10 +34,10 @@ class TrainedRecipe:
     per_s: int  # decisions per second on one core (Intel Xeon), to estimate the time of the training
 
     def load(self, name: str, **changes: Any) -> TrainingRecipe:
-        """Load the recipe.
+        """Load the recipe, and return it with the new name ``name``.
 
-        Return it with the new name ``name``, with this length and these evaluations, and with the new values in
-        ``changes`` for further keys of the recipe.
+        The length of training and the number of updates between two evaluations are those of this object. ``changes``
+        gives new values for further keys of the recipe.
         """
         recipe = load_recipe(self.recipe)
         evaluation = {**recipe.evaluation.model_dump(), "every_updates": self.every_updates}

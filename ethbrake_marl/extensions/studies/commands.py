@@ -60,7 +60,7 @@ def sweep_command(
     schema: schema_option("ethbrake_marl.extensions.studies.sweep", "SweepPlan", "sweep") = False,  # type: ignore[valid-type]  # made here
     as_json: JsonOption = False,
 ) -> None:
-    """Train every job of a file, and write one table of the results.
+    """Do the training runs in a file, and write a table of results.
 
     After an interruption, the same command continues: finished jobs are not trained again, and unfinished jobs continue
     from their last checkpoint. If a job failed, the exit status is 1, and failures.csv says why.

@@ -43,11 +43,11 @@ def search(
 ) -> Scored:
     """Search the unit cube for points with a high score, and return all points that were tried.
 
-    Half of the points of a round are spread evenly (scrambled Sobol points). Each point of the other half is one step
-    away from a *parent*. The parents are the points with the highest scores so far that are far apart from each other.
-    A step is a normal random step in some coordinates, or half the difference between two random parents (differential
-    evolution). In the first round, and later while no score is above the median score, all points are spread evenly.
-    The same seed gives the same points.
+    The points are tried in rounds of at most 256 points (``ROUND``). Half of the points of a round are spread evenly
+    (scrambled Sobol points). Each point of the other half is one step away from a *parent*. The parents are the points
+    with the highest scores so far that are far apart from each other. A step is a normal random step in some
+    coordinates, or half the difference between two random parents (differential evolution). In the first round, and
+    later while no score is above the median score, all points are spread evenly. The same seed gives the same points.
 
     Args:
         score: function from points [n, d] to scores [n].

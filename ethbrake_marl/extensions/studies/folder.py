@@ -30,8 +30,8 @@ class StudyFolder:
         record: name of the file in the folder that stores ``question``.
         more: additional entries for the file ``record``; they are stored, but never compared.
         advice: last words of an error message about the folder, which say what the user can do.
-        beside: names of files that an existing folder may contain although the file ``record`` is missing; with any
-            other file the folder is refused. None: every file is allowed.
+        beside: names of the files that an existing folder without the file ``record`` may contain; if it contains any
+            other file, ``check`` raises an error. None: every file is allowed.
         writes: names of files that the work replaces; they must be writable.
 
     """

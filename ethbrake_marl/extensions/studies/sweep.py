@@ -68,7 +68,7 @@ _Settings = Annotated[dict[str, Any], AfterValidator(_check_keys)]
 
 
 class Request(NamedTuple):
-    """One training of a sweep, as requested in the file of the sweep."""
+    """One training run of a sweep, as requested in the file of the sweep."""
 
     path: YamlPath  # place of the training in the file: ``("grid",)``, or ``("jobs", k)`` for a listed job
     scenario: str  # name or path of the scenario
@@ -87,7 +87,7 @@ def _place(path: YamlPath) -> str:
 
 
 class SeedRange(FileModel):
-    """Seeds of the trainings as a range of ``count`` whole numbers: ``first``, ``first`` + 1, and so on."""
+    """Seeds of the training runs as a range of ``count`` whole numbers: ``first``, ``first`` + 1, and so on."""
 
     first: Seed = Field(default=0, description="the smallest seed")
     count: int = Field(ge=1, le=MOST_JOBS, description="number of seeds")
@@ -101,7 +101,7 @@ _Seeds = Annotated[
 
 
 class Grid(FileModel):
-    """Grid of trainings: one training for every combination of the listed scenarios, recipes, settings and seeds."""
+    """Grid of training runs: one run for every combination of the listed scenarios, recipes, settings and seeds."""
 
     settings: Annotated[dict[str, _Values], AfterValidator(_check_keys)] = Field(
         default={}, alias="set", description="a list of values for each dotted key"
@@ -124,7 +124,7 @@ class Grid(FileModel):
 
 
 class ListedJob(FileModel):
-    """One training of the list ``jobs``: a scenario, a recipe, settings and a seed."""
+    """One training run of the list ``jobs``: a scenario, a recipe, settings and a seed."""
 
     settings: _Settings = Field(default={}, alias="set", description="settings by dotted key, as for train --set")
     scenario: str = Field(description="name or path of the scenario, as for train --scenario")
@@ -133,7 +133,7 @@ class ListedJob(FileModel):
 
 
 class SweepFile(StudyFile):
-    """Content of the YAML file of a sweep: trainings as a grid of combinations, as a list of single jobs, or both."""
+    """Content of the YAML file of a sweep: training runs as a grid of combinations, as single jobs, or both."""
 
     settings: _Settings = Field(default={}, alias="set", description="settings of every job, as for train --set")
     grid: Grid | None = Field(default=None, description="one training for every combination of the listed values")
@@ -272,9 +272,9 @@ class SweepPlan:
 
     @staticmethod
     def folder(path: Path) -> StudyFolder:
-        """Return the object that checks and locks the folder ``path`` of a sweep.
+        """Return a ``StudyFolder`` that checks and locks the folder ``path`` of a sweep.
 
-        The object compares no settings, because the folder of each job stores the settings of the job's training.
+        This object compares no settings, because the folder of each job stores the settings of this job.
         """
         return StudyFolder(path, "a sweep", writes=(TABLE, FAILURES))
 

@@ -85,7 +85,9 @@ class TrainingJob:
         return max(total - (steps if isinstance(steps, int) else 0), 1)
 
     def finish(self, tell: OnProgress | None = None, *, stop_at: StopAt | None = None) -> bool | None:
-        """Continue the training to its end. Return True if the training has finished, or None if it was stopped early.
+        """Continue the training run to its end.
+
+        Return True if the run has finished, or None if the run was stopped early.
 
         Raises the exceptions of ``train`` and ``resume``.
 
@@ -113,10 +115,10 @@ class TrainingJob:
         return True if ended.status == "finished" else None
 
     def time(self, sample: Sample | None = None) -> Timed:
-        """Measure the time of a few updates of this training run, and the time in which its policies drive worlds.
+        """Measure the time of a few updates of this training run, and the time in which its policies drive some worlds.
 
-        The policies drive at most 50 worlds of ``sample``. If ``sample`` is None, they drive the first 50 worlds of the
-        list on which the recipe evaluates.
+        The policies drive at most 50 worlds of ``sample``. If ``sample`` is None, the policies drive the first 50
+        worlds of the list on which the recipe evaluates.
         """
         from ethbrake_marl.training.session import train
 

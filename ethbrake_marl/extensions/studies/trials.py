@@ -45,7 +45,7 @@ def run_trials(
         given: further keyword arguments of ``work``, the same for all trials.
         folder: folder of all results; every computer of a cluster must see it.
         config: settings of Ray Tune: search algorithm, scheduler and number of trials.
-        space: dictionary from a key of the dictionary ``config`` that ``work`` gets to the values that Ray Tune tries.
+        space: values that Ray Tune tries, by key; ``work`` gets one value of each key, in the dictionary ``config``.
         jobs: number of trials that run at once; None: one for each core.
         retries: number of times that a trial is started again after its process has ended unexpectedly, or after an
             exception that is not an ``EthBrakeError``.

@@ -202,9 +202,9 @@ class Measuring(FileModel):
 class Pruning(FileModel):
     """Rule that stops weak trials early (Ray's median stopping rule).
 
-    A trial is one training run with several evaluations. After the k-th evaluation of a trial, the rule computes for
-    every other trial its mean harm up to its own k-th evaluation. The trial is stopped if its least harm so far is
-    above the median of these means.
+    A trial is one training run with several evaluations. After the k-th evaluation of a trial, the rule computes the
+    mean harm of each other trial over its evaluations up to the k-th. If the trial's own least harm so far is above the
+    median of these means, the trial is stopped.
     """
 
     # Number of other trials that must have reached an evaluation before a trial may be stopped there.
@@ -425,9 +425,9 @@ class TuningPlan:
             raise InvalidInput(f"search: the recipe rejects {', '.join(texts_of(values))}: {error}") from None
 
     def folder(self, path: Path) -> StudyFolder:
-        """Return the object that checks and locks the folder ``path``.
+        """Return a ``StudyFolder`` that checks and locks the folder ``path``.
 
-        The object raises an error if the folder belongs to a tuning with other settings.
+        This object raises ``InvalidInput`` if the folder belongs to a tuning with other settings.
         """
         return StudyFolder(path, "a tuning", self.question, record="tuning.json", writes=(TABLE,))
 

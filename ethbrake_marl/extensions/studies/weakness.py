@@ -90,7 +90,7 @@ class Measure:
     def falsify(
         self, budget: int, seed: int, *, most: int = 20, adaptive: bool = True, on_round: Watcher | None = None
     ) -> Falsified:
-        """Search the ranges of the scenario for the worlds in which the agent does worst.
+        """Search the worlds that the scenario can draw for those in which the agent does worst.
 
         For every measure but ``bound``, only worlds with a score above 0 are returned, so there may be none. Raises the
         exceptions of ``scenario.ranges``. Raises ``InvalidInput`` if no tried world has a finite score.
@@ -147,8 +147,9 @@ class Measure:
         Args:
             name: name of the measure: ``harm``, ``regret``, ``difference`` or ``bound``.
             agent: spec of the agent, such as ``ppo`` or ``ppo+step``.
-            against: spec of the reference agent, with whose harm ``regret`` and ``difference`` compare; None:
-                ``best_harm`` for ``regret``. It must be None for ``harm`` and ``bound``.
+            against: spec of the reference agent, whose harm the measures ``regret`` and ``difference`` compare with the
+                agent's harm. For ``regret``, None means ``best_harm``. For ``harm`` and ``bound``, ``against`` must be
+                None.
             scenario: scenario whose learners the agents drive.
             harm_count: harm count: the first impact of each pair (``first``) or all impacts (``total``).
 
