@@ -40,7 +40,7 @@ def harm_by_agent(
 
     Args:
         rows: results of each agent.
-        harm_count: harm count to draw, ``first`` or ``total``.
+        harm_count: harm count that the figure shows, ``first`` or ``total``.
         elsewhere: results of the agents in other tests, by the title of the test; None: no other tests.
 
     """

@@ -451,7 +451,7 @@ def write_evaluation(
         evaluation: evaluation of the agents.
         rows: results of the evaluation, one row for each agent.
         agents: evaluated agents, by name. These agents drive some worlds again for the episode player.
-        harm_count: harm count that the agents make small, ``first`` or ``total``.
+        harm_count: harm count that the agents minimise, ``first`` or ``total``.
         force: whether an existing file is replaced.
         tell: function that is called with the number of agents that have driven the worlds again, and the number of all
             agents.

@@ -59,7 +59,7 @@ class TrainingJob:
 
     @property
     def per_update(self) -> int:
-        """Number of decisions of all learners between two updates."""
+        """Number of decisions between two updates of the policy, of all learners together."""
         return self.training.recipe.n_envs * len(self.training.scenario.learners) * self.training.recipe.rounds
 
     def steps_left(self) -> int:

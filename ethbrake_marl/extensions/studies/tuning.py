@@ -203,7 +203,7 @@ class Pruning(FileModel):
     """Rule that stops weak trials early (Ray's median stopping rule).
 
     A trial is one training run with several evaluations. After the k-th evaluation of a trial, the rule computes the
-    mean harm of each other trial over its evaluations up to the k-th. If the trial's own least harm so far is above the
+    mean harm of each other trial so far, up to the k-th evaluation. If the trial's own least harm so far is above the
     median of these means, the trial is stopped.
     """
 
@@ -577,7 +577,7 @@ class TuningPlan:
         return recipe.text(f"# The best trial of a tuning, trained again: {command}\n")
 
     def has_exported(self, path: Path, file: Path) -> bool:
-        """Return whether ``file`` is the exported recipe of one of the trials in the tuning's folder ``path``."""
+        """Return whether ``file`` is a recipe that was exported from a trial in the tuning's folder ``path``."""
         try:
             source, text = load_recipe(file).source, file.read_text("utf-8")
         except InvalidInput:

@@ -151,7 +151,7 @@ class Measure:
                 agent's harm. For ``regret``, None means ``best_harm``. For ``harm`` and ``bound``, ``against`` must be
                 None.
             scenario: scenario whose learners the agents drive.
-            harm_count: harm count: the first impact of each pair (``first``) or all impacts (``total``).
+            harm_count: impacts that count as harm: the first of each pair (``first``) or all (``total``).
 
         """
         chosen = next((each for each in MEASURES if each == name), None)
