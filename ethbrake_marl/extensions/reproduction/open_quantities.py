@@ -1,7 +1,7 @@
 """Sensitivity of the random test's results to the quantities that the paper leaves open.
 
-For each such quantity, a table states what the paper says, our default, and alternative values. Another table states
-how much mean harm and collision rates change with each alternative.
+For each such quantity, a table states what the paper says, our default, and alternative values. Another table states,
+for each alternative, how much the mean harm changes, and the new collision rates.
 """
 
 from __future__ import annotations
