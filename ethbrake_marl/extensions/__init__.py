@@ -1,1 +1,4 @@
-"""Extensions: folders that can be deleted. Each registers itself by entry points; no core module names one."""
+"""Extensions: optional parts of the package, one folder each.
+
+The other modules work without this folder, because every extension registers itself by an entry point.
+"""

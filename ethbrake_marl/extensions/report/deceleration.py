@@ -40,7 +40,7 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class DecelerationCurve:
-    """Harm in one world as a function of the constant deceleration of one vehicle, at K increasing decelerations."""
+    """Harm in one world at K constant decelerations of one vehicle, in increasing order."""
 
     task: Task  # scenario, and the one controlled vehicle
     world: Worlds  # world at the alert, n = 1
@@ -62,14 +62,14 @@ class DecelerationCurve:
 def deceleration_curve(world: Worlds, task: Task, *, points: int = POINTS) -> DecelerationCurve:
     """Compute predicted, first-impact and total harm of one world at many constant decelerations of one vehicle.
 
-    The decelerations are ``points`` evenly spaced values, and the values at which the predicted harm (the pairwise
-    closed form) has a kink or jump. The prediction assumes that all other vehicles brake fully. In the simulation, the
-    other vehicles follow the scripts of the scenario. Raises ``InvalidInput`` if there is not exactly one world, if
-    ``points`` is below 2, or if a script reacts to what happens after the alert.
+    The decelerations are ``points`` evenly spaced values. Further decelerations are the values at which the predicted
+    harm (the pairwise closed form) has a kink or jump. The prediction assumes that all other vehicles brake fully. In
+    the simulation, the other vehicles follow the scripts of the scenario. Raises ``InvalidInput`` if there is not
+    exactly one world, if ``points`` is below 2, or if a script reacts to what happens after the alert.
 
     Args:
         world: world at the alert, n = 1.
-        task: scenario, and the one controlled vehicle.
+        task: scenario, with exactly one controlled vehicle.
         points: number of evenly spaced decelerations from 0 to the braking capacity.
 
     """
@@ -112,12 +112,12 @@ def regimes_of(worlds: Worlds, pair: int, deceleration_mps2: Floats) -> NDArray[
     Each vehicle of the pair coasts during its latency and then brakes with a constant deceleration. All other vehicles
     are ignored. The values are ``early`` (contact before the front vehicle brakes), ``A`` (the front vehicle brakes,
     the rear vehicle coasts), ``A'`` (the front vehicle is at rest, the rear vehicle coasts), ``B`` (both vehicles
-    brake), ``C`` (the front vehicle is at rest, the rear vehicle brakes) and ``none`` (no contact). Formulas for each
-    value are in docs/internals/proofs/constant-deceleration.md.
+    brake), ``C`` (the front vehicle is at rest, the rear vehicle brakes) and ``none`` (no contact). The page
+    docs/internals/proofs/constant-deceleration.md defines each of these kinds of contact by formulas.
 
     Args:
         worlds: worlds at the alert, [n].
-        pair: index of the pair of the vehicles with the indices ``pair`` and ``pair + 1``.
+        pair: index of the front vehicle of the pair; the rear vehicle has the index ``pair + 1``.
         deceleration_mps2: constant deceleration of each vehicle, [n, N] m/s2.
 
     """
@@ -160,11 +160,12 @@ def deceleration_figure(curve: DecelerationCurve, *, title: str = "") -> Figure:
     """Draw predicted and simulated harm of one world against the constant deceleration of one vehicle.
 
     The upper panel shows the predicted harm, the simulated harm under both counts, and the decelerations that the
-    pairwise and the coupled E-V2X-BM choose. Two horizontal lines mark the best known harm over all commands, constant
-    or not, under each count. The lower panel shows how each pair makes its first contact (see ``regimes_of``).
+    pairwise and the coupled E-V2X-BM choose. Two horizontal lines mark the best known harm of this world over all
+    commands, constant or not: one line for each harm count. The lower panel shows how each pair makes its first contact
+    (see ``regimes_of``).
 
     Args:
-        curve: result of ``deceleration_curve``.
+        curve: harm at each deceleration, as ``deceleration_curve`` returns it.
         title: title of the figure; if empty, the title is the name of the scenario.
 
     """

@@ -21,12 +21,12 @@ from ethbrake_marl.game.harm import HARM_COUNTS
 def trajectories(records: Mapping[str, EpisodeRecord], *, caption: str = "") -> Figure:
     """Draw positions with impacts, gaps, and commands of the controlled vehicles over time.
 
-    The figure has one column for each record. All columns have the same scales, so agents can be compared in the same
-    world. Raises ``InvalidInput`` if ``records`` is empty.
+    The figure has one column for each recorded episode. All columns have the same scales, so episodes of different
+    agents can be compared. Raises ``InvalidInput`` if ``records`` is empty.
 
     Args:
         records: recorded episodes; the key of an episode is the title of its column.
-        caption: text below the figure; if empty, the caption states the parameters of the first world.
+        caption: text below the figure; if empty, the gaps, speeds and other parameters of the first world.
 
     """
     if not records:

@@ -61,8 +61,8 @@ MakeSection = Callable[[Experiment, OnProgress], RunSection | None]  # None: no 
 def register_run_section(name: str, make: MakeSection) -> None:
     """Register a function that adds a section to the report of every ``ethbrake run``, below the results.
 
-    ``name`` is the unique name of the section. ``make`` is a function that returns the section, or None if the run gets
-    no such section. An installed package can instead declare an entry point in the group
+    ``name`` is the unique name of the section. ``make`` is a function that returns the section for a run, or None if
+    the report of this run needs no such section. An installed package can instead declare an entry point in the group
     ``ethbrake_marl.run_sections``.
     """
     RUN_SECTIONS.add(name, make, lambda other: other is make)
@@ -72,10 +72,10 @@ RUN_SECTIONS: Registry[MakeSection] = Registry("section of a run's report", "run
 
 
 def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
-    """Evaluate the policy on the other two tests, draw figures, write ``report.html``, and return what is printed.
+    """Evaluate the policy on the other two tests, draw figures, write ``report.html``, and return the text to print.
 
     Args:
-        experiment: finished run, with its folder, policy and evaluation.
+        experiment: results of ``ethbrake run`` so far: the folder, the trained policy and its evaluation.
         tell: function that is called with a ``Progress`` object at each stage.
 
     """
@@ -123,7 +123,7 @@ def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
 
 
 def _drive_other_test(experiment: Experiment, test: Scenario) -> SummaryTable:
-    """Evaluate the trained policy (without and with a shield) and the baselines on ``test``; return a summary."""
+    """Evaluate the trained policy (without and with a shield) and the baselines in ``test``, and return the results."""
     evaluation = experiment.evaluation
     worlds = test.sample(min(evaluation.worlds.n, MOST_WORLDS), experiment.list_seed)
     agents = compared_agents(experiment.trained.trained, test, experiment.harm_count, BESIDE)
@@ -147,14 +147,15 @@ def write_figures(
 
     Args:
         folder: folder of the run.
-        evaluation: evaluation of the trained policy or team and the baselines.
-        rows: summary of the evaluation, one row for each agent.
+        evaluation: evaluation of the trained policy or team and of the baselines.
+        rows: results of the evaluation, one row for each agent.
         course: evaluations during the training, each with ``steps``, ``first_impact_harm``, ``total_harm`` and
             ``collision_rate``.
         course_caption: caption of the learning curve.
-        agents: evaluated agents, by name; some drive the typical world again.
+        agents: evaluated agents, by name. The trained policy and two baselines drive a typical world again for the
+            third figure.
         learned: name of the trained policy or team in ``agents``.
-        harm_count: harm count by which the typical world of the third figure is chosen.
+        harm_count: harm count by which the typical world is chosen, ``first`` or ``total``.
 
     """
     references = [row for row in rows if row.agent in BESIDE]
@@ -185,10 +186,10 @@ def write_figures(
 
 
 def telling_world(evaluation: Evaluation, harm_count: HarmCount = "first", learned: str = TRAINED_POLICY) -> int:
-    """Return the index of a typical world: the one in which ``learned`` reduces the harm by the median amount.
+    """Return the index of a typical world: the world in which ``learned`` reduces the harm by the median amount.
 
     The reduction is the harm of full braking minus the harm of ``learned``, the trained policy or team. The median is
-    taken over the worlds in which full braking does harm. Returns 0 if full braking does no harm in any world.
+    taken over the worlds in which full braking does harm. If full braking does no harm in any world, the index is 0.
     ``harm_count`` is ``first`` or ``total``.
     """
     before = evaluation.outcome(BESIDE[0]).world_harm(harm_count)

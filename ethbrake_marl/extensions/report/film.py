@@ -121,7 +121,10 @@ def check_film(ending: str, films: int = 1) -> None:
 
 
 def _stacked(films: Films) -> Iterator[Frame]:
-    """Yield the pictures of the file. Each picture shows the current scenes of all films, one below the other."""
+    """Yield the pictures of a GIF or MP4 file in order.
+
+    Each picture shows the scenes of all films at the same time, one below the other.
+    """
     for k in range(max(map(len, films.values()))):
         each = (shown[min(k, len(shown) - 1)]._replace(title=title) for title, shown in films.items())
         yield np.concatenate([scene.frame() for scene in each])

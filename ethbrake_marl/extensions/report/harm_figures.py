@@ -35,13 +35,13 @@ def harm_by_agent(
 ) -> Figure:
     """Draw the mean harm of each agent as a bar with its 95 % interval.
 
-    A vertical line marks the mean best known harm. Further marks show each agent's mean harm on other tests. The figure
-    is narrow enough for the screen of a phone. Raises ``InvalidInput`` if ``rows`` is empty.
+    A vertical line marks the mean best known harm. Markers show the mean harm of the same agent in other tests. The
+    figure is narrow enough for the screen of a phone. Raises ``InvalidInput`` if ``rows`` is empty.
 
     Args:
-        rows: summary of each agent.
-        harm_count: harm count to draw, ``first`` or ``total``.
-        elsewhere: summaries of the agents on other tests, by the title of the test; None: no other tests.
+        rows: results of each agent.
+        harm_count: harm count that the figure shows, ``first`` or ``total``.
+        elsewhere: results of the agents in other tests, by the title of the test; None: no other tests.
 
     """
     if not rows:
@@ -72,17 +72,17 @@ def harm_by_agent(
 def _name_rows(axes: Axes, agents: Sequence[str], most: int = 40) -> None:
     """Label the rows of a figure with the names of the agents, the first agent in the top row.
 
-    Names are shortened to ``most`` characters.
+    Longer names are shortened to ``most`` characters.
     """
     axes.set_yticks(range(len(agents)), [label_text(agent, most) for agent in agents])
     axes.invert_yaxis()
 
 
 def regret_distribution(evaluation: Evaluation) -> Figure:
-    """Draw, for each agent and harm count, the fraction of worlds in which the agent's regret exceeds x, against x.
+    """Draw, for every x, the fraction of worlds in which an agent's regret exceeds x, for each agent and harm count.
 
-    *Regret* is harm minus best known harm. If the best known harm of the worlds was not computed, the figure shows the
-    agents' harm instead of their regret.
+    *Regret* is the agent's harm minus the best known harm of the world. If the best known harm of the worlds was not
+    computed, the figure shows the agents' harm instead of their regret.
     """
     regrets = regrets_of(evaluation)
     figure, panels = new_panels((10.0, 3.8), columns=2, sharey=True)
@@ -108,11 +108,11 @@ def regret_distribution(evaluation: Evaluation) -> Figure:
 
 
 def harm_in_parts(evaluation: Evaluation) -> Figure:
-    """Draw each agent's mean harm per world as a bar of three parts.
+    """Draw the mean harm of each agent as a bar of three parts.
 
-    The parts are the best known harm, the regret in worlds with unavoidable contact, and the regret in worlds with
-    avoidable contact. *Regret* is harm minus best known harm. Raises ``InvalidInput`` if it is not proven in which
-    worlds contact is avoidable.
+    The first part of the bar is the best known harm, the second the regret in worlds with unavoidable contact, and the
+    third the regret in worlds with avoidable contact. *Regret* is the agent's harm minus the best known harm of the
+    world. Raises ``InvalidInput`` if no proof says in which worlds contact is avoidable.
     """
     regrets = regrets_of(evaluation)
     avoidable = None if regrets is None else regrets.limits.proof.avoidable

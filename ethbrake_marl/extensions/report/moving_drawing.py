@@ -83,7 +83,7 @@ class _Strip:
         return (float(place_m) - self._left) * self._scale
 
     def drawn(self) -> Iterator[str]:
-        """Yield the SVG elements of the strip."""
+        """Yield the SVG elements that draw the strip."""
         yield f'<text x="12" y="22" font-weight="bold">{escape(self.title)}</text>'
         texts = [
             f"harm {scene.first_harm:.1f} by first impacts, {scene.total_harm:.1f} in total" for scene in self._film
@@ -149,10 +149,10 @@ class _Strip:
         )
 
     def _events(self) -> list[tuple[int, int, Struck]]:
-        """Return the impacts to show, each as (start, stop, impact): the scenes start to stop - 1 show the impact.
+        """Return the impacts to show, each as (start, stop, impact): scenes ``start`` to ``stop - 1`` show the impact.
 
-        Only one impact is shown at a time. A new impact replaces the shown impact unless it is weaker; then it is
-        omitted.
+        Only one impact is shown at a time. If the next impact is at least as strong as the shown impact, it replaces
+        the shown impact; if it is weaker, it is not shown.
         """
         known: set[tuple[int, float]] = set()
         events: list[tuple[int, int, Struck]] = []
@@ -189,7 +189,7 @@ def _clock(y: int, last: int, frames: int, fps: int) -> Iterator[str]:
     Args:
         y: vertical position of the bar in the picture.
         last: index of the last scene of the longest film.
-        frames: number of scenes after which the animation starts again.
+        frames: number of scenes of the whole animation, after which it starts again.
         fps: scenes per second.
 
     """

@@ -59,7 +59,7 @@ class Part:
 
     @classmethod
     def facts(cls, facts: Mapping[str, object]) -> Part:
-        """Return a part with a list of names and their values; ``facts`` maps each name to its value."""
+        """Return a part that lists the entries of ``facts``, each as a name with its value."""
         lines = [Markup("<dt>{}</dt><dd>{}</dd>").format(shown(name), _text(value)) for name, value in facts.items()]
         return cls(Markup("<dl>\n{}\n</dl>\n").format(Markup("\n").join(lines)))
 
@@ -81,7 +81,7 @@ class Part:
 
     @classmethod
     def opened(cls, title: str, parts: Sequence[Part]) -> Part:
-        """Return one part with ``parts`` under a title. The parts are hidden until the reader clicks on the title."""
+        """Return one part with ``parts`` under a title. These parts are hidden until the reader clicks on the title."""
         return cls._around("<details><summary>{}</summary>\n{}</details>\n", parts, shown(title))
 
     @classmethod
@@ -111,10 +111,10 @@ class Part:
 
     @classmethod
     def template(cls, file: str, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = (), **values: object) -> Part:
-        """Return a part made from the template ``file`` in the folder of this module, filled with ``values``.
+        """Fill the template ``file``, which is in the folder of this module, with ``values``, and return it as a part.
 
-        Values of the type ``Markup`` are inserted unchanged; other values are escaped. ``styles`` and ``scripts`` are
-        the names of the style sheets and scripts in the same folder that the part needs.
+        Values of the type ``Markup`` (HTML text) are inserted unchanged; other values are escaped. ``styles`` and
+        ``scripts`` are the names of the style sheets and scripts that the part needs, in the same folder.
         """
         return cls(Markup(_environment().get_template(file).render(**values)), styles, scripts)
 
@@ -122,8 +122,8 @@ class Part:
     def table(cls, sheet: Sheet) -> Part:
         """Return a part that shows ``sheet`` as a table. A table that is wider than the page can be scrolled.
 
-        To put HTML such as a button into a cell, give a ``Shown`` object whose value has the type ``Markup``. All other
-        texts are escaped.
+        To put HTML such as a button into a cell, give a ``Shown`` object whose value has the type ``Markup``. The texts
+        of all other cells are escaped.
         """
         return cls(Markup(sheet.html() + "\n"))
 
@@ -147,8 +147,8 @@ class Part:
             figure: figure of matplotlib, or the bytes of an SVG file with a figure of this package.
             title: title above the figure.
             description: description of what the figure shows.
-            alone: True: keep the figure's own colours, on a white background (for instance for a map). False: use the
-                colours of the page, light or dark.
+            alone: whether the figure keeps its own colours on a white background (for instance a map), instead of the
+                light or dark colours of the page.
             known: text that is omitted from the caption, because the page shows it elsewhere.
             where: path of the SVG file, for error messages.
 
@@ -183,11 +183,11 @@ class Part:
 
         Args:
             worlds: worlds to show, at least one, with the episode of each agent.
-            driven: indices (0 = front) of the controlled vehicles. If the agents control different vehicles: a mapping
-                from the name of each agent to these indices.
-            focus: name of an agent that is selected at the start if ``shown_first`` is empty.
-            shown_first: indices of the agents that are selected at the start; empty: ``focus``, and the first and last
-                agents, up to three.
+            driven: indices (0 = front) of the controlled vehicles. If different agents control different vehicles, give
+                a mapping from the name of each agent to the indices of its vehicles.
+            focus: name of an agent that is shown at the start if ``shown_first`` is empty.
+            shown_first: indices of the agents that are shown at the start. If empty, up to three agents are shown:
+                ``focus``, the first agent and the last agents.
             folded: whether the curves over time are hidden until the reader clicks on the title above them.
 
         """
@@ -249,7 +249,7 @@ class Page:
     Args:
         title: title of the page.
         sections: sections, in the order of the page; each section has an entry in the table of contents.
-        lead: one or two sentences about the page, shown below the title.
+        lead: one or two sentences about the page, below the title.
         opening: parts between the lead and the table of contents.
 
     >>> from ethbrake_marl.extensions.report.page import Page, Part, Section
@@ -270,7 +270,10 @@ class Page:
 
     @cached_property
     def _code(self) -> tuple[str, str]:
-        """Text of all style sheets of the page, and text of all its scripts. Each file is included only once."""
+        """Text of all style sheets of the page, and text of all its scripts.
+
+        A file that several parts need is included only once.
+        """
         styles = dict.fromkeys(["page.css", *(name for part in self._parts for name in part.styles)])
         scripts = dict.fromkeys(name for part in self._parts for name in part.scripts)
         return "\n".join(map(read_file, styles)), "\n".join(map(read_file, scripts))

@@ -1,4 +1,4 @@
-"""Rows of the paper's two tables of results, and the check that an evaluation uses the same test as the paper."""
+"""Rows of the paper's two tables of results, and a check whether an evaluation uses the same test as the paper."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ethbrake_marl.scenario.task import Task
 class PaperRow:
     """One row of a table of results as printed in the paper.
 
-    The paper has only one harm count, and gives no confidence intervals.
+    The paper has only one count of harm (first-impact harm), and gives no confidence intervals.
     """
 
     table: Literal["random test", "hybrid test"]  # title of the table

@@ -23,7 +23,7 @@ _BIN_S = 1e-3  # s; if a pair has several impacts within this time, only the las
 
 @dataclass(frozen=True, slots=True)
 class Played:
-    """One world of the episode player, with the motion of the vehicles under every agent."""
+    """One world of the episode player (interactive drawing), with the motion of the vehicles under every agent."""
 
     number: int  # number of the world in its list
     kind: str  # heading of the group of worlds, which says why the world is shown
@@ -33,12 +33,12 @@ class Played:
 
     @staticmethod
     def drive(played: Sequence[Played], worlds: Worlds, name: str, agent: Driver, scenario: Scenario) -> None:
-        """Let one agent drive the worlds, and store the motion in each world under ``name`` in ``motions``.
+        """Let one agent drive the worlds, and store the motion in each world as ``motions[name]``.
 
         Args:
-            played: one entry for each world; the function adds the motion to the ``motions`` of the entry.
+            played: one object for each world; the function adds the motion to ``motions`` of this object.
             worlds: worlds at the alert, in the order of ``played``.
-            name: name of the agent that the page shows.
+            name: name of the agent, as the page shows it.
             agent: agent that drives the worlds; the agent is not changed.
             scenario: scenario of the worlds; its learners are the controlled vehicles.
 
@@ -76,8 +76,8 @@ def _impacts(motion: EpisodeMotion) -> list[list[float]]:
 
     The numbers are the time (s), the index of the pair, the closing speed (m/s), 1 for the first impact of the pair and
     0 for a later one, the number of the impact in the episode (from 1), the first-impact harm so far, and the total
-    harm so far (m2/s2). If a pair has several impacts within 1 ms (``_BIN_S``), only the last of these impacts is
-    returned. After the last impact, both harms equal the recorded harms of the episode exactly.
+    harm so far (m2/s2). If a pair has several impacts within the same 1 ms (``_BIN_S``), only the last of these impacts
+    is returned. At the last impact, the two harms so far equal the recorded harms of the episode exactly.
     """
     rows = motion.impacts
     order = np.argsort(rows.time_s, kind="stable")

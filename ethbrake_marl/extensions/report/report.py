@@ -38,10 +38,10 @@ SHIELD_WORLDS = 200  # number of worlds in which each replacement by a shield is
 
 
 def worst_section(evaluation: Evaluation, focus: str, watched: Sequence[int]) -> Section:
-    """Return the section with the ten worlds in which the agent ``focus`` did worst.
+    """Return the section that lists the ten worlds in which the agent ``focus`` did worst.
 
-    ``watched`` are the numbers of the worlds that the episode player on the page can show. Next to each of the ten
-    worlds that the player can show, a button starts the player.
+    ``watched`` are the numbers of the worlds that the episode player on the page can show. A listed world with such a
+    number gets a button that starts the player.
     """
     regrets, outcome = regrets_of(evaluation), evaluation.outcome(focus)
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
@@ -120,9 +120,9 @@ _SPLIT: tuple[Column | str, ...] = (
 def shield_section(rows: ShieldModes, conditions: str) -> Section:
     """Return the section that compares the modes of the shield.
 
-    The section also states how many interventions of the mode ``step`` were needed, harmless or costly. ``rows`` are
-    the results, one row for each agent and mode of its shield. ``conditions`` is a sentence about the worlds and the
-    harm count. The section is empty if ``rows`` is empty.
+    The section also counts the interventions of the mode ``step`` that were needed (the harm is higher without the
+    intervention), harmless (equal) and costly (lower). ``rows`` are the results, one row for each agent and mode of its
+    shield. ``conditions`` is a sentence about the worlds and the harm count. The section is empty if ``rows`` is empty.
     """
     if not rows:
         return Section("Shield", ())
@@ -151,8 +151,8 @@ _OTHERS = {"Knows", "sampled_harm", "vehicle_1_shoved_m", "vehicle_1_shoved_far_
 class Report:
     """Content of the HTML report of an evaluation.
 
-    ``html`` is the text of the page, ``write`` writes the page to a file, and ``driven`` returns the report with
-    episodes to watch.
+    ``html`` is the text of the page, and ``write`` writes the page to a file. ``driven`` returns a new report that also
+    has episodes to watch.
     """
 
     title: str  # title of the page
@@ -173,7 +173,7 @@ class Report:
     versions: Mapping[str, str] = field(default_factory=dict)  # versions of software, by name; printed unchanged
 
     def driven(self, agents: Mapping[str, Driver], *, on_agent: Callable[[str], None] | None = None) -> Report:
-        """Return the report with episodes to watch and with the section about shields.
+        """Return a new report that also has episodes to watch and the section about shields.
 
         For the episodes, every agent drives some worlds again (see ``choose_shown``). The section about shields
         compares the modes of each shield in the first ``SHIELD_WORLDS`` worlds.
@@ -206,8 +206,8 @@ class Report:
     def about(self) -> str:
         """Name of the agent that the page is mainly about.
 
-        The name is ``focus`` if ``focus`` is not empty; otherwise the last agent with a trained policy; if there is
-        none, the last agent.
+        If ``focus`` is not empty, this agent is ``focus``. If ``focus`` is empty, this agent is the last one with a
+        trained policy, or the last one of all if no agent has a trained policy.
         """
         learned = [row.agent for row in self.rows if row.policy_sha256]
         return self.focus or (learned or [row.agent for row in self.rows] or [""])[-1]
@@ -254,10 +254,11 @@ class Report:
 
     @property
     def first_sentence(self) -> str:
-        """Sentence at the top of the page, which compares the agent's harm with full braking and the best known harm.
+        """First sentence of the page, which compares the harm of one agent with full braking and the best known harm.
 
-        The sentence names the other tests in which the agent does at least as much harm as full braking. If there is no
-        such test, the sentence states in how many worlds the agent does more harm than full braking.
+        The sentence is about the agent ``about``. If this agent does about as much harm as full braking, or more, in
+        some other tests, the sentence names these tests. If there are no such tests, the sentence says in how many
+        worlds the agent does more harm than full braking.
         """
         rows, harm = {row.agent: row for row in self.rows}, NAMES[self.harm_count]
         if self.about not in rows:
@@ -279,11 +280,11 @@ class Report:
         return f"{name} does {words} full braking ({numbers}){joined}{fails or 'in no world more'}."
 
     def _fails(self, harm: str) -> str:
-        """Return a clause that says where the agent fails, or an empty text if it fails nowhere.
+        """Return the end of ``first_sentence``, which names tests or worlds in which the agent does badly, if any.
 
-        The agent fails in another test if its harm in that test is not clearly less than that of full braking. If the
-        agent fails in no other test, the clause states in how many worlds of the evaluation the agent does more harm
-        than full braking. ``harm`` is the measure to compare, for instance ``total_harm``.
+        The text names the other tests in which the agent's harm is not clearly less than the harm of full braking (see
+        ``_change``). If there is no such test, the text says in how many worlds of the evaluation the agent does more
+        harm than full braking. ``harm`` is the name of the compared measure, for instance ``total_harm``.
         """
         reasons = []
         for title, _, others in self.tests:
@@ -321,7 +322,7 @@ class Report:
     def _episodes(self) -> Section:
         """Return the section with episodes to watch.
 
-        Notes in the section name the agents that drove differently here than in the evaluation.
+        If an agent drove differently in these episodes than in the evaluation, a note in the section names this agent.
         """
         evaluation, played = self.evaluation, self.played
         if not played:
@@ -354,15 +355,15 @@ class Report:
 
 
 def _words(estimate: Estimate | None) -> str:
-    """Return an estimated mean as text, without its interval; a dash if ``estimate`` is None."""
+    """Return the value of ``estimate`` as text, without its interval; a dash if ``estimate`` is None."""
     return Column("").show(estimate).value
 
 
 def _change(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
-    """Return "less", "more" or "as much": the harm of an agent compared with full braking in the same worlds.
+    """Compare the harm of an agent with the harm of full braking in the same worlds: "less", "more" or "as much".
 
-    The result is "as much" if the interval of the difference contains 0, or if there are several worlds but no
-    interval. ``harm`` is the measure to compare, for instance ``total_harm``.
+    The result is "as much" if the 95 % interval of the difference contains 0, or if no interval is known although there
+    are several worlds. ``harm`` is the name of the compared measure, for instance ``total_harm``.
     """
     difference = row[f"{harm}_difference"]
     unknown = difference is None or (difference.interval is None and row.episodes > 1)
@@ -382,17 +383,17 @@ def _short_table(rows: SummaryTable) -> Part:
 
 
 def _remarks(rows: SummaryTable) -> list[str]:
-    """Return those notes about ``rows`` that are important remarks."""
+    """Return the important notes about ``rows`` as texts, without the notes in small print."""
     return [text for kind, text in SummaryTable(rows).notes() if kind == "note"]
 
 
 def _measured(rows: SummaryTable, because: str = "") -> list[Part]:
-    """Return parts with the conditions under which ``rows`` were measured, and with tables of all measures.
+    """Return parts of the page: the conditions under which ``rows`` were measured, and tables of all measures.
 
     The tables are hidden until the reader clicks on their title.
 
-    The first table also contains the paper's rows if ``rows`` has them. ``because`` is a sentence that says why columns
-    are empty.
+    If ``rows`` also contains results that the paper prints, the first table shows these results. ``because`` is a
+    sentence that says why some columns are empty.
     """
     ours = SummaryTable(rows)
     whole, notes, empty = rows.sheet(), ours.notes(), _empty(rows)
@@ -412,14 +413,14 @@ def _measured(rows: SummaryTable, because: str = "") -> list[Part]:
 
 
 def _empty(rows: SummaryTable) -> list[str]:
-    """Return the headings of those columns of a summary in which no row has a value."""
+    """Return the headings of those columns of the table ``rows`` in which every cell is empty."""
     sheet = rows.sheet()
     filled = sheet.filled()
     return [name for k, name in enumerate(sheet.headings) if k not in filled]
 
 
 def _table(sheet: Sheet, caption: str, names: set[str]) -> Part:
-    """Return a table with the first column of ``sheet`` (the agent) and those columns in ``names`` that have values.
+    """Return a table with the agents, and with those columns of ``sheet`` that are in ``names`` and have values.
 
     ``caption`` is the title of the table.
     """
@@ -448,9 +449,9 @@ def write_evaluation(
     Args:
         path: path of the HTML file.
         evaluation: evaluation of the agents.
-        rows: summary of the evaluation.
-        agents: evaluated agents, by name; they drive some worlds again for the episode player.
-        harm_count: harm count that the agents make small, ``first`` or ``total``.
+        rows: results of the evaluation, one row for each agent.
+        agents: evaluated agents, by name. These agents drive some worlds again for the episode player.
+        harm_count: harm count that the agents minimise, ``first`` or ``total``.
         force: whether an existing file is replaced.
         tell: function that is called with the number of agents that have driven the worlds again, and the number of all
             agents.

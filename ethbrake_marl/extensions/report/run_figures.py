@@ -1,4 +1,4 @@
-"""Figures of a run: the learning curve, and harm against the sum of the gaps at the alert."""
+"""Figures of ``ethbrake run``: the learning curve, and harm against the sum of the gaps at the alert."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ def learning_curve(
     references: Sequence[SummaryRow] = (),
     caption: str = "",
 ) -> Figure:
-    """Draw first-impact harm, total harm and collision rate of a policy or team over its training.
+    """Draw first-impact harm, total harm and collision rate of a policy or team against the number of training steps.
 
     Raises ``InvalidInput`` if ``points`` is empty.
 
     Args:
         points: evaluations, earliest first; each has ``steps``, ``first_impact_harm``, ``total_harm`` and
             ``collision_rate``.
-        learned: name of the policy or team that the legend shows.
-        references: summaries of other agents, whose results are drawn as horizontal lines.
+        learned: name of the policy or team in the legend.
+        references: results of other agents, drawn as horizontal lines.
         caption: text below the figure.
 
     """
@@ -67,13 +67,13 @@ def learning_curve(
 def harm_against_total_gap(evaluation: Evaluation, *, agents: Sequence[str] | None = None, bins: int = 12) -> Figure:
     """Draw mean first-impact harm and mean total harm against the sum of the gaps at the alert.
 
-    The figure has one line for each agent. A band around the line shows the 95 % interval. Raises ``InvalidInput`` if
-    an agent is unknown or ``bins`` is below 1.
+    The figure has one line for each agent. A band around each line shows the 95 % interval of the mean. Raises
+    ``InvalidInput`` if an agent is unknown or ``bins`` is below 1.
 
     Args:
         evaluation: evaluation of the agents.
         agents: names of the agents to draw; None: all agents.
-        bins: number of intervals of equal width into which the worlds are grouped by their sum of gaps.
+        bins: number of intervals of equal width into which the range of the sum of the gaps is divided.
 
     """
     if not bins >= 1:

@@ -55,13 +55,14 @@ def write_worlds(path: Path, scenario: Scenario, sample: Sample, *, seed: int, f
 def worlds_figure(scenario: Scenario, sample: Sample, *, seed: int) -> Figure:
     """Draw distributions and scatter plots of the quantities that vary between the worlds, and three worlds to scale.
 
-    The scatter plots prefer quantities of the first learner and of the gap ahead of it. If the scenario is a mixture,
-    the colours show from which scenario a world is drawn; otherwise they show the type of the first learner.
+    The scatter plots prefer quantities of the first learner and of the gap ahead of it. If ``scenario`` is a mixture of
+    scenarios, the colour of a point shows from which scenario its world is drawn. Otherwise the colour shows the
+    vehicle type of the first learner.
 
     Args:
         scenario: scenario of the worlds.
         sample: worlds to draw.
-        seed: seed of the list of worlds, for the caption.
+        seed: seed of the list of worlds, which the caption states.
 
     """
     worlds, panels = sample.worlds, drawn_alike(sample.worlds, scenario)
@@ -88,10 +89,10 @@ def worlds_figure(scenario: Scenario, sample: Sample, *, seed: int) -> Figure:
 
 
 def _paired(worlds: Worlds, focus: int) -> dict[str, Floats]:
-    """Return the quantities to draw in scatter plots, as a dictionary: label of the quantity -> values [n].
+    """Return the quantities to draw in scatter plots, as a dictionary from label to values [n].
 
-    Quantities that have the same value in all worlds are omitted. Quantities of the vehicles and pairs nearest to the
-    vehicle ``focus`` are preferred. At most ``_MOST_PAIRED`` quantities are returned.
+    Quantities that have the same value in all worlds are omitted. At most ``_MOST_PAIRED`` quantities are returned;
+    quantities of vehicles and pairs near the vehicle ``focus`` are chosen first.
     """
     pairs: list[tuple[int, str, Floats]] = []
     for rule in QUANTITY.of(worlds).values():
@@ -108,10 +109,10 @@ def _paired(worlds: Worlds, focus: int) -> dict[str, Floats]:
 
 
 def _distributions(panels: Mapping[str, Mapping[str, Floats]], part: Any) -> None:
-    """Draw a panel for each quantity, with one histogram for all vehicles that have the same distribution.
+    """Draw a panel for each quantity. Vehicles with the same distribution of the quantity share one histogram.
 
-    ``panels`` maps each quantity to a dictionary: name of a group of vehicles -> values in this group, [n, ...].
-    ``part`` is a sub-figure of matplotlib.
+    ``panels`` maps the key of each quantity to its histograms: name of the vehicles -> values of these vehicles, [n,
+    ...]. ``part`` is a sub-figure of matplotlib.
     """
     columns = min(len(panels), _ABREAST)
     every = part.subplots(-(-len(panels) // columns), columns, squeeze=False).ravel()

@@ -1,4 +1,4 @@
-"""Figure of trainings with several seeds: mean of a quantity at each training step, and spread between seeds."""
+"""Figure of training runs with several seeds: mean of a quantity at each training step, and spread between seeds."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from ethbrake_marl.physics.state import Floats
 
 @dataclass(frozen=True, slots=True)
 class SeedCurve:
-    """Values of one quantity at k steps of several trainings that differ only in their seeds."""
+    """Values of one quantity at k steps of several training runs that differ only in their seeds."""
 
     steps: Floats  # [k] training steps (or another quantity of the x axis)
     values: Floats  # [seeds, k] values of the quantity
 
     @classmethod
     def of(cls, trainings: Sequence[Mapping[int, float]]) -> Self:
-        """Return the values of several trainings at the steps that all trainings have in common.
+        """Return the values of several training runs at the steps that all runs have in common.
 
-        Each training is a dictionary: step -> value of the quantity. Raises ``InvalidInput`` if the trainings have no
-        step in common.
+        ``trainings`` has one dictionary for each run, from training step to value of the quantity. Raises
+        ``InvalidInput`` if the runs have no step in common.
         """
         common = sorted(set.intersection(*(set(training) for training in trainings))) if trainings else []
         if not common:
@@ -49,17 +49,17 @@ def seed_curves(
 ) -> Figure:
     """Draw a panel for each quantity, with a line for each recipe: the mean over the seeds.
 
-    A band shows plus and minus one standard deviation.
+    A band around each line shows plus and minus one standard deviation over the seeds.
 
     Raises ``InvalidInput`` if there are no panels, or if a panel has no curves.
 
     Args:
-        panels: label of a quantity -> name of a recipe -> curve.
-        logarithmic: labels of the quantities whose panels have a logarithmic axis. The axis of a panel stays linear if
-            one of its values is not positive.
+        panels: nested mapping: label of a quantity -> name of a recipe -> values of the quantity.
+        logarithmic: labels of the quantities whose panels have a logarithmic axis. Even these panels have a linear axis
+            if one of their values is not positive.
         caption: text below the figure.
         x_label: label of the x axis.
-        known: label of a quantity -> best known value, drawn as a dashed line; None: no lines.
+        known: best known value of each quantity, by the label of the quantity, drawn as a dashed line; None: no lines.
 
     """
     if not panels or not all(panels.values()):

@@ -46,13 +46,13 @@ _NO_DATES: dict[str, dict[str, None]] = {  # metadata to omit, because they diff
 
 
 class ShownFigure(Figure):
-    """Figure that a notebook displays if it is the value of the last line of a cell; pyplot is not needed."""
+    """Figure that a notebook displays when the last line of a notebook cell returns it, without pyplot."""
 
     def draw(self, renderer: RendererBase) -> None:
         """Draw the figure with matplotlib's ``renderer``.
 
-        When a file is saved, matplotlib calls this method twice and uses only the second picture. The first call
-        therefore only computes the layout.
+        When matplotlib saves a figure to a file, it calls this method twice and uses only the second picture. Therefore
+        the first of these two calls only computes the layout.
         """
         engine = self.get_layout_engine()
         if self.axes and isinstance(engine, ConstrainedLayoutEngine) and self.canvas.is_saving():
@@ -67,7 +67,7 @@ class ShownFigure(Figure):
 def series_style(number: int) -> dict[str, Any]:
     """Return the style of curve ``number`` (from 0), as keyword arguments of matplotlib's ``plot``.
 
-    Styles repeat after seven curves.
+    The styles repeat: curve 7 has the style of curve 0.
     """
     k = number % len(COLOURS)
     return {"color": COLOURS[k], "marker": MARKERS[k], "linestyle": DASHES[k], "linewidth": 1.6, "markersize": 4.5}
@@ -76,7 +76,8 @@ def series_style(number: int) -> dict[str, Any]:
 def label_text(text: str, most: int = 40) -> str:
     """Return ``text`` as a label of at most ``most`` characters.
 
-    Dollar signs start no formula, and characters that the font lacks are escaped.
+    Dollar signs are shown as dollar signs (they do not start a formula), and characters that the font lacks are
+    escaped.
     """
     signs = font_signs()
     label = "".join(c if ord(c) in signs else c.encode("unicode_escape").decode() for c in plain_text(text))
@@ -108,7 +109,7 @@ def style_axes(axes: Axes, labelsize: float = 9) -> None:
 def new_panels(size_in: tuple[float, float], rows: int = 1, columns: int = 1, **how: Any) -> tuple[Figure, list[Axes]]:
     """Return a figure with ``rows`` times ``columns`` panels, and the axes of the panels, row by row.
 
-    ``size_in`` is the width and height in inches. ``how`` are further arguments of matplotlib's ``subplots``.
+    ``size_in`` is the width and height in inches. ``how`` are further keyword arguments for matplotlib's ``subplots``.
     """
     figure = new_figure(*size_in)
     panels = list(figure.subplots(rows, columns, squeeze=False, **how).ravel())
@@ -120,7 +121,7 @@ def new_panels(size_in: tuple[float, float], rows: int = 1, columns: int = 1, **
 def name_axes(axes: Axes, title: str = "", x: str = "", y: str = "") -> None:
     """Set the title of a panel and the labels ``x`` and ``y`` of its axes.
 
-    An empty text leaves the title or label unchanged.
+    If ``title``, ``x`` or ``y`` is empty, this title or label stays unchanged.
     """
     in_style = ((title, partial(axes.set_title, loc="left"), 10), (x, axes.set_xlabel, 9), (y, axes.set_ylabel, 9))
     for text, write, size in in_style:
@@ -142,10 +143,10 @@ def finish(
     Args:
         figure: figure to change.
         caption: text below the figure.
-        legend: panel whose curves appear in the legend of the whole figure; None: no legend.
+        legend: the legend of the figure lists the curves of this one panel; None: no legend.
         columns: number of columns in the legend.
         fontsize: font size of the legend.
-        loc: place of the legend.
+        loc: position of the legend.
 
     """
     if legend is not None:
@@ -170,7 +171,7 @@ def add_caption(figure: Figure, text: str) -> None:
 def picture_ending(path: str | Path) -> str:
     """Return the ending of a picture's file name: .png, .svg or .pdf.
 
-    Raises ``InvalidInput`` if the name ends differently.
+    Raises ``InvalidInput`` for any other ending.
     """
     ending = Path(path).suffix.lower()
     if ending not in _NO_DATES:
@@ -207,8 +208,8 @@ TITLES = {"first": "First-impact harm (m²/s²)", "total": "Total harm (m²/s²)
 
 
 def plain(value: float, _: int) -> str:
-    """Return the number at a tick of an axis as text such as 1000, not as a power of ten.
+    """Return ``value``, the number at a tick of an axis, as text such as 1000, not as a power of ten.
 
-    The second argument, the index of the tick, is not used.
+    Matplotlib also passes the index of the tick, which is not used.
     """
     return f"{value:g}"

@@ -1,4 +1,4 @@
-"""Put a figure into an HTML page as inline SVG."""
+"""Convert a figure to an SVG element inside an HTML page."""
 
 from __future__ import annotations
 
@@ -62,12 +62,13 @@ def inline_svg(figure: Figure | bytes, label: str, *, recolour: bool = True) -> 
 
     The SVG element contains no caption and no ``style`` attributes, because the security policy of the page forbids
     such attributes. All ids of SVG elements get a prefix, so that two figures of a page have no id in common. Raises
-    ``InvalidInput`` if the bytes contain elements or attributes that figures of this package do not have: somebody may
-    have changed the file.
+    ``InvalidInput`` if ``figure`` is an SVG file with elements or attributes that this package never writes, because
+    somebody may have changed the file.
 
     Args:
         figure: figure of matplotlib, or the bytes of an SVG file with a figure.
-        label: description for readers who cannot see the figure; the prefix of the ids depends on this text, too.
+        label: description for readers who cannot see the figure. Two figures with different descriptions have different
+            ids.
         recolour: True: use the colours of the page, light or dark; False: keep the colours of the figure.
 
     """
@@ -142,9 +143,9 @@ def _is_ours(svg: bytes) -> bool:
 
 
 def _restyle(element: ElementTree.Element, recolour: bool) -> None:
-    """Replace each declaration in the ``style`` attribute of ``element`` by an attribute of the same name.
+    """Replace the ``style`` attribute of ``element`` by one attribute for each CSS property in it.
 
-    If ``recolour`` is true, the colours become those of the page.
+    If ``recolour`` is true, the colours of the figure are replaced by the colours of the page.
     """
     for declaration in element.attrib.pop("style", "").split(";"):
         name, colon, value = declaration.partition(":")

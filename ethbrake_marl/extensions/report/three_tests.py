@@ -24,7 +24,7 @@ TESTS = {
 def is_as_shipped(scenario: Scenario) -> bool:
     """Return whether the scenario equals the shipped scenario of the same name.
 
-    The two may differ in title, description and source.
+    Titles, descriptions and sources are not compared.
     """
     one, other = (
         each.model_dump(exclude={"title", "description", "source"}) for each in (scenario, load_scenario(scenario.name))
@@ -33,7 +33,7 @@ def is_as_shipped(scenario: Scenario) -> bool:
 
 
 def other_tests(scenario: Scenario) -> tuple[Scenario, ...]:
-    """Return the other two tests in ``TESTS`` if ``scenario`` is one of the three tests as shipped; else no tests."""
+    """If ``scenario`` is one of the three shipped ``TESTS``, return the other two; else return an empty tuple."""
     if scenario.name not in TESTS or not is_as_shipped(scenario):
         return ()
     return tuple(load_scenario(name) for name in TESTS if name != scenario.name)
@@ -43,13 +43,14 @@ _KEPT = ("collision_rate", "first_impact_harm", "total_harm")  # columns of the 
 
 
 def brief(table: SummaryTable, beside: Mapping[str, SummaryTable]) -> Sheet:
-    """Return a short table with the collision rate and both harms of each agent, and both harms on the other tests.
+    """Return a short table of each agent's collision rate and harms, and of its harms on the other tests.
 
-    The notes about the results are below the table. The paper's rows and all other measures are omitted.
+    *Harms* are first-impact harm and total harm. The notes about the results are below the table. The table omits all
+    other measures, and results that the paper prints.
 
     Args:
-        table: summary of the agents on the scenario of the run.
-        beside: summaries of the agents on other tests, by name of the test.
+        table: summary of the agents' results on the scenario of the run.
+        beside: summaries of the agents' results on the other tests, by name of the test.
 
     """
     ours = SummaryTable(table)

@@ -52,8 +52,8 @@ def reproduce_command(
     """Reproduce the paper's results, and compare ours with them.
 
     An item is a figure or a table of the paper. The command prints how long the work takes, then reproduces each item.
-    It writes one page (index.html) with all items and, for each item, figures and data. A verdict says whether our
-    results agree with the paper, differ, or cannot agree. After an interruption, repeat the command to continue.
+    The command writes one page (index.html) with all items and, for each item, figures and data. A verdict says whether
+    our results agree with the paper, differ, or cannot agree. After an interruption, repeat the command to continue.
     """
     with Out(as_json=as_json, force=force, remains=REMAINS) as out:
         from ethbrake_marl.extensions.reproduction.folder import Reproduction

@@ -1,6 +1,6 @@
 """Reproduce the paper's learning curves at high and low delay.
 
-The labels of these figures in the paper's source are ``fig:ppo_sac_high_latency`` and ``fig:ppo_sac_low_latency``.
+The labels of the two figures in the paper's source are ``fig:ppo_sac_high_latency`` and ``fig:ppo_sac_low_latency``.
 """
 
 from __future__ import annotations
@@ -93,54 +93,54 @@ def _shipped_ends(settings: Reproduction) -> Made:
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """Trainings of one recipe at one delay, one for each seed."""
+    """Training runs of one recipe at one delay, one run for each seed."""
 
     returns: SeedCurve  # mean return of training episodes (exploration included) against decisions
     harm: SeedCurve  # first-impact harm on the fixed list (m2/s2) against decisions
 
     @property
     def last_returns(self) -> Floats:
-        """Mean return over the last tenth of the updates of each training, [seeds]."""
+        """Mean return of each training run over the last tenth of its updates, [seeds]."""
         return np.asarray(self.returns.values[:, -max(len(self.returns.steps) // 10, 1) :].mean(axis=1))
 
     @property
     def rise(self) -> float:
-        """Rise of the return from the first update to the last tenth of the updates, as the mean over the trainings."""
+        """Mean return over the last tenth of the updates, minus the return at the first update (mean over the runs)."""
         return float((self.last_returns - self.returns.values[:, 0]).mean())
 
     @property
     def decisions_to_converge(self) -> Floats:
-        """Number of decisions until the harm has fallen by 90 % (``_DONE``) of its largest fall, [seeds]."""
+        """Number of decisions until a run first reaches 90 % (``_DONE``) of its largest decrease of harm, [seeds]."""
         first, least = self.harm.values[:, :1], self.harm.values.min(axis=1, keepdims=True)
         there = self.harm.values <= first - _DONE * (first - least)
         return np.asarray(self.harm.steps[np.argmax(there, axis=1)])
 
     def returns_at(self, shares: Floats) -> Floats:
-        """Return the mean return at k points of each training, [seeds, k].
+        """Return the mean return of each training run at k points of the run, [seeds, k].
 
-        ``shares`` [k] are the points as shares of the training: 0 is its start and 1 its end.
+        ``shares`` [k] gives each point as a share of the run: 0 is the start of the run and 1 its end.
         """
         steps = shares * self.returns.steps[-1]
         return np.array([np.interp(steps, self.returns.steps, own) for own in self.returns.values])
 
     def unrest(self, points: int) -> Floats:
-        """Return how much the return of each training fluctuates in its second half, [seeds].
+        """Return how much the return of each training run fluctuates in the second half of the run, [seeds].
 
-        The return is read at ``points`` equally spaced points of the second half, so trainings of different lengths can
-        be compared. The result is the standard deviation of the changes from one point to the next, divided by
-        ``rise``.
+        The return is read at ``points`` equally spaced points of the second half, so runs of different lengths can be
+        compared. The result is the standard deviation of the changes from one point to the next, divided by the
+        absolute value of ``rise`` (the rise of the return in the whole run).
         """
         return np.asarray(np.diff(self.returns_at(np.linspace(0.5, 1.0, points)), axis=1).std(axis=1) / abs(self.rise))
 
     @property
     def still_rising(self) -> float:
-        """Rise of the return in the last quarter of the training, as a share of ``rise`` (mean over the trainings)."""
+        """Rise of the return in the last quarter of a run (mean over the runs), as a share of the whole ``rise``."""
         before = self.returns_at(np.array([0.75]))[:, 0]
         return float((self.returns.values[:, -1] - before).mean()) / abs(self.rise)
 
     @property
     def spread(self) -> Floats:
-        """Standard deviation of the return among the trainings, at k steps in the second half of training, [k]."""
+        """Standard deviation of the return between the runs, at k steps in the second half of the runs, [k]."""
         return np.asarray(self.returns.values[:, len(self.returns.steps) // 2 :].std(axis=0, ddof=1))
 
 
@@ -148,10 +148,10 @@ Courses = Mapping[str, Course]  # trainings by recipe
 
 
 def reproduce_curves(delay: str, settings: Reproduction) -> Made:
-    """Reproduce the paper's learning curves at one delay (``high`` or ``low``) with the trainings of ``--full``.
+    """Reproduce the paper's learning curves at one delay (``high`` or ``low``) from the training runs of ``--full``.
 
-    Returns verdicts, tables, figures and data. Without these trainings, there are no curves, and the tables show
-    results of shipped policies.
+    Returns verdicts, tables, figures and data. If nothing was trained with ``--full``, there are no curves, and the
+    tables show results of shipped policies.
     """
     courses = {
         each: {
@@ -225,7 +225,7 @@ def reproduce_curves(delay: str, settings: Reproduction) -> Made:
 def _judge(delay: str, courses: Mapping[str, Courses]) -> list[Verdict]:
     """Return verdicts on the paper's statements about the learning curves at one delay (``high`` or ``low``).
 
-    ``courses`` maps each delay to its trainings: name of the recipe -> trainings.
+    ``courses`` contains the training runs at each delay, by name of the recipe.
     """
     own, high, low = courses[delay], courses[HIGH], courses[LOW]
     if not own:

@@ -29,8 +29,8 @@ def estimates_figure(
         panels: nested mapping: title of the panel -> label of the series -> x (a number or a text) -> estimate.
         y_label: label of the y axis.
         caption: text below the figure.
-        x_label: label of the x axis. With a label, each x is a number, and lines with bands are drawn. Without a label,
-            each x is a text, and groups of bars are drawn.
+        x_label: label of the x axis. If ``x_label`` is given, the x values must be numbers, and lines with bands are
+            drawn. If ``x_label`` is empty, the x values must be texts, and groups of bars are drawn.
 
     """
     figure, every = new_panels((4.6 * len(panels), 4.2), columns=len(panels), sharey=True)
@@ -56,10 +56,12 @@ def estimates_figure(
 
 
 def road_figure(records: Mapping[str, EpisodeRecord], *, caption: str) -> Figure:
-    """Draw the positions of all vehicles on the road as the paper does. Each episode has a panel, each vehicle a row.
+    """Draw the positions of all vehicles on the road as the paper does.
 
-    An arrow marks the position every ten time steps. Dashed lines connect the positions of the vehicles at the same
-    time.
+    Each episode has a panel, and each vehicle has a row in the panel.
+
+    An arrow marks the position of a vehicle every ten time steps. Dashed lines connect the positions of the vehicles at
+    the same time.
 
     Args:
         records: episodes; the key of an episode is the title of its panel.
@@ -83,7 +85,9 @@ def road_figure(records: Mapping[str, EpisodeRecord], *, caption: str) -> Figure
 
 
 def _in_pairs(panels: int, height_in: float, x: str, y: str) -> tuple[Figure, list[Axes]]:
-    """Return a figure with two panels in each row, and the list of its panels. All panels have the same scales.
+    """Return a figure with two panels in each row, and the list of the axes of its panels.
+
+    All panels have the same scales.
 
     Args:
         panels: number of panels.
@@ -102,7 +106,7 @@ def _in_pairs(panels: int, height_in: float, x: str, y: str) -> tuple[Figure, li
 
 
 def profiles_figure(panels: Mapping[str, Mapping[str, EpisodeRecord]], *, caption: str) -> Figure:
-    """Draw the command of the controlled vehicle over time, in one or more panels.
+    """Draw the command of the controlled vehicle against time, in one or more panels.
 
     Args:
         panels: nested mapping: title of the panel -> label of the curve -> recorded episode.
@@ -123,10 +127,10 @@ def profiles_figure(panels: Mapping[str, Mapping[str, EpisodeRecord]], *, captio
 def changes_figure(changes: Mapping[str, Mapping[str, Estimate]], *, x_label: str, caption: str) -> Figure:
     """Draw the effects of several changes with their 95 % intervals.
 
-    There is one row for each change, with one mark for each label.
+    The figure has one row for each change, with one marker for each label.
 
     Args:
-        changes: nested mapping: name of the change (row) -> label (for instance a strategy) -> effect.
+        changes: nested mapping: name of the change -> label (for instance a strategy) -> effect of the change.
         x_label: label of the x axis.
         caption: text below the figure.
 

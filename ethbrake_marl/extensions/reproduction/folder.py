@@ -1,4 +1,7 @@
-"""Settings of a reproduction, and types for items and results. An item is a figure or a table of the paper."""
+"""Settings of a reproduction of the paper, and types for items and results.
+
+An *item* is a figure or a table of the paper.
+"""
 
 from __future__ import annotations
 
@@ -50,17 +53,16 @@ class Reproduction:
     docs: Path | None = None  # JSON file to which all results are written; None: no such file
 
     def __post_init__(self) -> None:
-        """Raise ``InvalidInput`` if the name of ``docs`` does not end in ``.json`` or the file cannot be written."""
+        """Raise ``InvalidInput`` if the file ``docs`` cannot be written, or if its name does not end in ``.json``."""
         if self.docs is not None:
             if self.docs.suffix != ".json":
                 raise InvalidInput(f"{self.docs}: the name of the file must end in .json")
             check_target(self.docs, force=True)
 
     def seeds_of(self, wanted: Collection[str]) -> list[tuple[Group, str, list[Path]]]:
-        """Return the trainings of some groups, each as (group, name of the recipe, list with the folder of each seed).
+        """Return the training runs of some groups, for each recipe as (group, name of the recipe, folder of each seed).
 
-        ``wanted`` are the names of the groups. The result has one entry for each recipe of each group. In mode
-        ``quick`` the result is empty.
+        ``wanted`` are the names of the groups of training runs. In mode ``quick`` the result is empty.
         """
         return [
             (
@@ -74,9 +76,9 @@ class Reproduction:
         ]
 
     def trained(self, wanted: Collection[str]) -> dict[str, list[Path]]:
-        """Return the recipes whose trainings are finished for every seed: ``group/recipe`` -> folder of each seed.
+        """Find the recipes whose training runs are finished for every seed: ``group/recipe`` -> folder of each seed.
 
-        ``wanted`` are the names of the groups whose trainings are checked.
+        ``wanted`` are the names of the groups in which recipes are checked.
         """
         return {
             f"{group.name}/{name}": paths
@@ -85,9 +87,9 @@ class Reproduction:
         }
 
     def seconds_left(self, wanted: Collection[str]) -> float:
-        """Return the time (s) that one core needs for the remaining trainings of the groups named in ``wanted``.
+        """Estimate the time (s) in which one core does all unfinished training runs of the groups named in ``wanted``.
 
-        For a training that has begun, the time of the whole training is added.
+        A run that has begun is counted with its whole time, not with its remaining time.
         """
         return sum(
             group.trained[name][0].decisions / group.trained[name][0].per_s
@@ -97,9 +99,9 @@ class Reproduction:
         )
 
     def train(self, wanted: Collection[str]) -> bool:
-        """Run those trainings of the groups named in ``wanted`` that are not finished.
+        """Do those training runs of the groups named in ``wanted`` that are not finished.
 
-        Return False if Ctrl-C stopped a training.
+        Return False if Ctrl-C stopped a run.
         """
         from ethbrake_marl.extensions.reproduction.learning_curves import LearningCurves
 
@@ -112,7 +114,7 @@ class Reproduction:
         return True
 
     def cost(self, items: Sequence[Item]) -> str:
-        """Return a message that says which work is left for ``items`` and how long it takes."""
+        """Return a message that says how much work is left for ``items``, and how long this work takes."""
         wanted = {group for item in items for group in item.trained} if self.mode == "full" else set()
         cost = (
             f"to do: {count_of(len(items), 'item')}, at most about {sum(item.most_s for item in items)} s of one core"
@@ -123,7 +125,7 @@ class Reproduction:
 
 @model(frozen=True, config=WRITTEN)
 class Parameter:
-    """A quantity that affects a figure or table of the paper, and the origin of its value."""
+    """Name and value of a quantity that affects a figure or table of the paper, and the origin of this value."""
 
     name: str  # name of the quantity
     value: str  # its value as text, with unit
@@ -131,13 +133,16 @@ class Parameter:
 
 
 def stated(name: str, value: str, where: str) -> Parameter:
-    """Return a parameter whose value the paper states at the place ``where``. Empty: the value is our default."""
+    """Return a parameter whose value the paper states at the place ``where``.
+
+    If ``where`` is empty, the value is our default.
+    """
     return Parameter(name, value, f"stated in the paper ({where})") if where else Parameter(name, value)
 
 
 @model(frozen=True, config=WRITTEN)
 class Table:
-    """A table as it is stored in a result: headings, and cells as text."""
+    """A table in the stored result of an item: headings, and cells as text."""
 
     title: str  # title above the table
     head: Sequence[str]  # headings of the columns
@@ -156,7 +161,7 @@ class Drawn:
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """Result of reproducing a figure or table of the paper, before it is written to files."""
+    """Reproduction of a figure or table of the paper, before this result is written to files."""
 
     verdicts: Sequence[Verdict]  # verdict on each comparison with the paper
     parameters: Sequence[Parameter]  # quantities that affect the result
@@ -168,7 +173,7 @@ class Made:
 
 @model(frozen=True, config=WRITTEN, kw_only=True)
 class Result:
-    """Result of reproducing a figure or table of the paper, as stored in a file and shown on pages."""
+    """Reproduction of a figure or table of the paper, as stored in a file and shown on pages."""
 
     name: str  # name on the command line; also the name of the folder
     labels: Sequence[str]  # labels in the source of the paper
@@ -191,7 +196,7 @@ class Result:
     def in_words(self) -> dict[str, Any]:
         """Return the result as mappings, lists and texts, for a JSON file.
 
-        In this form, each cell of a table is one text.
+        The JSON file contains each table cell as one text, with value and interval.
         """
         tables = [
             {**asdict(table), "rows": [[cell.in_words for cell in row] for row in table.rows]} for table in self.tables
@@ -216,8 +221,8 @@ class Item:
 def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     """Return the content of a CSV file with the headings ``head`` and the rows ``rows``.
 
-    An ``Estimate`` in a row fills three columns: value, and lower and upper end of the interval. ``head`` contains a
-    heading for each of them.
+    An ``Estimate`` in a row fills three columns: value, and lower and upper end of the interval. Therefore ``head``
+    contains three headings for an ``Estimate``.
     """
     parts = ([(e.value, *(e.interval or ("", ""))) if isinstance(e, Estimate) else (e,) for e in row] for row in rows)
     return csv_of([dict(zip(head, chain(*row), strict=True)) for row in parts], head)
@@ -244,14 +249,14 @@ FIRST_IMPACTS = stated("harm", "each pair's first impact", "sec:result, Experime
 
 
 def scenario_parameters(scenario: Scenario, **places: str) -> list[Parameter]:
-    """Return the quantities of a scenario as parameters.
+    """Return the main quantities of a scenario, such as gaps and masses, as a list of ``Parameter`` objects.
 
-    Each parameter names the place where the paper states the value.
+    Each ``Parameter`` names the place where the paper states the value.
 
     Args:
         scenario: the scenario.
-        places: key of the scenario -> place in the paper, instead of the place in ``_QUANTITIES``. An empty text means
-            that the value is our default.
+        places: place where the paper states the value, by key of the scenario. A missing key has the place in
+            ``_QUANTITIES``. If a place is empty, the paper does not state the value, and the value is our default.
 
     """
     content = scenario.model_dump(mode="json", exclude_none=True)
@@ -265,13 +270,13 @@ def scenario_parameters(scenario: Scenario, **places: str) -> list[Parameter]:
 
 
 def list_parameter(episodes: int, where: str = "") -> Parameter:
-    """Return one parameter that states the number of worlds and the seed of the evaluation list from which they come.
+    """Return a parameter that states the number of worlds, and the seed of the evaluation list that contains them.
 
-    The seed is our choice, because the paper only says "a fixed random seed".
+    The seed of the list is our choice, because the paper only says "a fixed random seed".
 
     Args:
         episodes: number of worlds.
-        where: place where the paper states this number; empty: the number is our default.
+        where: place where the paper states the number of worlds; if empty, the number is our default.
 
     """
     return stated("worlds", f"{episodes:,}, the first of the list of seed {LIST_SEED}", where)
@@ -295,7 +300,7 @@ def json_text(content: Mapping[str, Any]) -> bytes:
 
 
 def checked_result(content: Mapping[str, Any], where: Path | str, name: str) -> Result:
-    """Return the result that is stored in a result file.
+    """Check the content of a result file, and return the result.
 
     Raises ``InvalidInput`` if an entry is missing or wrong, or if the result belongs to another figure or table.
 

@@ -1,6 +1,7 @@
 """Reproduce figures of the paper that show harm against distance or delay.
 
-The figures with distance are ``Fig:Harm-ivds`` and ``Fig:hybrid illu``. The figure with delay is ``Fig:harm-delay``.
+In the paper's source, the figures of harm against distance have the labels ``Fig:Harm-ivds`` and ``Fig:hybrid illu``;
+the figure of harm against delay has the label ``Fig:harm-delay``.
 """
 
 from __future__ import annotations
@@ -57,9 +58,9 @@ _ENDS_M = (10.0, 12.0, 14.0, 16.0, 18.0, 20.0)  # limits of the groups, for the 
 def by_distance(evaluation: Evaluation) -> tuple[list[float], Groups]:
     """Group the worlds by the sum of the two gaps.
 
-    Return the mean sum in each group (m), and the harm of each strategy in each world of each group. The harm has the
-    form ``{"10-12 m": {"PPO": harm, ...}, ...}``, in which ``harm`` is an array with one value for each world of the
-    group. Groups without worlds are omitted.
+    Return the mean sum of the gaps in each group (m), and the harm of each strategy in each world of each group. The
+    harm has the form ``{"10-12 m": {"PPO": harm, ...}, ...}``, in which ``harm`` is an array with one value for each
+    world of the group. Groups without worlds are omitted.
     """
     total, each_harm = evaluation.worlds.gaps_m.sum(axis=1), harms(evaluation)
     inner, at, groups = np.digitize(total, _ENDS_M[1:-1]), [], {}
@@ -73,8 +74,8 @@ def by_distance(evaluation: Evaluation) -> tuple[list[float], Groups]:
 def less_in_each(groups: Groups, smaller: str, *larger: str) -> list[Less]:
     """Compare, in every group of worlds, the harm of strategy ``smaller`` with the harm of each strategy ``larger``.
 
-    The comparisons are paired by world. ``groups`` contains, for each group, the harm [n] of each strategy in the n
-    worlds of the group.
+    Each comparison is paired: the two strategies drive the same worlds. For each group of worlds, ``groups`` contains
+    the harm of each strategy in each of the n worlds, [n].
     """
     return [
         Less.of_harms(group if len(larger) == 1 else f"{group}, {other}", harm, smaller, other)
@@ -86,10 +87,10 @@ def less_in_each(groups: Groups, smaller: str, *larger: str) -> list[Less]:
 def _harm_table(title: str, groups: Groups, note: str) -> Sheet:
     """Return a table of mean harms with intervals.
 
-    It has a row for each strategy and a column for each group of worlds.
+    The table has a row for each strategy and a column for each group of worlds.
 
-    ``groups`` contains, for each group, the harm [n] of each strategy in the n worlds of the group. ``note`` is added
-    to the text below the table.
+    For each group of worlds, ``groups`` contains the harm of each strategy in each of the n worlds, [n]. ``note`` is
+    added to the text below the table.
     """
     strategies = next(iter(groups.values()))
     rows = [(name, *(mean(harm[name]) for harm in groups.values())) for name in strategies]
@@ -108,10 +109,10 @@ def over_distance(
 
     Args:
         stem: file name of the figure and of the data, without ending.
-        curves: name of the assumption on when Vehicle 2 may act -> result of ``by_distance``.
+        curves: results of ``by_distance``, by the name of the assumption on when Vehicle 2 may act.
         verdicts: verdicts on the paper's statements.
-        lines: names of the strategies to draw.
-        parameters: further parameters to list, in addition to the quantities of the scenario.
+        lines: names of the strategies that the figure shows.
+        parameters: parameters to list on the page in addition to the quantities of the scenario.
         episodes: number of worlds.
 
     """
@@ -191,8 +192,8 @@ _ONE, _LIST = "d = 7, 7 m; v = 20, 18, 20 m/s", "d = 5-10 m; v = 18-22 m/s"
 def reproduce_delays(settings: Reproduction) -> Made:
     """Reproduce the paper's figure of harm at three delays; return figures, tables and verdicts.
 
-    The first figure shows the harm in the one world of the paper's figure. The second figure shows the mean harm in
-    random worlds.
+    The paper's figure is about a single world. Our first figure shows the harm in this world, and our second figure the
+    mean harm in random worlds.
     """
     episodes = min(_DELAY_WORLDS, settings.episodes)
     curves: dict[tuple[str, str], Groups] = {}  # (description of the worlds, assumption) -> delay -> harm
@@ -245,6 +246,6 @@ def reproduce_delays(settings: Reproduction) -> Made:
 
 
 def _delay_name(scenario: Scenario) -> str:
-    """Return the name of a scenario's delay with the latencies of Vehicles 2 and 3, such as "low (0.1, 0.3 s)"."""
+    """Name a scenario's delay, and add the latencies of Vehicles 2 and 3: "low (0.1, 0.3 s)"."""
     _, middle, rear = scenario.model_dump()["latency_s"]
     return f"{scenario.name.removeprefix('paper-delay-')} ({middle:g}, {rear:g} s)"

@@ -1,6 +1,7 @@
 """Reproduce the paper's results on its hybrid, and on random worlds.
 
-The hybrid is in ``Fig:hybrid illu`` and ``Table:hybrid`` of the paper, the random worlds in ``Table:Random``.
+In the paper's source, the results on the hybrid have the labels ``Fig:hybrid illu`` and ``Table:hybrid``; the results
+on random worlds have the label ``Table:Random``.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ _ALONE, _REALISED, _AS_PRINTED = "policy alone", "hybrid, realised H*", "hybrid,
 def _drive_hybrid(name: str, settings: Reproduction, reading: Reading) -> Evaluation:
     """Evaluate E-V2X-BM, a policy that has not converged, and the paper's hybrid of the two.
 
-    The *hybrid* is the paper's Algorithm 1: at the alert it chooses whether E-V2X-BM or the policy drives.
+    The *hybrid* is the paper's Algorithm 1: at the alert the hybrid chooses whether E-V2X-BM or the policy drives.
 
     Args:
         name: name of the shipped scenario.
@@ -64,11 +65,11 @@ def _drive_hybrid(name: str, settings: Reproduction, reading: Reading) -> Evalua
 
 @lru_cache(maxsize=2 * len(READINGS))  # figure and table share the evaluations
 def _driven_hybrid(name: str, settings: Reproduction, reading: Reading, about: str) -> Evaluation:
-    """Evaluate the strategies of ``_drive_hybrid``, or return the evaluation from the cache.
+    """Return the evaluation that ``_drive_hybrid`` describes, from the cache if it is there.
 
-    ``about`` describes the policy that has not converged. The description is part of the cache key: if the training of
-    this policy ends after the first call, the trained policy replaces a shipped one, and the strategies are evaluated
-    again.
+    ``about`` is the description of the policy that has not converged. The description is part of the cache key. If the
+    training run of this policy ends after the first call, the trained policy replaces a shipped policy, the description
+    changes, and the strategies are evaluated again.
     """
     scenario, (policy, _) = reading.scenario(name), unconverged_policy(settings)
     agents: dict[str, Agent] = {
@@ -84,9 +85,10 @@ def reproduce_illustration(settings: Reproduction) -> Made:
     """Reproduce the paper's illustration of its hybrid; return figure, tables and verdicts.
 
     The figure shows the harm of E-V2X-BM, of a policy that has not converged, and of the hybrid of the two, against the
-    sum of the two gaps. The *hybrid* is the paper's Algorithm 1: at the alert it chooses whether E-V2X-BM or the policy
-    drives. The paper says that the hybrid "consistently selects the strategy that results in lower harm". The verdicts
-    check this statement in each world, and in groups of worlds.
+    sum of the two gaps. The *hybrid* is the paper's Algorithm 1: at the alert the hybrid chooses whether E-V2X-BM or
+    the policy drives. The paper says that the hybrid "consistently selects the strategy that results in lower harm".
+    The verdicts check in each world, and in groups of worlds, whether the hybrid does no more harm than E-V2X-BM and no
+    more harm than the policy.
     """
     curves, verdicts = {}, []
     for reading in READINGS:
@@ -114,8 +116,8 @@ def reproduce_illustration(settings: Reproduction) -> Made:
 def reproduce_hybrid_table(settings: Reproduction) -> Made:
     """Reproduce the paper's table of 5,000 episodes (``Table:hybrid``); return tables and verdicts.
 
-    The paper has two sets of initial speeds, and does not say which of them this table uses. Therefore our results
-    cover both sets.
+    The paper has two sets of initial speeds, and does not say which of them this table uses. Therefore we compute the
+    table for both sets of speeds.
     """
     ours = {
         "E-V2X-BM": (NAMES[PAIRWISE], NAMES[COUPLED]),

@@ -1,4 +1,4 @@
-"""Items of a reproduction: the paper's figures and tables, in the order of the paper."""
+"""Items of a reproduction: the paper's figures and tables in order, and last a table of what the paper leaves open."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ ITEMS = (  # in the order of the paper
 def read_results(folder: Path) -> list[Result]:
     """Return the results that are stored in ``folder``, in the order of the paper.
 
-    Raises ``InvalidInput`` if a result is damaged, or belongs to a different figure or table than its folder.
+    Raises ``InvalidInput`` if a result file is damaged, or if it lies in the folder of a different figure or table.
     """
     files = {item.name: folder / item.name / RESULT for item in ITEMS}
     return [checked_result(read_object(file), file, name) for name, file in files.items() if file.is_file()]

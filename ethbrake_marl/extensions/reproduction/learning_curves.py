@@ -47,9 +47,9 @@ AXES: dict[Against, tuple[str, str, type]] = {  # column, label of the axis, typ
 
 
 class LearningCurves(NamedTuple):
-    """Trainings of several recipes with several seeds on one scenario.
+    """Training runs of several recipes with several seeds on one scenario.
 
-    The folder of a training is ``folder/RECIPE-seedK``.
+    The folder of a training run is ``folder/RECIPE-seedK``.
     """
 
     scenario: Scenario  # scenario of all trainings
@@ -79,16 +79,16 @@ class LearningCurves(NamedTuple):
     def train(
         self, *, steps: int | None = None, settings: Sequence[str] = (), jobs: int = 1, tell: OnProgress | None = None
     ) -> bool:
-        """Train every recipe with every seed. Finished trainings are not repeated; unfinished trainings continue.
+        """Train every recipe with every seed. Finished training runs are not repeated; unfinished runs continue.
 
-        Returns False if Ctrl-C stopped the work. Before any training begins, raises ``InvalidInput`` if the folder
-        contains a different training. Later the method raises the exceptions of ``train_all``.
+        Returns False if Ctrl-C stopped the work. Raises the exceptions of ``train_all``; in particular, before any run
+        begins, ``InvalidInput`` if a folder contains a training run with other settings.
 
         Args:
-            steps: number of steps of each training; None: the number in the recipe.
-            settings: changes ``KEY=VALUE`` that were already applied to scenario and recipes; they are written into the
-                file ``config.json`` of each training.
-            jobs: number of trainings that run at the same time.
+            steps: number of steps of each training run; None: the number in the recipe.
+            settings: texts ``KEY=VALUE`` of the changes that scenario and recipes already contain. These texts are only
+                written into the file ``config.json`` of each training run.
+            jobs: number of training runs at the same time.
             tell: function that is called with the progress; None: the progress is not reported.
 
         """
@@ -108,13 +108,13 @@ class LearningCurves(NamedTuple):
             return train_all(trainings, jobs, tell)
 
     def write(self) -> dict[str, Any]:
-        """Draw the curves of the trainings, write figure, table and summary to the folder, and return the summary.
+        """Draw the curves of the training runs, write figure, table and summary to the folder, and return the summary.
 
-        The summary contains, for each recipe, the harm of the best policy and of the last policy of its trainings: the
-        interquartile mean over the seeds, with a bootstrap interval. The summary also contains hashes of the best
-        policies and of the worlds on which the policies were evaluated.
+        For each recipe, the summary contains the harm of the best policy and of the last policy in a training run. Both
+        harms are interquartile means over the seeds, with a bootstrap interval. The summary also contains hashes of the
+        best policies and of the worlds on which the policies were evaluated.
 
-        Raises ``InvalidInput`` if no step exists at which all seeds of a recipe were evaluated.
+        Raises ``InvalidInput`` if the runs of a recipe have no step in common at which each of them was evaluated.
         """
         scenario, curves, lists = self.scenario, self.curves(), set()
         summary: dict[str, Any] = {
@@ -163,9 +163,9 @@ class LearningCurves(NamedTuple):
     def curves(self) -> dict[str, dict[str, SeedCurve]]:
         """Return the learning curves: metric -> name of the recipe -> curve with all seeds of the recipe.
 
-        The metrics are the return, and those counts of harm that the rewards of the recipes use. A metric that has no
-        values is omitted. If ``against`` is ``cpu``, the x values of a curve are processor times (s), averaged over the
-        seeds.
+        A metric is the return, or a count of harm that the reward of some recipe uses. A metric without values is
+        omitted. If ``self.against`` is ``cpu``, the x values of a curve are processor times (s), averaged over the
+        seeds, instead of training steps.
         """
         counts = {recipe.reward.harm_count for recipe, _ in self.plan}
         metrics = [RunDirectory.HARM[count] for count in HARM_COUNTS if count in counts]

@@ -31,8 +31,8 @@ from ethbrake_marl.files.store import write_file, write_output
 def choose_items(names: Sequence[str]) -> list[Item]:
     """Return the items (figures and tables of the paper) with these names, in the order of the paper.
 
-    If ``names`` is empty, the result contains all items. Raises ``UnknownName``, with a suggestion, if a name is
-    unknown, and ``InvalidInput`` if a name is repeated.
+    If ``names`` is empty, all items are returned. Raises ``UnknownName``, with a suggestion, if a name is unknown, and
+    ``InvalidInput`` if a name is repeated.
     """
     known = {item.name: item for item in ITEMS}
     for k, name in enumerate(names):
@@ -44,15 +44,15 @@ def choose_items(names: Sequence[str]) -> list[Item]:
 
 
 def open_folder(asked: Reproduction, *, force: bool = False) -> StudyFolder:
-    """Return the object that checks and locks the folder of a reproduction.
+    """Return a ``StudyFolder`` that checks and locks the folder of a reproduction.
 
-    A reproduction that was begun in this folder with the same settings continues.
+    If the folder contains a reproduction with the same settings, the work continues this reproduction.
 
     Raises ``InvalidInput`` if the folder is a symbolic link.
 
     Args:
         asked: settings of the reproduction.
-        force: whether existing results in the folder are deleted; trainings are never deleted.
+        force: whether existing results in the folder are deleted first; training runs are never deleted.
 
     """
     path, question = asked.folder, {"episodes": asked.episodes, "version": __version__}
@@ -72,14 +72,14 @@ def open_folder(asked: Reproduction, *, force: bool = False) -> StudyFolder:
 def make_items(asked: Reproduction, items: Sequence[Item], *, force: bool = False) -> tuple[list[Result], bool]:
     """Reproduce items (figures and tables of the paper).
 
-    Items that need no trainings are reproduced first. An item is not reproduced again if its result exists and used the
-    same trainings. The HTML page is written again after each item.
+    Items that need no training runs are reproduced first. An item is not reproduced again if its stored result comes
+    from the same training runs. The HTML page with all results is written again after each item.
 
-    Ctrl-C during a training stops all trainings; afterwards the items are reproduced with the finished trainings. A
-    second Ctrl-C stops everything at once.
+    Ctrl-C during a training run stops all training runs; afterwards the items are reproduced with the finished runs. A
+    second Ctrl-C stops the command at once.
 
-    Returns all results in the folder, and whether all trainings are finished. Raises the exceptions of ``open_folder``
-    and ``StudyFolder.work``.
+    Returns all results in the folder, and whether all training runs are finished. Raises the exceptions of
+    ``open_folder`` and ``StudyFolder.work``.
 
     Args:
         asked: settings of the reproduction.
@@ -106,7 +106,7 @@ def make_items(asked: Reproduction, items: Sequence[Item], *, force: bool = Fals
 def _make_item(asked: Reproduction, item: Item, trained: Sequence[str]) -> None:
     """Reproduce an item; write its figures, its data and then its result file, which marks the item as complete.
 
-    ``trained`` are the names of the finished trainings that the item uses, each as ``group/recipe``.
+    ``trained`` are the names of the recipes whose finished training runs the item uses, each as ``group/recipe``.
     """
     place, started = asked.folder / item.name, time.process_time()
     product = item.make(asked)

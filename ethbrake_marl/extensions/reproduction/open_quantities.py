@@ -1,7 +1,7 @@
-"""Effect on the results of the random test of the quantities that the paper leaves open.
+"""Sensitivity of the random test's results to the quantities that the paper leaves open.
 
-The result states for each quantity: what the paper says, our default, alternatives, and how much the main results
-change with each alternative.
+For each such quantity, a table states what the paper says, our default, and alternative values. Another table states,
+for each alternative, how much the mean harm changes, and the new collision rates.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from ethbrake_marl.training.run_folder import RunDirectory
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alternative:
-    """Another possible value of a quantity that the paper leaves open, and how this value changes the random test."""
+    """Another possible value of a quantity that the paper leaves open, and how to repeat the random test with it."""
 
     value: str  # the value in words
     changes: Mapping[str, Any] = field(default_factory=dict)  # keys of the scenario with their new values
@@ -123,14 +123,14 @@ _SHOWN = tuple(NAMES[spec] for spec in _SPECS)
 
 @dataclass(frozen=True, slots=True)
 class Headline:
-    """Main results in n worlds: harm and collisions of each strategy."""
+    """Harm and collisions of each strategy in n worlds."""
 
     gaps_m: Floats  # [n, P] gaps at the alert (m), which show whether two results are for the same worlds
     harm: Mapping[str, Floats]  # strategy -> [n] harm in each world (m2/s2)
     collided: Mapping[str, Bools]  # strategy -> [n] whether each world has a collision
 
     def change(self, base: Headline, strategy: str) -> Estimate:
-        """Return a strategy's mean harm in these results minus its mean harm in the results ``base``, m2/s2.
+        """Return the mean harm of ``strategy`` in these results minus its mean harm in the results ``base``, m2/s2.
 
         If both results are for the same worlds, the difference is computed world by world (paired).
         """
@@ -243,13 +243,14 @@ def reproduce_gaps(settings: Reproduction) -> Made:
 
 
 def _measure(scenario: Scenario, alternative: Alternative, episodes: int) -> Headline:
-    """Evaluate the strategies on the random test with one alternative; return harm and collisions in each world.
+    """Evaluate the strategies in the random test after one open quantity has got another value.
 
-    If ``alternative.harm`` is ``predicted``, strategies that predict no harm get their first-impact harm.
+    Returns the harm and the collisions in each world. If ``alternative.harm`` is ``predicted``, only the pairwise
+    E-V2X-BM has predicted harm; for the other strategies, first-impact harm is returned.
 
     Args:
-        scenario: scenario of the random test, to which the changes of the alternative are applied.
-        alternative: alternative value of an open quantity.
+        scenario: scenario of the random test, before ``alternative.changes`` are applied.
+        alternative: the other value of an open quantity.
         episodes: number of worlds.
 
     """

@@ -28,11 +28,10 @@ _NUMERAL = re.compile(r"[-+−]?\d[\d,.]*( ?%)?|–|")
 
 
 def _account(results: Sequence[Result]) -> tuple[str, str, str, list[str]]:
-    """Return texts about the results and about how they were made.
+    """Return the first sentence of the page, the command that makes the results, how they were made, and remarks.
 
-    There are four: the first sentence of the page; the command that makes the results; date, machines and processor
-    time; and a list of remarks. The list contains one remark if fewer worlds were used than in the paper; otherwise it
-    is empty.
+    The third text states date, machines and processor time. There is one remark if fewer worlds were used than in the
+    paper, else none.
     """
     every = len(results) == len(ITEMS)
     most = max((result.episodes for result in results), default=MOST_EPISODES)
@@ -125,8 +124,8 @@ def write_docs(file: Path, folder: Path, results: Sequence[Result]) -> None:
 
     Args:
         file: JSON file to write.
-        folder: folder of the reproduction, from which the figures are copied.
-        results: results to write.
+        folder: folder of the reproduction, which contains the figures.
+        results: results of all reproduced figures and tables.
 
     """
     figures = file.parent / FIGURES

@@ -1,7 +1,7 @@
 """The paper's strategies, and two assumptions on the time at which Vehicle 2 may act.
 
-With the first assumption, Vehicle 2 has the latency that the paper states. With the second assumption, its latency is
-0.2 s.
+The first assumption gives Vehicle 2 the latency that the paper states. The second assumption gives Vehicle 2 a latency
+of 0.2 s.
 """
 
 from __future__ import annotations
@@ -48,14 +48,17 @@ NAMES = {  # names of the strategies in tables and figures
 class Reading:
     """An assumption on the time at which Vehicle 2 may act.
 
-    There are two such assumptions (``READINGS``), because the paper is not clear about this time.
+    The list ``READINGS`` has two such assumptions, because the paper is not clear about this time.
     """
 
     name: str  # name of the assumption
     acts_s: float | None = None  # time at which Vehicle 2 may act (s); None: the latency of the scenario
 
     def scenario(self, name: str, **changes: object) -> Scenario:
-        """Return the shipped scenario ``name`` with the latency of this assumption and ``changes`` of further keys."""
+        """Load the shipped scenario ``name``, and return it with Vehicle 2's latency under this assumption.
+
+        ``changes`` gives new values for further keys of the scenario.
+        """
         scenario = load_scenario(name).replace(**changes) if changes else load_scenario(name)
         if self.acts_s is None:
             return scenario
@@ -67,17 +70,18 @@ READINGS = (Reading("as stated"), Reading("Vehicle 2 acts at 0.2 s", 0.2))
 
 
 def lineup(scenario: Scenario, *specs: str) -> dict[str, Agent]:
-    """Return agents by name.
+    """Return the agents with the given specs, by name.
 
-    ``specs`` are the agents' specs, such as ``"full_brake"``; their names in the result are those in ``NAMES``.
+    ``specs`` are specs such as ``"full_brake"``. The name of an agent in the result is its entry in ``NAMES``, or the
+    spec if there is no such entry.
     """
     return {NAMES.get(spec, spec): agent for spec, agent in make_agents(specs, scenario).items()}
 
 
 def drive_list(scenario: Scenario, agents: Mapping[str, Agent], episodes: int, settings: Reproduction) -> Evaluation:
-    """Evaluate every agent in the first ``episodes`` worlds of a scenario.
+    """Evaluate every agent in the first ``episodes`` worlds of the scenario's evaluation list.
 
-    The progress is reported with ``settings.tell``.
+    The function ``settings.tell`` is called with the progress.
     """
     return evaluate(
         scenario.sample(episodes, LIST_SEED),
@@ -92,8 +96,8 @@ def drive_list(scenario: Scenario, agents: Mapping[str, Agent], episodes: int, s
 def harms(evaluation: Evaluation) -> dict[str, Floats]:
     """Return the first-impact harm of each strategy: name of the strategy -> [n] harm in each world (m2/s2).
 
-    Further entries, if known, are the harm that E-V2X-BM predicts (key ``PREDICTED``) and the proven lower bound of the
-    harm (key ``PROVEN``).
+    If they are known, two entries are added: the harm that E-V2X-BM predicts (key ``PREDICTED``), and the proven lower
+    bound of the harm (key ``PROVEN``).
     """
     each_harm = {name: outcome.first_impact_harm for name, outcome in evaluation.outcomes.items()}
     pairwise = evaluation.outcomes.get(NAMES[PAIRWISE])
@@ -112,7 +116,8 @@ def unconverged_policy(settings: Reproduction) -> tuple[Policy, str]:
     """Return a policy that has not converged, and its description.
 
     The paper uses a "PPO model obtained from training before convergence occurred". This function returns the policy of
-    the training that ``--full`` stops early. If this training has not run, a shipped policy replaces the policy.
+    a training run that ``--full`` stops early. If this run has not been done, the function returns a shipped policy
+    instead.
     """
     for (path,) in settings.trained([STOPPED]).values():
         about = f"PPO stopped early: the last policy of {EARLY.decisions:,} decisions on paper-random"
@@ -125,7 +130,7 @@ def hybrid(policy: Policy, scenario: Scenario, bound: Literal["coupled", "pairwi
     """Return the paper's hybrid (Algorithm 1).
 
     At the alert the hybrid chooses ``policy`` if the policy's harm is at most H*, otherwise E-V2X-BM. H* is the harm of
-    E-V2X-BM. It is simulated if ``bound`` is ``coupled``, and predicted by a closed form if ``bound`` is ``pairwise``.
+    E-V2X-BM. H* is simulated if ``bound`` is ``coupled``, and predicted by a closed form if ``bound`` is ``pairwise``.
     """
     return HybridAgent(LearnedAgent(policy, "policy"), scenario, bound=bound)
 

@@ -28,13 +28,16 @@ _UNDERCUT = {_RATE: "worlds in which no command avoids an impact", _MEAN_HARM: "
 
 
 def collision_rate(collided: Bools) -> Estimate:
-    """Return the share of worlds with an impact, with its 95 % interval. ``collided`` [n] is True for these worlds."""
+    """Return the share of worlds with an impact, with its 95 % interval.
+
+    ``collided`` [n] is True for each world with an impact.
+    """
     return rate(int(collided.sum()), len(collided))
 
 
 @dataclass(frozen=True)
 class Beside:
-    """Our results under one assumption on when Vehicle 2 may act, which are compared with a table of the paper."""
+    """Our results to compare with a table of the paper, under one assumption on when Vehicle 2 may act."""
 
     title: str  # description of the assumption
     evaluation: Evaluation  # outcomes of our strategies
@@ -45,8 +48,7 @@ class Beside:
     def numbers(self) -> dict[str, dict[str, Estimate]]:
         """Our results: strategy -> quantity (such as "collision rate") -> estimate.
 
-        If lower bounds are proven, a further key, "least possible (proven)" (``NOBODY``), contains the bounds that hold
-        for all strategies.
+        If lower bounds for all strategies are proven, they are the entry "least possible (proven)" (``NOBODY``).
         """
         numbers, braking = {}, self.evaluation.outcomes.get(NAMES[FULL_BRAKE])
         for name, outcome in self.evaluation.outcomes.items():
@@ -65,14 +67,14 @@ class Beside:
         return numbers
 
     def candidates(self, row: str, quantity: str) -> Iterator[tuple[str, Estimate]]:
-        """Yield those of our results that may correspond to a number in the paper, each as (name, estimate).
+        """Yield those of our results that a printed number of the paper may mean, each as (name, estimate).
 
-        The number is compared with the first result. If the two differ, the verdict also names the result nearest to
-        the number.
+        The printed number is compared with the first of these results. If the printed number and the first result
+        differ, the verdict also names the result that is nearest to the printed number.
 
         Args:
             row: name that the paper gives the strategy.
-            quantity: quantity that the number states: "collision rate", "average harm" or "harm decrease".
+            quantity: quantity that the paper prints: "collision rate", "average harm" or "harm decrease".
 
         """
         for name in self.ours[row]:
@@ -86,11 +88,11 @@ class Beside:
 
 
 def compare_rows(printed: Sequence[PaperRow], besides: Sequence[Beside]) -> list[Verdict]:
-    """Compare each number in a table of the paper with each of our results ``besides``, and return the verdicts.
+    """Compare each number in a table of the paper with our results under each assumption, and return the verdicts.
 
     Args:
         printed: rows of the paper's table.
-        besides: our results, one entry for each assumption on when Vehicle 2 may act.
+        besides: our results under each assumption on when Vehicle 2 may act.
 
     """
     verdicts = []
@@ -117,15 +119,16 @@ def compare_rows(printed: Sequence[PaperRow], besides: Sequence[Beside]) -> list
 
 
 def selection_verdict(one: PaperRow, other: PaperRow, chosen: PaperRow) -> Verdict:
-    """Return a verdict on the printed number of collisions of a strategy that chooses one of two others in each world.
+    """Return a verdict on the printed number of collisions of the hybrid, which chooses between two strategies.
 
-    Such a strategy avoids a collision only in worlds in which one of the other two avoids it. Therefore it avoids at
-    most as many collisions as the other two together.
+    In each world the hybrid chooses one of the two strategies. Therefore the hybrid avoids a collision only in worlds
+    in which at least one of the two strategies avoids a collision. So the hybrid cannot avoid more collisions than the
+    two strategies together.
 
     Args:
-        one: row of the paper's table for the first strategy.
-        other: row for the second strategy.
-        chosen: row for the strategy that chooses one of these two in each world.
+        one: row of the paper's table for the first of the two strategies.
+        other: row of the paper's table for the second of the two strategies.
+        chosen: row of the paper's table for the hybrid.
 
     """
     avoided = [row.episodes - row.collisions for row in (one, other, chosen)]
@@ -139,13 +142,13 @@ def selection_verdict(one: PaperRow, other: PaperRow, chosen: PaperRow) -> Verdi
 
 
 def decrease_verdict(row: PaperRow, baseline: PaperRow) -> Verdict:
-    """Return a verdict on whether the decrease of harm that the paper prints follows from the harms that it prints.
+    """Return a verdict on whether the decrease of harm that the paper prints follows from the printed mean harms.
 
     The printed and the computed decrease may differ by at most 0.01 percentage points.
 
     Args:
         row: row of the paper's table in which the decrease is printed.
-        baseline: row of the strategy relative to whose harm the decrease is stated.
+        baseline: row of the strategy from whose harm the decrease is counted.
 
     """
     follows = 1.0 - row.average_harm / baseline.average_harm
@@ -178,14 +181,14 @@ def beside_printed(
     parameters: Sequence[Parameter],
     notes: Sequence[str] = (),
 ) -> Made:
-    """Return the comparison of a table of the paper with our results: verdicts, tables and data.
+    """Compare a table of the paper with our results, and return verdicts, tables and data.
 
     Args:
         stem: name of the CSV file with the data, without ending.
         printed: rows of the paper's table.
-        besides: our results, one entry for each assumption on when Vehicle 2 may act.
-        arithmetic: verdicts that follow from the printed numbers alone.
-        parameters: quantities that affect the result.
+        besides: our results under each assumption on when Vehicle 2 may act.
+        arithmetic: verdicts on whether the printed numbers fit together, which need none of our results.
+        parameters: quantities that affect our results, to list on the page.
         notes: sentences that say what was run and what was not.
 
     """

@@ -1,6 +1,7 @@
-"""Trainings of ``ethbrake reproduce --full``: for learning curves, for a policy stopped early, and for open settings.
+"""Training runs of ``ethbrake reproduce --full``: for learning curves, a policy stopped early, and open settings.
 
-The trainings of a group are stored in one folder, which ``learning_curves.LearningCurves`` manages.
+*Open settings* are settings that the paper does not state. The runs of a group are stored in one folder, which
+``learning_curves.LearningCurves`` manages.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ _STATED_STATE = (  # the paper's state: positions and speeds of all vehicles, an
 
 @dataclass(frozen=True, slots=True)
 class TrainedRecipe:
-    """Name of a recipe, length of its training, and number of updates between two evaluations of the policy."""
+    """Name of a recipe, length of its training run, and number of updates between two evaluations of the policy."""
 
     recipe: str  # name of a shipped recipe
     decisions: int  # length of the training, in decisions
@@ -33,7 +34,11 @@ class TrainedRecipe:
     per_s: int  # decisions per second on one core (Intel Xeon), to estimate the time of the training
 
     def load(self, name: str, **changes: Any) -> TrainingRecipe:
-        """Return the recipe with the new name ``name``, with these settings, and with ``changes`` of further keys."""
+        """Load the recipe, and return it with the new name ``name``.
+
+        The length of training and the number of updates between two evaluations are those of this object. ``changes``
+        gives new values for further keys of the recipe.
+        """
         recipe = load_recipe(self.recipe)
         evaluation = {**recipe.evaluation.model_dump(), "every_updates": self.every_updates}
         if "log_every_updates" in type(recipe).model_fields:  # otherwise the table has a row for every update
@@ -48,7 +53,7 @@ EARLY = TrainedRecipe("ppo", 100_000, 4, 16_000)  # a fifteenth of the decisions
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Trainings of several recipes on one scenario, stored in one folder."""
+    """Group of training runs: several recipes on one scenario, stored in one folder."""
 
     name: str  # name of the group; also the name of its folder
     scenario: str  # name of a shipped scenario
@@ -58,7 +63,7 @@ class Group:
 
 
 def groups() -> dict[str, Group]:
-    """Return all groups of trainings by name, in the order in which they run: the quickest group first."""
+    """Return all groups of training runs by name, in the order in which they are trained: the quickest group first."""
     base = PPO_PAPER.load("ppo-paper").reward.model_dump(exclude_defaults=True)
     changed = {
         "risk-0": {"risk": 0.0},

@@ -147,7 +147,8 @@ def _record_all(settings: Reproduction) -> Records:
 def play() -> Part:
     """Return an interactive player of the episodes in Scenarios 1 and 2, as a part of the page.
 
-    At the start the player shows PPO and SAC. There are episodes with both assumptions on when Vehicle 2 may act.
+    At the start the player shows PPO and SAC. The player has one episode for each scenario, strategy and assumption on
+    when Vehicle 2 may act.
     """
     records = []
     for reading, number in _CELLS:
@@ -174,17 +175,16 @@ def _parameters() -> list[Parameter]:
 
 
 def _both(records: Records, reading: Reading, number: int, what: str, column: int) -> tuple[Floats, Floats]:
-    """Return one recorded quantity under PPO and under SAC, at the same times.
+    """Return the course of one recorded quantity under PPO and under SAC, at the same times.
 
-    The times end when the longer of the two episodes ends. After the end of the shorter episode, its last value is
-    repeated.
+    The times end with the longer of the two episodes. After the end of the shorter episode, its last value is repeated.
 
     Args:
         records: recorded episodes.
         reading: assumption on when Vehicle 2 may act.
         number: number of the scenario, 1 or 2.
-        what: name of the quantity's array in the records, for instance ``gaps_m``.
-        column: index of a column of this array.
+        what: name of the quantity, an attribute of ``EpisodeRecord`` such as ``gaps_m``.
+        column: index of the vehicle or of the pair.
 
     """
     pair = [records[reading, number, name] for name in _POLICIES]
@@ -196,12 +196,12 @@ def _both(records: Records, reading: Reading, number: int, what: str, column: in
 def _apart(records: Records, reading: Reading, what: str) -> list[float]:
     """Return how far a quantity of Vehicle 2 differs between PPO and SAC, in Scenario 1 and in Scenario 2.
 
-    The result is the root mean square of the difference over time.
+    The result is the root mean square, over the times of an episode, of the difference between PPO and SAC.
 
     Args:
         records: recorded episodes.
         reading: assumption on when Vehicle 2 may act.
-        what: name of the quantity's array in the records, for instance ``positions_m``.
+        what: name of the quantity, an attribute of ``EpisodeRecord`` such as ``positions_m``.
 
     """
     pairs = (_both(records, reading, number, what, 1) for number in _SCENARIOS)
@@ -212,10 +212,10 @@ def _judge_one_world(claims: Mapping[str, tuple[str, float, float]], reading: Re
     """Return a verdict on each claim of the paper about a single world. Numbers for a single world have no intervals.
 
     Args:
-        claims: claim -> (text with the two numbers, number that is smaller according to the claim, number that is
-            larger).
+        claims: for each claim, a text with two numbers, the number that is smaller according to the claim, and the
+            number that is larger according to the claim.
         reading: assumption on when Vehicle 2 may act, for the text of the verdict.
-        show: format in which the difference of the two numbers is written.
+        show: format in which the verdict writes the difference of the two numbers.
 
     """
     return [
@@ -225,7 +225,7 @@ def _judge_one_world(claims: Mapping[str, tuple[str, float, float]], reading: Re
 
 
 def _asked_of_vehicle_2(record: EpisodeRecord) -> tuple[float, float, float]:
-    """Return three numbers on the commands of Vehicle 2.
+    """Return three numbers that describe the commands of Vehicle 2 in one episode.
 
     The numbers are the first command (m/s2), the sum of the absolute changes of the command (m/s2), and the share (0 to
     1) of the time in motion during which Vehicle 2 brakes.

@@ -1,15 +1,17 @@
-"""Verdicts on the paper's numbers and statements, computed from our results.
+"""Verdicts on whether the paper's numbers and statements agree with our results.
 
-*Chance* is the difference that the results of two random lists of worlds may have by chance.
+*Chance* means: how much two results may differ only because they come from two different random lists of worlds.
 
-- A number that the paper prints *agrees* with ours if the two differ by no more than chance, or by no more than
-  ``TOLERANCE`` of the printed number.
-- It is *undecided* if the two differ by no more than chance, but chance is more than ``WIDE`` of the larger number.
-- It *cannot agree* if it is below a proven lower bound for all strategies by more than chance.
-- It *differs* in all other cases.
+- A number that the paper prints *agrees* with our number if the difference is at most ``TOLERANCE`` of the printed
+  number. It also agrees if the difference is at most chance, and chance is at most ``WIDE`` of the larger of the two
+  numbers.
+- A printed number that does not agree is *undecided* if the difference is at most chance.
+- A printed number *cannot agree* if it is below a proven lower bound for all strategies by more than chance.
+- A printed number *differs* in all other cases.
 
-A statement of the paper *agrees* if the interval of every comparison supports it. It is *undecided* if some intervals
-do not support it, but all these intervals contain 0.
+A statement of the paper says that some quantities are smaller than others. A statement *agrees* if every difference
+(smaller minus larger quantity) has a 95 % interval below 0. A statement that does not agree is *undecided* if each of
+its other intervals contains 0.
 """
 
 from __future__ import annotations
@@ -68,13 +70,14 @@ def compare_number(
     """Return a verdict on whether a number that the paper prints agrees with our result.
 
     Args:
-        what: name of the number, for the verdict.
+        what: name of the printed number, as the verdict shows it.
         printed: number that the paper prints.
-        ours: the same quantity in our results, with its 95 % interval.
+        ours: value of this quantity in our results, with its 95 % interval.
         show: format in which both numbers are written.
         least: description and value of a proven lower bound for all strategies in our worlds; None: no bound.
-        others: description -> the same quantity under another assumption. If our result differs from the printed
-            number, the verdict names the entry that is nearest to the printed number.
+        others: values of this quantity in our results under other assumptions, by the description of the assumption. If
+            ``ours`` differs from the printed number, the verdict names the assumption whose value is nearest to the
+            printed number.
 
     """
     text = f"ours {show.show(ours).in_words}, printed {show.scale * printed:.{show.digits + 1}f}{show.unit}"
@@ -98,10 +101,10 @@ def compare_number(
 
 
 def _off(printed: float, ours: Estimate) -> str:
-    """Return how far ``ours`` is from the printed number, as text such as "+3.1 %"; an empty text if the two agree.
+    """Return how far ``ours`` is from the printed number, as text such as "+3.1 %"; empty if the two numbers agree.
 
-    The two numbers agree if they differ by at most 2 % of the printed number (``TOLERANCE``), or by no more than chance
-    (``_chance``). If chance is more than 15 % (``WIDE``) of the larger number, only the first condition applies.
+    Two numbers agree if they differ by at most 2 % of the printed number (``TOLERANCE``). They also agree if they
+    differ by no more than chance (``_chance``), and chance is at most 15 % (``WIDE``) of the larger number.
     """
     chance = _chance(ours)
     off = chance if chance <= WIDE * max(abs(printed), abs(ours.value)) else 0.0
@@ -111,7 +114,7 @@ def _off(printed: float, ours: Estimate) -> str:
 
 
 def _chance(estimate: Estimate) -> float:
-    """Return by how much this estimate may differ, by chance, from an estimate for the same number of other worlds.
+    """Return by how much ``estimate`` may differ, by chance, from an estimate in equally many other worlds.
 
     The result is sqrt(2) times half the width of the 95 % interval.
     """
@@ -121,7 +124,7 @@ def _chance(estimate: Estimate) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Less:
-    """Comparison of two quantities, to judge a statement of the paper that the first is smaller than the second.
+    """Comparison of two quantities, to judge a statement of the paper that one of them is smaller than the other.
 
     A statement can need several comparisons, for example one for each group of worlds.
     """
@@ -143,13 +146,13 @@ class Less:
 
     @classmethod
     def of_harms(cls, where: str, harm: Mapping[str, Floats], smaller: str, larger: str) -> Less:
-        """Compare the harms of two strategies in the same worlds, also with the proven lower bound if it is known.
+        """Compare the harms of two strategies in the same worlds, and with the proven lower bound if it is known.
 
         Args:
             where: text that says which worlds or strategies are compared.
-            harm: name of the strategy -> [n] harm in each world.
-            smaller: name of the strategy whose harm should be smaller.
-            larger: name of the strategy whose harm should be larger.
+            harm: harm of each strategy in each world, [n], by the name of the strategy.
+            smaller: name of the strategy whose harm is smaller according to the paper.
+            larger: name of the strategy whose harm is larger according to the paper.
 
         """
         low, high = harm[smaller], harm[larger]
@@ -160,12 +163,12 @@ class Less:
 def judge_statement(what: str, parts: Sequence[Less], *, or_equal: bool = False, show: Column = HARM) -> Verdict:
     """Return a verdict on a statement of the paper.
 
-    The statement agrees if the interval of every difference is below 0.
+    The statement agrees if the 95 % interval of every difference in ``parts`` is below 0.
 
     Args:
-        what: the statement.
-        parts: comparisons that the statement needs.
-        or_equal: whether intervals that end at 0 agree, too.
+        what: statement of the paper, in words.
+        parts: all comparisons that must be right if the statement is right.
+        or_equal: whether an interval whose upper end is exactly 0 also agrees with the statement.
         show: format in which the differences are written.
 
     """
@@ -201,7 +204,8 @@ def judge_statement(what: str, parts: Sequence[Less], *, or_equal: bool = False,
 def summarise_verdicts(verdicts: Sequence[Verdict]) -> Verdict:
     """Combine all verdicts on a figure or table into one verdict with the worst outcome.
 
-    Its text states how often each outcome occurs, and quotes the first verdict with the worst outcome.
+    The text of the combined verdict states how often each outcome occurs, and quotes the first verdict with the worst
+    outcome.
     """
     if not verdicts:
         return Verdict("all", "not run", "nothing was compared")

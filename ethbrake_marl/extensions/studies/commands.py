@@ -1,4 +1,4 @@
-"""The commands ``study sweep``, ``study tune`` and ``study falsify``: many trainings, or many worlds."""
+"""The commands ``study sweep`` and ``study tune`` for many training runs, and ``study falsify`` for many worlds."""
 
 from __future__ import annotations
 
@@ -63,10 +63,10 @@ def sweep_command(
     schema: schema_option("ethbrake_marl.extensions.studies.sweep", "SweepPlan", "sweep") = False,  # type: ignore[valid-type]  # made here
     as_json: JsonOption = False,
 ) -> None:
-    """Train every job of a file, and write one table of the results.
+    """Do the training runs in a file, and write a table of results.
 
     After an interruption, the same command continues: finished jobs are not trained again, and unfinished jobs continue
-    from their last checkpoint. The exit status is 1 if a job failed; failures.csv contains the reasons.
+    from their last checkpoint. If a job failed, the exit status is 1, and failures.csv says why.
     """
     with Out(as_json=as_json, remains=REMAINS) as out:
         from ethbrake_marl.extensions.studies.sweep import SweepPlan
@@ -122,9 +122,9 @@ def tune_command(
 ) -> None:
     """Search for the best settings of a training recipe.
 
-    A trial is one training. Its harm is measured on the list of worlds that the file describes. After an interruption,
-    the same command continues: finished trials are not trained again, and unfinished trials continue. The exit status
-    is 1 if no trial has finished.
+    A trial is one training run. The harm of a trial is measured on the list of worlds that FILE describes. After an
+    interruption, the same command continues: finished trials are not trained again, and unfinished trials continue. The
+    exit status is 1 if no trial has finished.
     """
     with Out(as_json=as_json, force=force, remains=REMAINS) as out:
         need("optuna")
@@ -242,10 +242,11 @@ def falsify_command(
     """Search a scenario for the worlds in which an agent does worst.
 
     --measure sets the score of a world; a larger score is worse. With harm, the score is the agent's harm. With regret,
-    it is the agent's harm minus the harm of --against (by default the best known commands). With difference, it is the
-    absolute difference between these two harms. With bound, it is the agent's harm minus the bound of its shield, so a
-    score above 0 means that the bound is broken. With --again FILE, the agent of the file (or --agent) drives the
-    worlds of the file again. With --again, the exit status is 1 if a world has a worse score than in the file.
+    the score is the agent's harm minus the harm of --against (by default the best known commands). With difference, the
+    score is the absolute difference between the harms of the agent and of --against. With bound, the score is the
+    agent's harm minus the bound of its shield, so a score above 0 means that the bound is broken. With --again FILE,
+    the agent that FILE names (or --agent) drives the worlds of FILE again. If the score of a world is then larger than
+    in FILE, the exit status is 1.
     """
     with Out(as_json=as_json, force=force) as out:
         import numpy as np
@@ -329,7 +330,7 @@ def falsify_command(
 def _spelled(**options: Any) -> str:
     """Return the command line ``ethbrake study falsify`` with these options.
 
-    Options with the value None are omitted. An option whose value is a tuple is repeated for each element.
+    Options with the value None are omitted. An option whose value is a tuple is given once for each element.
     """
     words = ["ethbrake", "study", "falsify"]
     for option, value in options.items():
@@ -340,10 +341,10 @@ def _spelled(**options: Any) -> str:
 
 
 def _drive_again(out: Out, file: Path, agent: str | None) -> None:
-    """Measure the worlds of a file of ``study falsify`` again, and print a comparison with the scores in the file.
+    """Let an agent drive the worlds in a file of ``study falsify``, and compare the scores with those in the file.
 
-    ``agent`` is the agent that drives the worlds; None: the agent that the file names. Exits with status 1 if a world
-    has a worse score than in the file, or if the agent cannot drive a world.
+    ``agent`` is the agent that drives the worlds; None: the agent that the file names. The exit status is 1 if the
+    score of a world is larger than in the file, or if the agent cannot drive a world.
     """
     import numpy as np
 

@@ -43,11 +43,11 @@ def search(
 ) -> Scored:
     """Search the unit cube for points with a high score, and return all points that were tried.
 
-    Half of the points of a round are spread evenly (scrambled Sobol points). Each point of the other half is one step
-    away from a *parent*. The parents are the points with the highest scores so far that are far apart from each other.
-    A step is a normal random step in some coordinates, or half the difference between two random parents (differential
-    evolution). In the first round, and later while no score is above the median score, all points are spread evenly.
-    The same seed gives the same points.
+    The points are tried in rounds of at most 256 points (``ROUND``). Half of the points of a round are spread evenly
+    (scrambled Sobol points). Each point of the other half is one step away from a *parent*. The parents are the points
+    with the highest scores so far that are far apart from each other. A step is a normal random step in some
+    coordinates, or half the difference between two random parents (differential evolution). In the first round, and
+    later while no score is above the median score, all points are spread evenly. The same seed gives the same points.
 
     Args:
         score: function from points [n, d] to scores [n].
@@ -92,9 +92,10 @@ def _spread(dimensions: int, seed: int) -> Iterator[Floats]:
 def far_apart(scored: Scored, count: int) -> Ints:
     """Choose at most ``count`` points of ``scored`` that have high scores and are far apart.
 
-    Return their row numbers, best point first.
+    Return the row numbers of the chosen points in ``scored``, highest score first.
 
-    Any two of these points differ by at least 0.1 in some coordinate. Points whose score is not finite are omitted.
+    Any two of the chosen points differ by at least 0.1 in some coordinate. Points whose score is not finite are
+    omitted.
     """
     order = np.argsort(-scored.scores, kind="stable")
     order = order[np.isfinite(scored.scores[order])]
@@ -107,7 +108,7 @@ def far_apart(scored: Scored, count: int) -> Ints:
 
 
 def _above_median(scored: Scored) -> Scored:
-    """Return ``scored`` with minus infinity in place of all scores that are not above the median score."""
+    """Return a copy of ``scored`` in which every score that is not above the median score is minus infinity."""
     good = np.isfinite(scored.scores)
     if not good.any():
         return scored
@@ -115,7 +116,7 @@ def _above_median(scored: Scored) -> Scored:
 
 
 def _children(parents: Floats, count: int, rng: np.random.Generator) -> Floats:
-    """Return ``count`` new points [count, d] near the points ``parents`` [m, d], about equally many near each."""
+    """Return ``count`` new points [count, d], about equally many near each point of ``parents`` [m, d]."""
     if count == 0:
         return parents[:0]
     parent = parents[np.arange(count) % len(parents)]

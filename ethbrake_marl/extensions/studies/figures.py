@@ -1,4 +1,4 @@
-"""Train one job of a sweep or tuning to its end in the job's folder, and return the job's entries for a table."""
+"""Train one job of a sweep or tuning to its end in the job's folder, and return the values of its row in the table."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ Evaluation = Mapping[str, float]  # one evaluation during a training: number of 
 
 
 def is_done(job: TrainingJob) -> bool:
-    """Return whether the folder of ``job`` contains the finished training with its policies.
+    """Return whether the folder of ``job`` contains the finished training run with its policies.
 
-    Raises ``InvalidInput`` if the folder contains another training.
+    Raises ``InvalidInput`` if the folder contains a training run with other settings.
     """
     run = RunDirectory(job.folder)
     if not run.is_finished:
@@ -47,11 +47,11 @@ def is_done(job: TrainingJob) -> bool:
 
 
 def finish(job: TrainingJob, stop_at: StopAt | None = None) -> bool:
-    """Continue the training of ``job`` to its end. Return False if ``stop_at`` stopped the training early.
+    """Continue the training run of ``job`` to its end. Return False if ``stop_at`` stopped the run early.
 
     ``stop_at`` is a function that is called with each evaluation; it returns a reason to stop, or None to continue.
-    Raises the exceptions of a training, ``InvalidInput`` if the folder contains another training, and
-    ``BlockingIOError`` if another worker has just begun the same training.
+    Raises the exceptions of ``train`` and ``resume``, ``InvalidInput`` if the folder contains a training run with other
+    settings, and ``BlockingIOError`` if another process has just begun the same training run.
     """
     run = RunDirectory(job.folder)
     if run.status.is_file():
@@ -66,7 +66,7 @@ def finish(job: TrainingJob, stop_at: StopAt | None = None) -> bool:
 
 
 def evaluations_of(job: TrainingJob) -> list[dict[str, float]]:
-    """Return the evaluations so far of the training ``job``, each as number of steps and measures, by name.
+    """Return the evaluations so far of the training run ``job``, each as a dictionary with ``steps`` and the measures.
 
     Raises ``InvalidInput`` if the file ``progress.csv`` in the folder is damaged.
     """
@@ -87,10 +87,10 @@ def evaluations_of(job: TrainingJob) -> list[dict[str, float]]:
 
 
 def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, Any]:
-    """Return the entries of the training ``job`` for a table, by column, computed from its evaluations so far.
+    """Return the values in the table's row for ``job``, by column, computed from its ``evaluations`` so far.
 
-    The columns are ``harm`` (the least harm, by which the best policy is chosen) and all ``FIGURES`` except
-    ``policy_sha256``. Example: ``{"harm": 7.1, "steps": 400000, "total_harm": 9.8, ...}``.
+    The columns are ``harm`` (the least harm in an evaluation, by which the best policy is chosen) and all ``FIGURES``
+    except ``policy_sha256``. Example: ``{"harm": 7.1, "steps": 400000, "total_harm": 9.8, ...}``.
     """
     harm = RunDirectory.chosen_by(evaluations, job.training.recipe.reward.harm_count)
     lowest, last = min(evaluations, key=lambda each: each[harm]), evaluations[-1]
@@ -104,7 +104,7 @@ def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, An
 
 
 def final_figures(job: TrainingJob) -> dict[str, Any]:
-    """Return the entries of the finished training ``job`` for a table, by column: ``harm`` and all ``FIGURES``.
+    """Return the values in the table's row for the finished ``job``, by column: ``harm`` and all ``FIGURES``.
 
     Raises ``InvalidInput`` if a file in the folder is damaged.
     """

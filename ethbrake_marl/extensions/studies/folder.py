@@ -1,4 +1,4 @@
-"""The folder of a study.
+"""The folder of a study, for instance of a sweep or of a reproduction of the paper.
 
 Only one process at a time may work in the folder, and all processes must use the same settings.
 """
@@ -23,14 +23,15 @@ class StudyFolder:
 
     Args:
         path: path of the folder; it is created when the work begins.
-        kind: what the folder contains, for messages, such as ``a sweep``.
-        question: all settings and software versions that the results depend on, as plain data. A folder in which other
-            settings are stored is refused. None: the folder stores no common settings, because every result stores its
-            own.
+        kind: words for the content of the folder in messages, such as ``a sweep``.
+        question: all settings and software versions that the results depend on, as plain data. If the folder stores
+            other settings, the work does not begin. None: the folder stores no common settings, because each result in
+            it stores its own settings.
         record: name of the file in the folder that stores ``question``.
-        more: additional entries of the file ``record``, which are not compared with the new settings.
-        advice: end of the messages about a wrong folder: what the user can do.
-        beside: names of the only files that a folder without the file ``record`` may contain; None: any files.
+        more: additional entries for the file ``record``; they are stored, but never compared.
+        advice: last words of an error message about the folder, which say what the user can do.
+        beside: names of the files that an existing folder without the file ``record`` may contain; if it contains any
+            other file, ``check`` raises an error. None: every file is allowed.
         writes: names of files that the work replaces; they must be writable.
 
     """
@@ -56,7 +57,7 @@ class StudyFolder:
 
         The method writes nothing. Raises ``InvalidInput`` if the path is not a folder, if the folder or a file in
         ``writes`` is not writable, or if other settings are stored in the folder. Raises ``AlreadyExists`` if the
-        folder contains something else than ``kind``.
+        folder contains the files of another command.
         """
         check_folder(self.path, self._writes, force=True)
         if self._question is None:
@@ -107,8 +108,8 @@ class StudyFolder:
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> list[str]:
     """Return the differences between the settings ``before`` and ``now`` as texts: ``["seeds 2, now 5", "recipes"]``.
 
-    If the value of a setting is a list or a mapping, the text contains only the name of the setting. ``inside`` is the
-    text before each name.
+    If the value of a setting is a list or a mapping, the text contains only the name of the setting. ``inside`` is put
+    before the name of each setting.
     """
     differences: list[str] = []
     for name in dict.fromkeys([*now, *before]):

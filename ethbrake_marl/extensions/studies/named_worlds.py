@@ -1,4 +1,6 @@
-"""Files of named worlds, which a search has found and which agents can drive again.
+"""Files of worlds with names.
+
+A search for an agent's worst worlds writes such a file, and agents can drive its worlds again.
 
 A file stores the worlds, the scenario with a hash of its content, the agent that drove the worlds, and the harm and
 score of each world.
@@ -61,7 +63,7 @@ class NamedWorlds(FileModel):
     def of(cls, scenario: Scenario, /, **fields: Any) -> NamedWorlds:
         """Return the content of a file of worlds that were drawn from ``scenario``.
 
-        ``fields`` are all fields of this class except ``format``, ``version`` and ``scenario_sha256``.
+        ``fields`` gives every field of this class by name, except ``format``, ``version`` and ``scenario_sha256``.
         """
         return cls(format="ethbrake-worlds", version=1, scenario_sha256=scenario_sha256(scenario), **fields)
 
@@ -95,8 +97,8 @@ class NamedWorlds(FileModel):
         Raises ``InvalidInput`` if the content of ``scenario`` has changed since the worlds were found.
 
         Args:
-            scenario: scenario whose name is in the file.
-            where: name of the file, for messages.
+            scenario: scenario from which the worlds were drawn, as it is now.
+            where: path of the file, for error messages.
 
         """
         if scenario_sha256(scenario) != self.scenario_sha256:

@@ -1,7 +1,7 @@
 """Proposals of Optuna for a tuning: the values to try in each trial, stored in a file and used again after a restart.
 
-Each trial has a new sampler, whose seed depends on the number of the trial. Therefore a proposal depends on the results
-of earlier trials, but not on interruptions of the command.
+Each trial has a new Optuna sampler, whose seed depends on the number of the trial. Therefore a proposal depends on the
+results of earlier trials, but not on interruptions of the command.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
 
     Args:
         file: JSON file of the proposals; it is created with the first proposal.
-        known: proposals that the file already contains; the first trials get these proposals again.
-        space: key -> Optuna's distribution of the values of this key.
-        sampler: function from the number of a trial to its Optuna sampler.
-        first: proposal of the first trial if ``known`` is empty; None: Optuna makes the first proposal.
+        known: proposals that the file already contains, in order; trial number k gets proposal number k of this list.
+        space: dictionary from each searched key to Optuna's distribution of its values.
+        sampler: function that is called with the number of a trial, and returns the Optuna sampler for this trial.
+        first: proposal of the first trial, used only if ``known`` is empty; None: Optuna makes the first proposal.
 
     """
 

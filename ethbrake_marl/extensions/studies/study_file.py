@@ -1,4 +1,4 @@
-"""Read the YAML file of a sweep or tuning, and load the scenario and the recipe that it names."""
+"""Read the YAML file of a sweep or tuning, and load the scenarios and recipes that the file names."""
 
 from __future__ import annotations
 
@@ -31,11 +31,13 @@ class StudyFile(FileModel):
     def read_as(cls, path: str | Path, needed: str) -> Self:
         """Read and check a YAML file with the content of this class.
 
-        Raises ``InvalidInput``, which names the file, line, key and value of the error, and a correct alternative.
+        Raises ``InvalidInput`` if the content is invalid; the message names the file, the line, the key and the wrong
+        value, and says what would be right.
 
         Args:
             path: path of the file.
-            needed: what the file must contain, for messages, such as ``with a grid or a list of jobs``.
+            needed: words that describe the right content in an error message, such as ``with a grid or a list of
+                jobs``.
 
         """
         document = read_yaml(path)
@@ -48,8 +50,8 @@ class StudyFile(FileModel):
 def load_parts(scenario: str, recipe: str, settings: Sequence[str]) -> tuple[Scenario, TrainingRecipe]:
     """Load a scenario and a recipe by name or path, and apply the settings ``KEY=VALUE`` to them.
 
-    A setting changes the scenario or the recipe, whichever has the key. Raises ``InvalidInput`` if a name or key is
-    unknown, or if a value is not allowed.
+    A setting changes the scenario if the scenario has the key, and the recipe if the recipe has the key. Raises
+    ``InvalidInput`` if a name or key is unknown, or if a value is not allowed.
     """
     loaded = load_recipe(recipe)
     changes = read_settings(settings, [loaded])
@@ -57,9 +59,9 @@ def load_parts(scenario: str, recipe: str, settings: Sequence[str]) -> tuple[Sce
 
 
 def refused_part(scenario: str, recipe: str, settings: Sequence[str]) -> str:
-    """Return the argument with which ``load_parts`` fails: ``recipe``, ``scenario`` or the key of a setting.
+    """Find the argument that makes ``load_parts`` fail, and return ``recipe``, ``scenario`` or the key of a setting.
 
-    Returns an empty text if every argument is valid by itself, so that only their combination fails.
+    Returns an empty text if every argument is valid by itself, and only the combination of the arguments is not.
     """
     tried: dict[str, Callable[[], object]] = {
         "recipe": partial(load_recipe, recipe),

@@ -1,7 +1,7 @@
-"""A sweep: read a list of trainings from a YAML file, run the trainings on Ray Tune, and write one table of results.
+"""A sweep: read a list of training runs from a YAML file, do these runs on Ray Tune, and write one table of results.
 
-The table is computed only from the folders of the trainings. Whatever the order, the computers and the number of
-attempts of the jobs, the table is the same, byte for byte.
+The table is computed only from the folders of the training runs. The table is the same, byte for byte, whatever the
+order of the runs, on whatever computers they ran, and however often they were interrupted.
 """
 
 from __future__ import annotations
@@ -38,9 +38,10 @@ _GRID: YamlPath = ("grid",)
 
 
 class _OneOrMore:
-    """Annotation of a list in a file, in whose place a single entry is allowed.
+    """Annotation of a field that accepts a list or, instead of a list with one entry, this entry itself.
 
-    The annotation itself changes only the JSON schema. A validator of the model turns a single entry into a list.
+    This annotation changes only the JSON Schema. The validator ``Grid._one_is_a_list_of_one`` turns a single entry into
+    a list.
     """
 
     @classmethod
@@ -67,7 +68,7 @@ _Settings = Annotated[dict[str, Any], AfterValidator(_check_keys)]
 
 
 class Request(NamedTuple):
-    """One training of a sweep, as requested in the file of the sweep."""
+    """One training run of a sweep, as requested in the file of the sweep."""
 
     path: YamlPath  # place of the training in the file: ``("grid",)``, or ``("jobs", k)`` for a listed job
     scenario: str  # name or path of the scenario
@@ -86,7 +87,7 @@ def _place(path: YamlPath) -> str:
 
 
 class SeedRange(FileModel):
-    """Seeds of the trainings as a range of ``count`` whole numbers: ``first``, ``first`` + 1, and so on."""
+    """Seeds of the training runs as a range of ``count`` whole numbers: ``first``, ``first`` + 1, and so on."""
 
     first: Seed = Field(default=0, description="smallest seed")
     count: int = Field(ge=1, le=MOST_JOBS, description="number of seeds")
@@ -100,7 +101,7 @@ _Seeds = Annotated[
 
 
 class Grid(FileModel):
-    """Grid of trainings: one training for every combination of the listed scenarios, recipes, settings and seeds."""
+    """Grid of training runs: one run for every combination of the listed scenarios, recipes, settings and seeds."""
 
     settings: Annotated[dict[str, _Values], AfterValidator(_check_keys)] = Field(
         default={},
@@ -118,14 +119,14 @@ class Grid(FileModel):
 
     @property
     def seeds(self) -> Sequence[int]:
-        """All seeds of the trainings, also if the file gives a range."""
+        """All seeds of the training runs: the listed seeds, or every seed in the range."""
         if isinstance(self.seed, SeedRange):
             return range(self.seed.first, self.seed.first + self.seed.count)
         return self.seed
 
 
 class ListedJob(FileModel):
-    """One training of the list ``jobs``: a scenario, a recipe, settings and a seed."""
+    """One training run of the list ``jobs``: a scenario, a recipe, settings and a seed."""
 
     settings: _Settings = Field(default={}, alias="set", description="settings of this job, as in ethbrake train --set")
     scenario: str = Field(description="name or path of the scenario, as in ethbrake train --scenario")
@@ -134,7 +135,7 @@ class ListedJob(FileModel):
 
 
 class SweepFile(StudyFile):
-    """Content of the YAML file of a sweep: trainings as a grid of combinations, as a list of single jobs, or both."""
+    """Content of the YAML file of a sweep: training runs as a grid of combinations, as single jobs, or both."""
 
     settings: _Settings = Field(
         default={}, alias="set", description="settings of every job, as in ethbrake train --set"
@@ -153,7 +154,8 @@ class SweepFile(StudyFile):
     def requests(self) -> Iterator[Request]:
         """Yield all jobs: first the jobs of the grid, then the jobs of the list ``jobs``.
 
-        The jobs of the grid are ordered by seed: all combinations with the first seed come before the second seed.
+        The jobs of the grid are ordered by seed: all jobs with the first seed come before all jobs with the second
+        seed.
         """
         if (grid := self.grid) is not None:
             changes = [
@@ -167,9 +169,10 @@ class SweepFile(StudyFile):
             yield Request(("jobs", k), job.scenario, job.recipe, self._texts(job.settings, ("jobs", k)), job.seed)
 
     def where(self, asked: Request, part: str = "") -> str:
-        """Return the place of a requested job in the file, for messages: ``sweep.yaml, line 7``.
+        """Return the line that requests a job, as text for messages: ``sweep.yaml, line 7``.
 
-        If ``part`` is ``recipe``, ``scenario`` or the key of a setting, the line is the one with this entry of the job.
+        If ``part`` is ``recipe``, ``scenario`` or the key of a setting, the text names the line with this entry of the
+        job.
         """
         path = (*asked.path, "set", part) if part else asked.path
         if part in self.settings:
@@ -196,7 +199,7 @@ TABLE, FAILURES, RUNS = "results.csv", "failures.csv", "runs"  # names inside th
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One job of a sweep, checked and loaded, which becomes one row of the sweep's table."""
+    """One job (one training run) of a sweep, checked and loaded. Its results become one row of the sweep's table."""
 
     asked: Request  # job as requested in the file
     identity: str  # SHA-256 of everything that affects the training (``Training.identity``)
@@ -205,12 +208,12 @@ class Row:
 
     @property
     def settings(self) -> dict[str, str]:
-        """Settings of the job: key -> value, as texts."""
+        """Settings of the job, as a dictionary from key to value, both as text."""
         return dict(text.split("=", 1) for text in self.asked.settings)
 
     @property
     def about(self) -> dict[str, Any]:
-        """Table entries that describe the job, by column: hash, scenario, recipe, algorithm, scheme, seed, steps."""
+        """Values in the job's row of the table that describe the job, by column, such as ``scenario`` and ``seed``."""
         return {
             "hash": self.identity,
             "scenario": self.asked.scenario,
@@ -275,15 +278,15 @@ class SweepPlan:
 
     @staticmethod
     def folder(path: Path) -> StudyFolder:
-        """Return the object that checks and locks the folder ``path`` of a sweep.
+        """Return a ``StudyFolder`` that checks and locks the folder ``path`` of a sweep.
 
-        The object compares no settings, because the folder of each job stores the settings of the job's training.
+        This object compares no settings, because the folder of each job stores the settings of this job.
         """
         return StudyFolder(path, "a sweep", writes=(TABLE, FAILURES))
 
     @staticmethod
     def job(row: Row, path: Path) -> TrainingJob:
-        """Return the training of the job ``row``, with its folder in the sweep's folder ``path``."""
+        """Return the training run of the job ``row``, with its own folder inside the sweep's folder ``path``."""
         training = Training.of(row.first.recipe, row.first.scenario, seed=row.asked.seed)
         return TrainingJob(training, path / RUNS / row.name, row.asked.settings)
 
@@ -292,16 +295,16 @@ class SweepPlan:
         finish(self.job(row, path))
 
     def results(self, path: Path) -> dict[str, dict[str, Any]]:
-        """Return the results of each finished job in the sweep's folder ``path``, by the name of the job.
+        """Return the results of the finished jobs in the sweep's folder ``path``, as a dictionary by name of the job.
 
-        The results of a job are its table entries by column: ``harm`` and all of ``figures.FIGURES``. Example:
-        ``{"ppo-seed0": {"harm": 7.1, "steps": 400000, ...}}``.
+        The results of a job are the values in its row of the table, by column: ``harm`` and all of ``figures.FIGURES``.
+        Example: ``{"ppo-seed0": {"harm": 7.1, "steps": 400000, ...}}``.
         """
         jobs = ((row.name, self.job(row, path)) for row in self.rows)
         return {name: final_figures(job) for name, job in jobs if is_done(job)}
 
     def states(self, path: Path) -> list[dict[str, Any]]:
-        """Return one dictionary for each job, with ``hash``, ``job`` (its name), ``set`` (settings) and ``state``.
+        """Return a dictionary for each job, with ``hash``, ``job`` (its name), ``set`` (its settings) and ``state``.
 
         The state is ``new``, ``begun`` or ``finished``. ``path`` is the sweep's folder.
         """
@@ -319,9 +322,9 @@ class SweepPlan:
     def run(
         self, path: Path, *, jobs: int | None = None, ray: str = LOCAL, retries: int = 2, tell: OnProgress | None = None
     ) -> SweepResult:
-        """Run the unfinished jobs of the sweep, and write the tables.
+        """Run the unfinished jobs of the sweep, and write the tables of results and of failures.
 
-        The tables are also written if Ctrl-C stops the run.
+        Both tables are also written if Ctrl-C stops the run.
 
         Raises ``InvalidInput`` if another process works in the folder, or if no cluster runs at the address ``ray``.
 
@@ -329,7 +332,7 @@ class SweepPlan:
             path: folder of all results; created if necessary.
             jobs: number of jobs that run at once; None: one for each core.
             ray: address of a Ray cluster; ``local``: Ray is started on this machine.
-            retries: number of further attempts at a job whose process is lost.
+            retries: number of times that a job is started again after its process has ended unexpectedly.
             tell: function that is called with the number of jobs that have ended, and with the reason of each failure;
                 None: no reports.
 
@@ -370,9 +373,10 @@ class SweepPlan:
     def _train(
         self, left: list[int], path: Path, jobs: int | None, ray: str, retries: int, tell: OnProgress | None
     ) -> dict[str, str]:
-        """Train jobs on Ray, and return the reasons of failures, by the name of the job.
+        """Train jobs on Ray. Return a dictionary from the name of each failed job to the reason of its failure.
 
-        ``left`` are the indices of the jobs in ``rows``. The docstring of ``run`` explains the other arguments.
+        ``left`` are the indices in ``rows`` of the jobs to train. The docstring of ``run`` explains the other
+        arguments.
         """
         with connected(ray, jobs):
             from ray import tune
@@ -395,7 +399,7 @@ class SweepPlan:
 
 @dataclass(frozen=True, slots=True)
 class SweepResult:
-    """Result of a run of a sweep: the file of the table, and the numbers of finished and failed jobs."""
+    """Result of ``SweepPlan.run``: the file with the table of results, and the numbers of finished and failed jobs."""
 
     table: Path  # CSV file with a row for each finished job
     jobs: int  # number of all jobs
@@ -404,7 +408,7 @@ class SweepResult:
 
     @property
     def interrupted(self) -> bool:
-        """Whether some jobs neither finished nor failed, because Ctrl-C stopped the run."""
+        """Whether Ctrl-C stopped the run, so that some jobs have neither finished nor failed."""
         return self.finished + self.failed < self.jobs
 
 
@@ -413,8 +417,8 @@ def do_job(config: dict[str, Any], plan: SweepPlan, path: Path) -> None:
 
     Args:
         config: configuration of the job, ``{"job": index}``, with its index in ``plan.rows``.
-        plan: plan of the sweep.
-        path: folder of the sweep.
+        plan: checked content of the sweep's file.
+        path: folder with all results of the sweep.
 
     """
     plan.train(plan.rows[config["job"]], path)

@@ -1,4 +1,4 @@
-"""Trainings of a study in their folders: train several at once, continue unfinished ones, and measure their speed."""
+"""Training runs of a study: do several at once, continue them after an interruption, and measure their speed."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 
 
 def train_all(trainings: Sequence[TrainingJob], jobs: int = 1, tell: OnProgress | None = None) -> bool:
-    """Continue every training to its end. Return False if a training was stopped before its end.
+    """Continue every training run to its end. Return False if a run was stopped before its end.
 
-    The trained policies depend neither on ``jobs`` nor on interruptions. The function raises the exceptions of
-    ``steps_left`` before any training begins, and later the exception of the first training that fails.
+    The trained policies depend neither on ``jobs`` nor on interruptions. Before any run begins, raises the exceptions
+    of ``steps_left``. Afterwards, raises the exception of the first run that fails.
 
     Args:
-        trainings: trainings with their folders.
-        jobs: number of trainings that run at once, one process each.
+        trainings: training runs, each with its folder.
+        jobs: number of training runs at the same time, each in a process of its own.
         tell: function that is called with the progress; None: no reports.
 
     """
@@ -51,7 +51,7 @@ def train_all(trainings: Sequence[TrainingJob], jobs: int = 1, tell: OnProgress 
 
 @dataclass(frozen=True, slots=True)
 class TrainingJob:
-    """A training of a study, and the folder in which it runs."""
+    """A training run of a study, and its folder."""
 
     training: Training  # recipe and scenario
     folder: Path  # folder of the run; it need not exist yet
@@ -59,13 +59,13 @@ class TrainingJob:
 
     @property
     def per_update(self) -> int:
-        """Number of decisions of all learners between two updates."""
+        """Number of decisions between two updates of the policy, of all learners together."""
         return self.training.recipe.n_envs * len(self.training.scenario.learners) * self.training.recipe.rounds
 
     def steps_left(self) -> int:
-        """Return the number of decisions until the end of the training; 0 if the training has finished.
+        """Return the number of decisions until the end of the training run; 0 if the run has finished.
 
-        Raises ``InvalidInput`` if the folder contains another training, or is not the folder of a training.
+        Raises ``InvalidInput`` if the folder contains a training run with other settings, or no training run at all.
         """
         run, total = RunDirectory(self.folder), self.training.recipe.total_steps
         if not run.status.exists():
@@ -85,7 +85,9 @@ class TrainingJob:
         return max(total - (steps if isinstance(steps, int) else 0), 1)
 
     def finish(self, tell: OnProgress | None = None, *, stop_at: StopAt | None = None) -> bool | None:
-        """Continue the training to its end. Return True if the training has finished, or None if it was stopped early.
+        """Continue the training run to its end.
+
+        Return True if the run has finished, or None if the run was stopped early.
 
         Raises the exceptions of ``train`` and ``resume``.
 
@@ -113,9 +115,10 @@ class TrainingJob:
         return True if ended.status == "finished" else None
 
     def time(self, sample: Sample | None = None) -> Timed:
-        """Measure how long a few updates of this training take, and how long its policies need to drive 50 worlds.
+        """Measure the time of a few updates of this training run, and the time in which its policies drive some worlds.
 
-        The policies drive the worlds in ``sample``; None: the first 50 worlds of the recipe's list for evaluations.
+        The policies drive at most 50 worlds of ``sample``. If ``sample`` is None, the policies drive the first 50
+        worlds of the list on which the recipe evaluates.
         """
         from ethbrake_marl.training.session import train
 
@@ -146,17 +149,17 @@ class TrainingJob:
 
 
 class Timed(NamedTuple):
-    """Measured speed of a training on one core, in CPU time, which other programs on the machine hardly affect."""
+    """Measured speed of a training run on one core, in CPU time, which other programs on the machine hardly affect."""
 
     job: TrainingJob  # the measured training
     decision_s: float  # training time divided by the number of decisions, s
     world_s: float  # time to evaluate the policies in one world, s
 
     def seconds(self, steps: int) -> float:
-        """Return the estimated time in s of ``steps`` decisions of this training, with the evaluations.
+        """Estimate the time in s in which this training run makes ``steps`` decisions, evaluations included.
 
-        The evaluations of a training, on the recipe's list of worlds, take place at the start, every few updates, and
-        at the end.
+        A training run evaluates its policies at the start, every few updates and at the end, on the recipe's list of
+        worlds.
         """
         recipe = self.job.training.recipe
         times = recipe.total_steps // self.job.per_update // recipe.evaluation.every_updates + 2
@@ -164,7 +167,7 @@ class Timed(NamedTuple):
 
     @staticmethod
     def each_s(worlds: Worlds, work: Callable[[Worlds], object], most: int = 50) -> float:
-        """Measure the CPU time of ``work`` on at most ``most`` of the worlds, and return the time per world in s.
+        """Return the CPU time per world in s that ``work`` needs for the first ``most`` of the ``worlds``.
 
         ``work`` first runs once with one world, so the measured time does not include compilation.
         """

@@ -34,7 +34,7 @@ def run_trials(
     retries: int,
     callback: TrialCallback,
 ) -> list[dict[str, Any]]:
-    """Run trials on Ray Tune, and return the last report of each trial that began, in order of beginning.
+    """Run trials on Ray Tune. Return the last report of each trial that began, in the order in which the trials began.
 
     A report is the dictionary that ``work`` passes to ``tune.report``, and to which Ray adds entries. If the trial
     failed, the entry ``reason`` says why. The entry ``done`` is True if the trial has ended. Ctrl-C stops all trials.
@@ -45,10 +45,10 @@ def run_trials(
         given: further keyword arguments of ``work``, the same for all trials.
         folder: folder of all results; every computer of a cluster must see it.
         config: settings of Ray Tune: search algorithm, scheduler and number of trials.
-        space: for each key of ``config``, the values that Ray Tune tries.
+        space: values that Ray Tune tries, by key; ``work`` gets one value of each key, in the dictionary ``config``.
         jobs: number of trials that run at once; None: one for each core.
-        retries: number of further attempts at a trial whose process is lost, or that raises an error from outside this
-            package.
+        retries: number of times that a trial is started again after its process has ended unexpectedly, or after an
+            exception that is not an ``EthBrakeError``.
         callback: callback that reports the trials that have ended.
 
     """
@@ -84,7 +84,8 @@ def _attempt(config: dict[str, Any], work: Callable[..., None], given: Mapping[s
 
     The docstring of ``run_trials`` explains the other arguments.
 
-    An error of this package is reported as a result, because Ray would repeat the trial after an exception.
+    An ``EthBrakeError`` is caught and reported as the result of the trial, because Ray would repeat the trial after an
+    exception.
     """
     try:
         if not folder.is_dir():
@@ -102,7 +103,7 @@ class TrialCallback(tune.Callback):  # type: ignore[misc]  # Ray ships no types
 
     Args:
         name: name of the study, for the progress display.
-        done: number of trials that ended in earlier runs.
+        done: number of trials that ended in earlier runs of the command.
         total: number of all trials.
         tell: function that is called with each ``Progress``; None: nothing is reported.
 
@@ -116,7 +117,7 @@ class TrialCallback(tune.Callback):  # type: ignore[misc]  # Ray ships no types
         return {}
 
     def say(self, note: str = "") -> None:
-        """Report how many trials have ended. ``note`` is a message to print once."""
+        """Report how many trials have ended. ``note`` is an additional message to print."""
         self._tell(Progress(self._name, self._done, self._total, note=note))
 
     def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
@@ -125,10 +126,10 @@ class TrialCallback(tune.Callback):  # type: ignore[misc]  # Ray ships no types
         self.say(str(trial.last_result.get(REASON, "")))
 
     def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        """Count a trial that has failed after all its attempts. Ray calls this method."""
+        """Count a trial that has failed at its last attempt. Ray calls this method."""
         self._done += 1
         self.say("a trial failed after all attempts; the table contains the reason")
 
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        """Report that a trial starts again. Ray calls this method."""
+        """Report that a trial starts again after its process has ended unexpectedly. Ray calls this method."""
         self.say("the process of a trial was lost or failed; the trial is tried again")

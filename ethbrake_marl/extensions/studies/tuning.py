@@ -73,7 +73,7 @@ _Number = Annotated[int | float, PlainValidator(_check_number), WithJsonSchema({
 class Range(FileModel):
     """Range of the numbers that a search may try for one setting, from ``low`` to ``high`` inclusive.
 
-    If both ends are written without a decimal point, the search tries only whole numbers.
+    If ``low`` and ``high`` are written without a decimal point, the search tries only whole numbers.
     """
 
     low: _Number = Field(description="smallest value to try")
@@ -89,7 +89,7 @@ class Range(FileModel):
 
     @property
     def whole(self) -> bool:
-        """Whether the search tries only whole numbers: both ends are written without a decimal point."""
+        """Whether the search tries only whole numbers: ``low`` and ``high`` are written without a decimal point."""
         return isinstance(self.low, int) and isinstance(self.high, int)
 
     @model_validator(mode="after")
@@ -102,11 +102,14 @@ class Range(FileModel):
 
     @property
     def ends(self) -> tuple[Any, ...]:
-        """Both ends of the range. The recipe must accept both ends, which is checked before the search starts."""
+        """The smallest and the largest value.
+
+        Before the search starts, the recipe is checked with each of these two values.
+        """
         return self.low, self.high
 
     def own(self, value: Any) -> int | float | None:
-        """Return ``value``, which the recipe has for this setting, as a number; None if it is outside the range."""
+        """Return ``value``, the recipe's own value of this setting, as a number; None if it is outside the range."""
         if not isinstance(value, int | float) or isinstance(value, bool) or not self.low <= value <= self.high:
             return None
         if not self.whole:
@@ -122,7 +125,7 @@ class Range(FileModel):
         return FloatDistribution(float(self.low), float(self.high), log=self.log)
 
     def stored(self, value: Any) -> Any:
-        """Return ``value`` in the form in which Optuna stores it, which is ``value`` itself for a range."""
+        """Return ``value`` unchanged, because Optuna stores a number of a range as the number itself."""
         return value
 
     value = stored
@@ -149,11 +152,11 @@ class Choices(FileModel):
 
     @property
     def ends(self) -> tuple[Any, ...]:
-        """All choices. The recipe must accept every choice, which is checked before the search starts."""
+        """All choices. Before the search starts, the recipe is checked with each choice."""
         return self.choices
 
     def own(self, value: Any) -> Any:
-        """Return the choice that equals ``value``, which the recipe has for this setting; None if there is none."""
+        """Return the choice that equals ``value``, the recipe's own value of this setting; None if there is none."""
         return next((each for each in self.choices if flow_text(each) == flow_text(value)), None)
 
     def distribution(self) -> BaseDistribution:
@@ -186,7 +189,7 @@ def _check_recipe_keys(value: dict[str, Any]) -> dict[str, Any]:
 
 
 class Measuring(FileModel):
-    """How trials are evaluated: the worlds that the policies drive, and the number of evaluations per training."""
+    """How trials are evaluated: the worlds that the policies drive, and the number of evaluations per training run."""
 
     # Number of worlds in which the policies are evaluated.
     worlds: int = Field(
@@ -201,8 +204,9 @@ class Measuring(FileModel):
 class Pruning(FileModel):
     """Rule that stops weak trials early (Ray's median stopping rule).
 
-    A trial is one training. At an evaluation, the mean harm so far of each other trial is computed, up to the same
-    evaluation. The trial is stopped if its own least harm so far is above the median of these means.
+    A trial is one training run with several evaluations. After the k-th evaluation of a trial, the rule computes the
+    mean harm of each other trial so far, up to the k-th evaluation. If the trial's own least harm so far is above the
+    median of these means, the trial is stopped.
     """
 
     # Number of other trials that must have reached an evaluation before a trial may be stopped there.
@@ -248,7 +252,7 @@ class Sampling(FileModel):
 
 
 class TuningFile(StudyFile):
-    """Content of the YAML file of a tuning: a training, and the settings of its recipe that the search changes."""
+    """Content of the YAML file of a tuning: scenario and recipe of all training runs, and the settings to search."""
 
     scenario: str = Field(description="name or path of the scenario, as in ethbrake train --scenario")
     recipe: str = Field(description="name or path of the recipe, as in ethbrake train --recipe")
@@ -269,20 +273,20 @@ class TuningFile(StudyFile):
     sampler: Sampling = Field(default=Sampling(), description="method that chooses the values of the next trial")
 
     def values(self, proposal: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the values of a proposal as the recipe's YAML file would contain them, by key.
+        """Convert a proposal of Optuna into values as in the YAML file of a recipe, and return them by key.
 
         ``proposal`` maps each searched key to its value as Optuna stores it.
         """
         return {key: self.search[key].value(value) for key, value in proposal.items()}
 
     def space(self) -> dict[str, BaseDistribution]:
-        """Return Optuna's distribution of the values of each searched key, by key."""
+        """Return a dictionary from each searched key to Optuna's distribution of its values."""
         return {key: dimension.distribution() for key, dimension in self.search.items()}
 
     def points(self, number: int) -> Iterator[dict[str, Any]]:
-        """Yield ``number`` random points of the space, each as a dictionary from key to value.
+        """Yield ``number`` random combinations of values, each as a dictionary from searched key to value.
 
-        Every call yields the same points.
+        Every call yields the same combinations.
         """
         with naming_extras():
             import optuna
@@ -312,7 +316,7 @@ TABLE, TRIALS, PROPOSALS = "trials.csv", "trials", "proposals.json"  # names ins
 
 @dataclass(frozen=True)
 class TuningPlan:
-    """A tuning whose file is checked and loaded: everything that the trials have in common."""
+    """Content of a tuning's file after it was checked, with the scenario and the recipe that all trials share."""
 
     file: TuningFile  # content of the tuning's file
     recipe: TrainingRecipe  # recipe with the file's settings and seed, before any searched value
@@ -375,10 +379,10 @@ class TuningPlan:
         return plan
 
     def training(self, values: Values) -> Training:
-        """Return the training of a trial with these values of the searched keys.
+        """Return the training run of the trial in which the searched keys have these ``values``.
 
-        Every training has about ``measure.times`` evaluations, so that trials can be compared before they finish.
-        Raises ``InvalidInput`` if the recipe does not allow the combination of values.
+        Every training run has about ``measure.times`` evaluations, so that trials can be compared before they finish.
+        Raises ``InvalidInput`` if the recipe does not allow this combination of values.
         """
         recipe = read_settings(texts_of(values), [self.recipe]).change(self.recipe)
         asked = self.file.measure
@@ -387,19 +391,20 @@ class TuningPlan:
         return Training.of(recipe.replace(evaluation=listed), self.scenario)
 
     def updates(self, recipe: TrainingRecipe) -> int:
-        """Return the number of updates in a complete training with ``recipe``."""
+        """Return the number of policy updates in a complete training run with ``recipe``."""
         return -(-recipe.total_steps // (recipe.n_envs * len(self.scenario.learners) * recipe.rounds))
 
     def own_values(self) -> dict[str, Any] | None:
-        """Return the recipe's value of each searched key; None if a range or list of choices excludes one of them."""
+        """Return the recipe's own value of each searched key; None if the search excludes any of these values."""
         content = self.recipe.model_dump(mode="json")
         own = {key: dimension.own(_value_at(content, key)) for key, dimension in self.file.search.items()}
         return None if None in own.values() else own
 
     def example(self) -> str:
-        """Return a command line ``ethbrake train ...`` that runs the training of one trial.
+        """Return a command line ``ethbrake train ...`` that does the same training run as one trial.
 
-        The trial has the values that the recipe itself contains, or random values if the ranges exclude them.
+        The searched keys have the recipe's own values. If the search excludes any of these values, the keys have random
+        values.
         """
         values = self.own_values() or next(self.file.points(1))
         measured = {"evaluation": self.training(values).recipe.evaluation.model_dump(mode="json")}
@@ -428,9 +433,9 @@ class TuningPlan:
             raise InvalidInput(f"search: {', '.join(texts_of(values))} is not possible: {error}") from None
 
     def folder(self, path: Path) -> StudyFolder:
-        """Return the object that checks and locks the folder ``path``.
+        """Return a ``StudyFolder`` that checks and locks the folder ``path``.
 
-        The object refuses the folder of a tuning with other settings.
+        This object raises ``InvalidInput`` if the folder belongs to a tuning with other settings.
         """
         return StudyFolder(path, "a tuning", self.question, record="tuning.json", writes=(TABLE,))
 
@@ -457,9 +462,11 @@ class TuningPlan:
         return [*known]
 
     def job(self, values: Values, path: Path) -> TrainingJob:
-        """Return the training with ``values``, and the folder for this training inside the tuning's folder ``path``.
+        """Return the training run with these ``values`` of the searched keys, and its folder inside ``path``.
 
-        Trials with equal values share one training and one folder.
+        ``path`` is the folder of the tuning.
+
+        Two trials with equal values share one training run and one folder.
         """
         training = self.training(values)
         return TrainingJob(training, path / TRIALS / training.identity[:16], texts_of({**self.file.settings, **values}))
@@ -474,19 +481,19 @@ class TuningPlan:
         retries: int = 2,
         tell: OnProgress | None = None,
     ) -> TuningResult:
-        """Run trials until the folder contains ``trials`` trials, and write their table.
+        """Run trials until the folder contains ``trials`` trials, and write a table with a row for each trial.
 
-        Every run repeats the search from the first trial, with the proposals that earlier runs have stored. The results
-        of finished trainings are read from their folders, and unfinished trainings continue. The table is also written
-        if Ctrl-C stops the run. Raises ``InvalidInput`` if another process works in the folder, if a file is damaged,
-        or if no cluster runs at the address ``ray``.
+        Every run repeats the search from the first trial, with the proposals that earlier runs have stored. Finished
+        trials are not trained again: their results are read from their folders. Unfinished trials continue. The table
+        is also written if Ctrl-C stops the run. Raises ``InvalidInput`` if another process works in the folder, if a
+        file is damaged, or if no cluster runs at the address ``ray``.
 
         Args:
             path: folder of all results; created if necessary.
-            trials: number of trials in the folder at the end.
+            trials: number of trials that the folder contains at the end, with the trials of earlier runs.
             jobs: number of trials that run at once; this number affects the proposals.
             ray: address of a Ray cluster; ``local``: Ray is started on this machine.
-            retries: number of further attempts at a trial whose process is lost.
+            retries: number of times that a trial is started again after its process has ended unexpectedly.
             tell: function that is called with the number of trials that have ended, and with the reason of each
                 failure; None: no reports.
 
@@ -520,9 +527,9 @@ class TuningPlan:
     def _search(
         self, path: Path, known: list[Values], trials: int, jobs: int, retries: int, tell: OnProgress | None
     ) -> tuple[list[Values], list[dict[str, Any]]]:
-        """Run the trials on Ray. Return all proposals, and the last report of each trial.
+        """Run the trials on Ray. Return all proposals, and the last result that each trial reported to Ray.
 
-        ``known`` are the proposals of earlier runs. The other arguments are explained in ``run``.
+        ``known`` are the proposals of earlier runs. The docstring of ``run`` explains the other arguments.
         """
         from ray import tune
 
@@ -551,14 +558,15 @@ class TuningPlan:
         return search.known, ends
 
     def best_recipe(self, values: Values, file: Path, source: str) -> str:
-        """Return the YAML text of a recipe that repeats the training with these values.
+        """Return the YAML text of a recipe that repeats the training run of the trial with these ``values``.
 
-        Raises ``InvalidInput`` if the name of the file is not a valid name of a recipe.
+        Raises ``InvalidInput`` if the name of ``file`` is not a valid name of a recipe.
 
         Args:
             values: value of each searched key.
-            file: path of the file for the text; the name of the file becomes the name of the recipe.
-            source: text for the key ``source`` of the recipe.
+            file: path of the file to which the caller writes the text; the name of this file becomes the name of the
+                recipe.
+            source: value of the recipe's key ``source``, a text.
 
         """
         check_file_name("recipe", file.stem)
@@ -577,7 +585,7 @@ class TuningPlan:
         return recipe.text(f"# The best trial of a tuning, trained again: {command}\n")
 
     def has_exported(self, path: Path, file: Path) -> bool:
-        """Return whether ``file`` is the exported recipe of one of the trials in the tuning's folder ``path``."""
+        """Return whether ``file`` is a recipe that was exported from a trial in the tuning's folder ``path``."""
         try:
             source, text = load_recipe(file).source, file.read_text("utf-8")
         except InvalidInput:
@@ -591,7 +599,7 @@ State = Literal["running", "finished", "pruned", "failed"]
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One trial of a tuning: a training with certain values of the searched keys, and how it ended."""
+    """One trial of a tuning: the values of the searched keys in one training run, and the result of this run."""
 
     number: int  # number of the trial, from 0
     state: State  # state of the trial; ``pruned``: stopped early because of too much harm
@@ -602,9 +610,9 @@ class Trial:
 
     @classmethod
     def of(cls, number: int, values: Values, end: Mapping[str, Any]) -> Trial:
-        """Return the trial with this number and these values.
+        """Return the trial ``number`` with these ``values`` of the searched keys, and with the result in ``end``.
 
-        ``end`` is the last report of the trial (``run_trials``).
+        ``end`` is the last result that the trial reported to Ray (see ``run_trials``).
         """
         reason = str(end.get(REASON, ""))
         state: State = "running"
@@ -618,7 +626,7 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class TuningResult:
-    """Result of a run of a tuning: the trials, and the file of their table."""
+    """Result of ``TuningPlan.run``: the trials, and the file with their table."""
 
     table: Path  # CSV file with a row for each trial that ended
     asked: int  # requested number of trials in the folder
@@ -636,7 +644,7 @@ class TuningResult:
 
     @property
     def best(self) -> Trial | None:
-        """Finished trial with the least harm, or the first of several with equal harm.
+        """Finished trial with the least harm; if several trials have this harm, the first of them.
 
         None if no trial has finished.
         """
@@ -645,15 +653,15 @@ class TuningResult:
 
 
 def do_trial(config: dict[str, Any], plan: TuningPlan, path: Path) -> None:
-    """Train one trial to its end in a worker process of Ray, and report every evaluation.
+    """Train the policy of one trial to the end in a worker process of Ray, and report every evaluation.
 
     When the trial reports an evaluation, Ray may stop (prune) the trial.
 
     Args:
         config: configuration of the trial, ``{"trial": number, "values": proposal}``, with values as Optuna stores
             them.
-        plan: plan of the tuning.
-        path: folder of the tuning.
+        plan: checked content of the tuning's file.
+        path: folder with all results of the tuning.
 
     """
     from ray.tune import report

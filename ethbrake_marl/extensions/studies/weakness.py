@@ -1,4 +1,7 @@
-"""Measures of how badly an agent does in a world. A search for the worst worlds uses them as scores."""
+"""Measures of how badly an agent does in a world.
+
+A search for an agent's worst worlds uses such a measure as its score.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,7 @@ HINDSIGHT = "best_harm"  # default reference agent of the measure regret
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Score, harm and reference of an agent in n worlds, in m2/s2."""
+    """Score and harm of an agent in n worlds, and the harm with which its harm is compared, in m2/s2."""
 
     score: Floats  # [n] value of the measure, the larger the worse for the agent; minus infinity if the physics failed
     harm: Floats  # [n] harm of the agent; NaN if the physics failed
@@ -42,7 +45,7 @@ class Measured:
 class Measure:
     """Measure of how badly an agent does in a world.
 
-    Call the measure with a sample to compute the score of every world.
+    Call this object with a ``Sample`` of worlds to compute the score of every world.
 
     There are four measures. ``harm`` is the agent's harm. ``regret`` is the agent's harm minus the harm of a reference
     agent, by default ``best_harm``. ``difference`` is the absolute difference between the harms of the agent and the
@@ -56,10 +59,10 @@ class Measure:
     harm_count: HarmCount  # harm count: the first impact of each pair (``first``) or all impacts (``total``)
 
     def __call__(self, sample: Sample) -> Measured:
-        """Return the score and the harm of the agent in each world of ``sample``, and the reference harm.
+        """Return the agent's score and harm in each world of ``sample``, and the harm with which its harm is compared.
 
-        If the physics fails, all scores are minus infinity. Raises ``InvalidInput`` for the measure ``bound`` if the
-        agent has no shield.
+        If the physics fails in any world, the scores of all worlds are minus infinity. Raises ``InvalidInput`` for the
+        measure ``bound`` if the agent has no shield.
         """
         n = sample.worlds.n
         score, harm, reference = np.full(n, -np.inf), np.full(n, np.nan), np.full(n, np.nan)
@@ -87,10 +90,10 @@ class Measure:
     def falsify(
         self, budget: int, seed: int, *, most: int = 20, adaptive: bool = True, on_round: Watcher | None = None
     ) -> Falsified:
-        """Search the ranges of the scenario for the worlds in which the agent does worst.
+        """Search the worlds that the scenario can draw for those in which the agent does worst.
 
-        Unless the measure is ``bound``, the result contains only worlds with a score above 0, so it may be empty.
-        Raises the exceptions of ``scenario.ranges``. Raises ``InvalidInput`` if no tried world has a finite score.
+        For every measure but ``bound``, only worlds with a score above 0 are returned, so there may be none. Raises the
+        exceptions of ``scenario.ranges``. Raises ``InvalidInput`` if no tried world has a finite score.
 
         Args:
             budget: number of worlds to try.
@@ -143,11 +146,12 @@ class Measure:
 
         Args:
             name: name of the measure: ``harm``, ``regret``, ``difference`` or ``bound``.
-            agent: spec of the agent.
-            against: spec of the reference agent; None: ``best_harm`` for ``regret``, no reference for ``harm`` and
-                ``bound``.
+            agent: spec of the agent, such as ``ppo`` or ``ppo+step``.
+            against: spec of the reference agent, whose harm the measures ``regret`` and ``difference`` compare with the
+                agent's harm. For ``regret``, None means ``best_harm``. For ``harm`` and ``bound``, ``against`` must be
+                None.
             scenario: scenario whose learners the agents drive.
-            harm_count: harm count: the first impact of each pair (``first``) or all impacts (``total``).
+            harm_count: impacts that count as harm: the first of each pair (``first``) or all (``total``).
 
         """
         chosen = next((each for each in MEASURES if each == name), None)
