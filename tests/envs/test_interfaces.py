@@ -33,7 +33,7 @@ from tests.contract.interfaces import CRASH, FIVE, PAPER, REST, actions, initial
 near = pytest.approx
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "environments.md").read_text("utf-8")
-INFOS = PAGE.partition("\n## Infos\n")[2].partition("\n- With a `v2x` channel")[0]
+INFOS = PAGE.partition("\n## Infos\n")[2].partition("\n\n- ")[0]
 BRAKE = np.full(1, -1.0, np.float32)
 
 
