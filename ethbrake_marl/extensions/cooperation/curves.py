@@ -147,8 +147,7 @@ def _curve(
 
 
 def _places(levels: Sequence[Json], beside: int) -> list[float]:
-    """Return the x position of each level: the number in the value of its key, plus ``beside`` small steps to the
-    right."""
+    """Return the x position of each level: the number in its value of the key, plus ``beside`` small steps."""
     low, high = _span(levels)
     return [level["swept_number"] + beside * _BESIDE * (high - low) for level in levels]
 

@@ -75,7 +75,7 @@ class _Game(NamedTuple):
         return self._replace(worlds=self.worlds.take(rows), joint=self.joint.take(rows), others=self.others[rows])
 
     def together(self, own: list[Profiles]) -> Profiles:
-        """Join the profiles ``own`` of the single learners into one profile of all, with one phase for each decision."""
+        """Join the profiles ``own`` of the single learners into one profile of all, with a phase for each decision."""
         steps = np.arange(int(self.joint.last_step.max()))
         at = [np.concatenate([each.at(np.full(self.joint.n, step)) for each in own], axis=1) for step in steps]
         return Profiles(np.minimum(steps + 1, self.joint.last_step[:, np.newaxis]), np.stack(at, axis=1))

@@ -288,7 +288,8 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
 def _drive(scenario: Scenario, sample: Sample, drivers: Sequence[Driver], tell: OnProgress) -> Harms:
     """Let each of the agents or teams ``drivers`` drive in the same worlds; return their harm.
 
-    The result has one seed for each agent or team."""
+    The result has one seed for each agent or team.
+    """
     outcomes = []
     for driver in drivers:
         result = evaluate(sample, {driver.name: driver}, scenario=scenario).complete()
