@@ -54,9 +54,9 @@ def scenario_from_data(
     """Create a scenario from the recordings in a folder and in all its subfolders.
 
     At regular times, each queue of vehicles in a recording is cut into chains, beginning at its front. A chain has as
-    many vehicles as the scenario ``based_on``. At one time, a vehicle belongs to at most one chain. Each chain is one row
-    of speeds and gaps. If there are more rows than a table may have, every k-th row is
-    used. Files with errors are left out; all other files are used.
+    many vehicles as the scenario ``based_on``. At one time, a vehicle belongs to at most one chain. Each chain is one
+    row of speeds and gaps. If there are more rows than a table may have, every k-th row is used. Files with errors are
+    left out; all other files are used.
 
     Args:
         name: name of the scenario.
@@ -128,7 +128,7 @@ def scenario_from_data(
 
 
 def _name(file: str, vehicles: str) -> str:
-    """Return the name of a chain: recording and vehicles, such as ``drive_1.csv: 2-3-4``; the start of a long name is cut."""
+    """Return the name of a chain, such as ``drive_1.csv: 2-3-4``; a long name loses its beginning."""
     return f"{file}: {vehicles}".strip()[-MOST_CHARACTERS:].strip()
 
 

@@ -172,9 +172,9 @@ def _states(piece: Piece, entry: Format, ticks: Floats, turned: Floats) -> Float
 def _of_gaps(piece: Piece, entry: Format, ticks: Floats) -> Floats:
     """Return the fields of ``State`` for OpenACC, [rows, fields].
 
-    Car k follows car k - 1 if the speeds of both cars and the gap between these cars (column
-    ``IVS`` with the number k - 1) are recorded. The first car of a queue has position 0. The position of every other car
-    is minus the sum of the gaps ahead of it.
+    Car k follows car k - 1 if the speeds of both cars and the gap between these cars (column ``IVS`` with the number
+    k - 1) are recorded. The first car of a queue has position 0. The position of every other car is minus the sum of
+    the gaps ahead of it.
     """
     at = {name.lower(): k for k, name in enumerate(piece.columns)}
     cars = sorted(int(name.removeprefix("speed")) for name in at if name.startswith("speed"))
