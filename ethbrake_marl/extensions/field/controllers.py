@@ -82,8 +82,7 @@ class Seen(NamedTuple):
 
     @property
     def until_contact_s(self) -> Floats:
-        """Time until contact with the vehicle ahead at the present speeds, [n] s; infinite if the gap does not
-        close."""
+        """Time until contact with the vehicle ahead at present speeds, [n] s; infinite if the gap does not close."""
         closing = self.closing_mps
         return np.where(closing > 0.0, self.gap_m / np.where(closing > 0.0, closing, 1.0), np.inf)
 
@@ -96,8 +95,8 @@ class Seen(NamedTuple):
         """Return the command for the next time step, [n] m/s2, with a limited growth of the deceleration.
 
         Args:
-        wanted_mps2: [n] acceleration that the law wants (m/s2).
-        rate_mps3: largest growth of the deceleration per second (m/s3).
+                    wanted_mps2: [n] acceleration that the law wants (m/s2).
+            rate_mps3: largest growth of the deceleration per second (m/s3).
 
         """
         return np.maximum(wanted_mps2, np.minimum(self.own_mps2, 0.0) - rate_mps3 * self.step_s)
@@ -148,8 +147,7 @@ def _human_notices(seen: Seen, p: Parameters) -> Bools:
 
 
 def _share(distance: Floats, safe: Floats, unsafe: Floats) -> Floats:
-    """Return a degree of danger [n]: 0 if ``distance`` is above ``safe``, 1 if it is below ``unsafe``, linear
-    between."""
+    """Return the danger [n]: 0 for a ``distance`` above ``safe``, 1 below ``unsafe``, and linear in between."""
     between = (safe - distance) / np.where(safe > unsafe, safe - unsafe, 1.0)
     return np.where(distance > safe, 0.0, np.where(distance < unsafe, 1.0, between))
 
@@ -312,9 +310,9 @@ def make_controller(argument: str | None, settings: AgentSettings) -> Controller
     """Return the controller that a text such as ``idm:T=1.0`` names.
 
     Args:
-    argument: values of parameters, which follow the name of the law in this text, such as ``T=1.0`` or ``T=1.0:a=2``;
-        None: all parameters have their default values.
-    settings: the whole text (``settings.spec``), and the time step of the scenario.
+        argument: part of this text after the name of the law: values of parameters, such as ``T=1.0`` or ``T=1.0:a=2``;
+            None: all parameters have their default values.
+        settings: the whole text (``settings.spec``), and the time step of the scenario.
 
     Raises ``UnknownName`` for a parameter that the law does not have. Raises ``InvalidInput`` if a value is not a
     number or is out of range, or if a parameter is repeated.

@@ -127,7 +127,7 @@ class Host(Protocol):
     dt: float
 
     def state(self) -> HostState:
-        """Return the present time, gaps and speeds; if the host resolves impacts, also the impacts since the last call."""
+        """Return the present time, gaps and speeds; if the host resolves impacts, also those since the last call."""
 
     def apply(self, command: HostCommand) -> None:
         """Move all vehicles for one time step with the accelerations in ``command``."""

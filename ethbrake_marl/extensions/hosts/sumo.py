@@ -84,8 +84,7 @@ class SumoHost:
         return HostState(self._sumo.simulation.getTime(), gaps, self._speeds)
 
     def apply(self, command: HostCommand) -> None:
-        """Set the speed that ``command`` requires of each vehicle at the end of the step, and let SUMO make the
-        step."""
+        """Compute from ``command`` the speed of each vehicle at the end of the step, and let SUMO make the step."""
         vehicle, begin = self._sumo.vehicle, np.maximum(command.speeds_mps, 0.0)
         end = np.maximum(command.speeds_mps + command.acceleration_mps2 * self.dt, 0.0)
         for k, line in enumerate(self._names):
