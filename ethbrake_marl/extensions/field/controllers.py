@@ -95,7 +95,7 @@ class Seen(NamedTuple):
         """Return the command for the next time step, [n] m/s2, with a limited growth of the deceleration.
 
         Args:
-                    wanted_mps2: [n] acceleration that the law wants (m/s2).
+            wanted_mps2: [n] acceleration that the law wants (m/s2).
             rate_mps3: largest growth of the deceleration per second (m/s3).
 
         """
