@@ -46,8 +46,8 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         reward: reward of the learners: a name such as ``harm``, or the weights of the reward's terms.
         horizon_is_end: if True, an episode that reaches the horizon is terminated; if False, it is truncated.
         shield: mode of the learners' shield, which must be ``step`` if there are several learners. None: no shield.
-        actions: None: actions are numbers in [-1, 1]. A number: there are this many discrete actions, as algorithms
-            such as QMIX need, and an action is an index.
+        actions: number of discrete actions, for algorithms such as QMIX, which choose the index of an action. None:
+            actions are numbers in [-1, 1].
 
     """
 

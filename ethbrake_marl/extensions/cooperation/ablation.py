@@ -29,7 +29,7 @@ def run_ablation(
         plan: settings of the ablation.
         jobs: number of training runs at the same time, and of threads in the search for the joint optima.
         machine: description of this machine, which is stored with the results.
-        tell: function that receives the progress; None: the progress is not reported.
+        tell: function that is called with each progress report; None: progress is not reported.
 
     Returns the content of ``ablation.json``, and the paths of the page, the Markdown file and the figures. Returns None
     if Ctrl-C stopped the training runs. Output files of an earlier call are replaced. Raises the exceptions of

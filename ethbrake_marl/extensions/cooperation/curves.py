@@ -147,7 +147,7 @@ def _curve(
 
 
 def _places(levels: Sequence[Json], beside: int) -> list[float]:
-    """Return the x position of each level: the number in its value of the key, plus ``beside`` small steps."""
+    """Return the x position of each level: the number in its value, moved right by ``beside`` small steps."""
     low, high = _span(levels)
     return [level["swept_number"] + beside * _BESIDE * (high - low) for level in levels]
 

@@ -1,9 +1,9 @@
 """Joint optimum of a level: in each world, the least known harm that the level's learners can achieve together.
 
-The joint optimum depends on the worlds, on the learners and on the scripts of the other vehicles. It does not depend on
-what the learners know or on their objectives. Levels that differ only in information or objectives therefore share one
-search for the joint optimum. The commands that the search finds for one level also count at every other level whose
-learners can give the same commands.
+The joint optimum depends on the worlds, on the learners and on the scripts of the other vehicles. The joint optimum
+does not depend on what the learners know or on their objectives. Levels that differ only in information or objectives
+therefore share one search for the joint optimum. The best commands of one level are also used for every other level
+whose learners can give the same commands.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def search_all(plan: Plan, samples: Sequence[Sample], jobs: int, tell: OnProgres
         plan: settings of the ablation.
         samples: worlds of each level, in the order of ``plan.levels``.
         jobs: number of threads of the search.
-        tell: function that receives the progress.
+        tell: function that is called with each progress report.
 
     """
     tables: dict[str, BestHarmTable] = {}
@@ -125,10 +125,10 @@ def best_known(own: LevelOptimum, answers: Sequence[LevelOptimum]) -> dict[HarmC
 def _can_imitate(own: LevelOptimum, other: LevelOptimum) -> Bools:
     """Return for each world, [n] bool, whether learners of ``own`` can give the commands of the learners of ``other``.
 
-    This is true if five conditions are met: each learner of ``other`` is also a learner in ``own``; each scripted
+    They can do this if five conditions are met: each learner of ``other`` is also a learner in ``own``; each scripted
     vehicle of ``own`` has the same script in ``other``; the lines of vehicles are the same; the latencies are equal;
-    and each decision time of ``other`` is also a decision time of ``own``. An obstacle on the road in ``own`` only is
-    no problem, because ``_harms`` simulates the commands of ``other`` again with this obstacle.
+    and each decision time of ``other`` is also a decision time of ``own``. It does not matter if only ``own`` has an
+    obstacle on the road, because ``_harms`` simulates the commands of ``other`` again with this obstacle.
     """
     mine, theirs = own.level.scenario, other.level.scenario
     same_scripts = all(theirs.scripts.get(i) == script for i, script in mine.scripts.items())
@@ -234,7 +234,7 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
     Args:
         plan: settings of the ablation. All training runs of the ablation must be finished.
         jobs: number of threads of the search.
-        tell: function that receives the progress; None: the progress is not reported.
+        tell: function that is called with each progress report; None: progress is not reported.
 
     Returns one result for each level and algorithm: levels in the order of ``plan.levels``, and for each level the
     algorithms in the order of ``plan.algorithms``. Before it evaluates or searches, the function raises the exceptions
@@ -288,7 +288,7 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
 def _drive(scenario: Scenario, sample: Sample, drivers: Sequence[Driver], tell: OnProgress) -> Harms:
     """Let each of the agents or teams ``drivers`` drive in the same worlds; return their harm.
 
-    The result has one seed for each agent or team.
+    In the result, each agent or team counts as one training seed.
     """
     outcomes = []
     for driver in drivers:

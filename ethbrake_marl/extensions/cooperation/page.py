@@ -34,8 +34,8 @@ _MOST, _USUAL, _LEAST = 3, 2, 2  # number of example worlds with the largest, a 
 def choose_worlds(measured: Sequence[Measured]) -> list[Played]:
     """Choose worlds for the page by the decrease of total harm from the first to the last level.
 
-    The chosen worlds are those with the largest, a median and the least decrease under the policies of the first seed.
-    Copies of levels with a worse V2X channel are ignored.
+    Some of the chosen worlds have the largest decrease, some a median decrease, and some the least decrease, each with
+    the policies of the first seed. Copies of levels with a worse V2X channel are ignored.
     """
     ladder = [one for one in measured if one.level.clear is None]
     first, last = ladder[0], ladder[-1]

@@ -73,7 +73,7 @@ def make_section(experiment: Experiment, tell: OnProgress) -> RunSection | None:
 
     Args:
         experiment: the finished run, with its folder, policies and evaluation.
-        tell: function that receives the progress.
+        tell: function that is called with each progress report.
 
     Returns the section of the report; None if the run has only one learner.
 
@@ -208,7 +208,7 @@ def _train(experiment: Experiment, scenario: Scenario, folder: str, share: int, 
         scenario: scenario to train in.
         folder: name of the folder for this training run, inside the folder of the finished run.
         share: the number of decisions is the finished run's number of decisions divided by ``share``.
-        tell: function that receives the progress.
+        tell: function that is called with each progress report.
 
     """
     recipe, path = experiment.trained.training.recipe, experiment.run.path / folder
@@ -266,7 +266,7 @@ def _borne(outcomes: Mapping[str, Outcome], harm_count: HarmCount, evaluation: E
 def _added(experiment: Experiment) -> Sheet:
     """Return a table of the harm that each learner of the team prevents.
 
-    A learner prevents (harm of the line if this learner brakes fully) - (harm of the line with the whole team).
+    The harm that a learner prevents is (harm of the line if this learner brakes fully) - (harm with the whole team).
     """
     evaluation, scenario = experiment.evaluation, experiment.evaluation.scenario
     columns = [Column("Learner", "learner", text=True)]

@@ -221,7 +221,7 @@ def write_dataset(
     If an environment starts in a recorded world and gets the recorded actions, it repeats the episode bit for bit.
     docs/extensions/datasets.md describes the files. Before it begins to record, the function raises ``InvalidInput`` if
     an argument is invalid, ``AlreadyExists`` if ``path`` exists and ``force`` is false, and ``MissingExtra`` if a
-    library is not installed. At the end it raises ``PhysicsError`` if the physics could not simulate even one world.
+    library is not installed. At the end it raises ``PhysicsError`` if the physics could simulate none of the worlds.
 
     Args:
         path: file (``.parquet``) or folder (``NAME-v0``) to write.
@@ -288,7 +288,7 @@ def check_dataset(
     Raises the exceptions that ``write_dataset`` raises before it begins to record.
 
     Args:
-        path: file or folder to write.
+        path: file (``.parquet``) or folder (``NAME-v0``) to write.
         scenario: scenario whose learners are recorded.
         format: ``parquet`` or ``minari``; None: the ending of ``path`` selects the format.
         force: whether an existing dataset may be replaced.

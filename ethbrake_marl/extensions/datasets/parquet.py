@@ -58,7 +58,7 @@ def decision_columns(recording: Recording) -> Columns:
     before = recording.told
 
     def each(values: NDArray[Any]) -> NDArray[Any]:
-        """Return the elements of ``values`` [T or T + 1, n, ...] for all decisions, episode after episode."""
+        """Return one element of ``values`` [T or T + 1, n, ...] for each decision, ordered by world, then by time."""
         return values[: running.shape[1]].swapaxes(0, 1)[running]
 
     def whole(values: NDArray[Any]) -> NDArray[Any]:

@@ -105,9 +105,9 @@ class Recording:
 def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Recording:
     """Let an agent drive the learners of the scenario, and record the episodes.
 
-    The commands of the agent are rounded to float32 actions, and the recorded episodes use these actions. Raises
-    ``PhysicsError``, which names the worlds, if the physics cannot simulate every world. Also raises the exceptions of
-    ``episode_engine``.
+    The commands of the agent are rounded to float32 actions, and the recorded episodes use these actions. If there are
+    worlds that the physics cannot simulate, raises ``PhysicsError``, which names these worlds. Also raises the
+    exceptions of ``episode_engine``.
 
     Args:
         sample: worlds at the alert.

@@ -99,7 +99,8 @@ class HostCommand(NamedTuple):
 class Host(Protocol):
     """Interface of a host: a simulator that moves ``n`` lines of vehicles, one line per world, from the alert on.
 
-    A host has the attribute ``dt`` and the methods ``state`` and ``apply``. It need not be a subclass of ``Host``.
+    A host has the attribute ``dt`` and the methods ``state`` and ``apply``. The class of the host need not inherit from
+    ``Host``.
 
     The attribute ``dt`` is the length of every step (s). If ``dt = math.inf``, each call of ``apply`` moves every world
     to the time ``command.until_s`` of its next decision. A world that is already at this time does not move.
@@ -225,7 +226,7 @@ class _Grid:
         return np.where(self.made < self.all, self.decisions.at(self.made), self.horizon_s)
 
     def is_due(self, time_s: Floats) -> Bools:
-        """Return for each world, [n] bool, whether ``next_s`` is reached at ``time_s`` [n]."""
+        """Return for each world, [n] bool, whether its next decision time ``next_s`` is reached at ``time_s``."""
         return self.next_s <= time_s + ROUNDING * self.decisions.time_step_s
 
 
@@ -453,7 +454,7 @@ class _Run:
         return np.maximum(gaps, 0.0), speeds
 
     def _check_clock(self, time_s: Floats, until: Floats) -> None:
-        """Raise ``HostFailed`` if the host's clock ``time_s`` [n] is off ``until`` [n] by more than half a step."""
+        """Raise ``HostFailed`` if the host's clock ``time_s`` [n] is not within half a step of ``until`` [n]."""
         within = SNAP * self.scenario.time_step_s if self.exact else self.dt / 2.0
         if not (good := np.abs(time_s - until) <= within).all():
             k = int(np.argmin(good))
@@ -492,8 +493,8 @@ class _Motion:
 
     If the host does not report impacts, the rules assume that its vehicles pass through one another. If the host
     reports impacts, vehicles in contact may push one another. For such vehicles, rule 1 allows every speed that the
-    commands of the whole line and, after an impact, the energy of the line make possible; and rules 2 and 3 start again
-    from the reported state, as if this state were the alert.
+    commands of the whole line make possible, and after an impact every speed that the energy of the line makes
+    possible. Rules 2 and 3 then start again from the reported state, as if this state were the alert.
 
     Args:
         alert: the worlds at the alert.

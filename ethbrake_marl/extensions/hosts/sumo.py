@@ -36,7 +36,7 @@ _SUMO_OPTIONS = (
 
 
 class SumoHost:
-    """Host that runs worlds as parallel roads of one SUMO simulation. A process can run one simulation at a time.
+    """Host that runs worlds as parallel roads of one SUMO simulation. A process can run only one simulation at a time.
 
     At the end of each step, every vehicle has the commanded speed. SUMO integrates the motion with its ballistic
     method, and lets vehicles pass through one another. SUMO has no negative speeds, so a vehicle that should move
@@ -120,7 +120,7 @@ def _net(edges: int) -> str:
 def _routes(worlds: Worlds, names: Sequence[Sequence[str]]) -> str:
     """Return the XML of SUMO's routes file, which contains the positions and speeds of all vehicles at the alert.
 
-    The front of each line's last vehicle is one tenth of the road's length behind the start of the road.
+    The last vehicle of each line begins at one tenth of the length of its road, measured from the start of the road.
 
     Args:
         worlds: the worlds at the alert.

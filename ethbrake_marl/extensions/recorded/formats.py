@@ -48,7 +48,7 @@ class Format(NamedTuple):
 
     @property
     def by_lane(self) -> bool:
-        """Whether lanes and positions must show which vehicle is ahead, because no column contains its id."""
+        """Whether the vehicle ahead must be determined from lanes and positions, because no column contains its id."""
         return "preceding" not in self.columns and not self.gaps
 
 

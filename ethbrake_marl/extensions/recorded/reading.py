@@ -81,13 +81,14 @@ def read_pieces(
 ) -> Iterator[Piece]:
     """Yield the numbers in the columns ``columns`` of a file, with up to ``PIECE`` rows at a time.
 
-    All numbers are finite. If the format has gaps instead of positions, an empty cell is read as NaN.
+    All numbers that it yields are finite. If the format has gaps instead of positions, an empty cell is read as NaN.
 
     Args:
         file: path of the file.
         entry: format of the file.
         columns: names of the columns to read, in this order.
-        names: numbers for the names in columns that contain names instead of numbers; the function adds new names.
+        names: dictionary from names to numbers, for columns that contain names instead of numbers; the function adds
+            new names.
         progress: function that is called with the amount of data read so far (KiB) and the size of the file (KiB).
 
     Raises ``InvalidInput``, which names file, line and column, for a missing column or a cell that is not a number.

@@ -30,7 +30,7 @@ _LISTED = 10  # largest number of skipped files that a note names
 
 
 class FromData(NamedTuple):
-    """A scenario from a folder of recordings, and information on the files."""
+    """A scenario that was created from a folder of recordings, and information on the files in the folder."""
 
     text: str  # content of the scenario file (YAML)
     csv: str  # content of the file of its rows (CSV): gaps (m), speeds (m/s), and the column ``recording``

@@ -45,7 +45,8 @@ STATE_TABLE = f"CREATE TABLE state({','.join(State._fields)})"
 def check_every(every_s: float, entry: Format, what: str) -> int:
     """Return how many ticks (intervals between recorded moments) the time ``every_s`` contains.
 
-    Raises ``InvalidInput`` if ``every_s`` is not a multiple of a tick. The error message calls the data ``what``.
+    Raises ``InvalidInput`` if ``every_s`` is not a multiple of a tick. The text ``what`` names the data in the error
+    message.
     """
     stride = every_s * entry.hertz
     off = 0.01 * stride if entry.title == "the table" else 1e-6  # video has 29.97 pictures in a second
@@ -131,7 +132,7 @@ def _with_rate(entry: Format, times: Floats, every_s: float) -> Format:
 
 
 def _states(piece: Piece, entry: Format, ticks: Floats, turned: Floats) -> Floats:
-    """Return the fields of ``State`` for each vehicle and moment, [rows, fields].
+    """Return the states of the vehicles in rows of a file, [states, fields of ``State``].
 
     Args:
         piece: rows of a file.
@@ -170,7 +171,7 @@ def _states(piece: Piece, entry: Format, ticks: Floats, turned: Floats) -> Float
 
 
 def _of_gaps(piece: Piece, entry: Format, ticks: Floats) -> Floats:
-    """Return the fields of ``State`` for OpenACC, [rows, fields].
+    """Return the states of the cars in rows of an OpenACC file, [states, fields of ``State``].
 
     Car k follows car k - 1 if the speeds of both cars and the gap between these cars (column ``IVS`` with the number
     k - 1) are recorded. The first car of a queue has position 0. The position of every other car is minus the sum of
