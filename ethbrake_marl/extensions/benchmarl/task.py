@@ -1,8 +1,8 @@
-"""A scenario as a TorchRL environment and as a BenchMARL task. The module needs the package's extra ``marl``.
+"""A scenario as a TorchRL environment and as a BenchMARL task; needs ``pip install ethbrake-marl[marl]``.
 
-The environment runs ``n`` worlds in one engine. All learners of a world form one group in TorchRL. The episode of a
-world ends for all of them at the same time. ``state``, the input of a central critic, is the full state of the line
-(``game.full_state.full_state``).
+The environment runs ``n`` worlds in one engine. All learners of a world form one group in TorchRL, and the episode of a
+world ends for all its learners at the same time. ``state``, the input of a central critic, is the full state of the
+line (``game.full_state.full_state``).
 
 Letters in shapes: ``n`` worlds, ``L`` learners, ``F`` features of an observation, ``S`` features of the state.
 """
@@ -37,17 +37,17 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
     """TorchRL environment with ``n`` worlds of one scenario and ``L`` learners.
 
     Shapes: observation [n, L, F], action [n, L, 1] (with discrete actions [n, L]), reward [n, L, 1], state [n, S], done
-    [n, 1]. F is the number of features of an observation, S of the state.
+        [n, 1]. F is the number of features of an observation, S the number of features of the state.
 
     Args:
         scenario: the scenario, which must have at least one learner.
         n: number of worlds.
-        seed: seed of the worlds.
-        reward: reward of the learners: a name such as ``harm``, or weights.
-        horizon_is_end: whether an episode that ends at the horizon counts as terminated (True) or as truncated (False).
-        shield: mode of a shield for the learners; it must be ``step`` if there are several learners. None: no shield.
-        actions: number of discrete actions, for learners such as QMIX; an action is then an index. None: actions are
-            numbers in [-1, 1].
+        seed: seed from which the worlds are drawn.
+        reward: reward of the learners: a name such as ``harm``, or the weights of the reward's terms.
+        horizon_is_end: if True, an episode that reaches the horizon is terminated; if False, it is truncated.
+        shield: mode of the learners' shield, which must be ``step`` if there are several learners. None: no shield.
+        actions: number of discrete actions, for algorithms such as QMIX, which choose the index of an action. None:
+            actions are numbers in [-1, 1].
 
     """
 
@@ -83,7 +83,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         self.done_spec = Composite(flag, shape=(n,))
 
     def _reset(self, tensordict: Any, **settings: Any) -> Any:
-        """Start a new episode in all worlds, or in the worlds that the mask ``_reset`` of ``tensordict`` marks."""
+        """Start a new episode in all worlds, or in the worlds where the mask ``_reset`` in ``tensordict`` is True."""
         asked = None if tensordict is None else tensordict.get("_reset", None)
         if asked is None:
             self.engine.reset()
@@ -107,7 +107,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         return TensorDict(content, batch_size=self.batch_size)
 
     def _set_seed(self, seed: int | None) -> None:
-        """Start new episodes in all worlds, with worlds drawn from ``seed``. If ``seed`` is None, nothing happens."""
+        """Start new episodes in all worlds, which are drawn from ``seed``. If ``seed`` is None, do nothing."""
         if seed is not None:
             self.engine.reset(seed=seed)
 
@@ -124,8 +124,9 @@ class LineTask(TaskClass):  # type: ignore[misc]
     Args:
         name: name of the task in BenchMARL, such as ``PAPER_RANDOM``.
         config: mapping with the keys ``scenario``, ``reward`` and ``horizon_is_end``, and optionally ``shield`` and
-            ``actions``. The scenario is the name of a shipped scenario, the path of a YAML file, a mapping with the
-            content of such a file, or a ``Scenario``. The values of the other keys are arguments of ``LineEnv``.
+            ``actions``. The value of ``scenario`` is the name of a shipped scenario, the path of a scenario file, a
+            mapping with the content of such a file, or a ``Scenario``. The values of the other keys are passed to
+            ``LineEnv``.
 
     """
 
@@ -137,8 +138,8 @@ class LineTask(TaskClass):  # type: ignore[misc]
 
         Args:
             num_envs: number of worlds.
-            continuous_actions: whether BenchMARL wants continuous actions.
-            seed: seed of the worlds; None: 0.
+            continuous_actions: whether BenchMARL wants continuous actions (True) or discrete actions (False).
+            seed: seed from which the worlds are drawn; None: seed 0.
             device: unused.
 
         Raises ``InvalidInput`` if the task has continuous actions and BenchMARL wants discrete actions, or the other
@@ -156,11 +157,11 @@ class LineTask(TaskClass):  # type: ignore[misc]
         return lambda: LineEnv(config["scenario"], num_envs, seed or 0, *settings)
 
     def supports_continuous_actions(self) -> bool:
-        """Return whether actions are continuous: True if the key ``actions`` of the task is None or missing."""
+        """Return whether actions are continuous: True if the key ``actions`` in ``config`` is None or missing."""
         return self.config.get("actions") is None
 
     def supports_discrete_actions(self) -> bool:
-        """Return whether actions are discrete: True if the key ``actions`` of the task is a number."""
+        """Return whether actions are discrete: True if the key ``actions`` in ``config`` is a number."""
         return self.config.get("actions") is not None
 
     def max_steps(self, env: Any) -> int:
@@ -188,7 +189,7 @@ class LineTask(TaskClass):  # type: ignore[misc]
         return None
 
     def state_spec(self, env: Any) -> Any:
-        """Return the TorchRL spec of the state for a central critic in ``env``, for a single world."""
+        """Return the TorchRL spec of the state in ``env`` (input of a central critic), for a single world."""
         spec = env.full_observation_spec_unbatched.clone()
         del spec[GROUP]
         return spec
@@ -198,12 +199,12 @@ class LineTask(TaskClass):  # type: ignore[misc]
         return env.full_action_spec_unbatched
 
     def action_mask_spec(self, env: Any) -> Any:
-        """Return None, because all actions are always allowed."""
+        """Return None, because every action is always allowed."""
         return None
 
     @staticmethod
     def env_name() -> str:
-        """Return the name under which BenchMARL groups these tasks."""
+        """Return the name of this group of tasks in BenchMARL."""
         return "ethbrake"
 
 

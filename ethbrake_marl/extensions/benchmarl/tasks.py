@@ -1,8 +1,8 @@
 """Register every shipped scenario that has a learner as a BenchMARL task (needs the extra ``marl``).
 
-``python -m ethbrake_marl.extensions.benchmarl.tasks algorithm=mappo task=ethbrake/paper_random`` is BenchMARL's own
-command line, which then knows these tasks and takes Hydra overrides. BenchMARL searches tasks only in its own folder.
-This module therefore adds the tasks to BenchMARL's tables of tasks before BenchMARL reads the command line.
+The command ``python -m ethbrake_marl.extensions.benchmarl.tasks algorithm=mappo task=ethbrake/paper_random`` registers
+these tasks and then runs BenchMARL's own command line, which also accepts Hydra overrides. This is necessary because
+BenchMARL searches tasks only in its own folder.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
 
 
 class _Scenarios(Task):  # type: ignore[misc]  # Task has no types if the extra is not installed
-    """Enumeration of tasks in BenchMARL's form: one task for each shipped scenario that has a learner."""
+    """The tasks as an enumeration, as BenchMARL needs it: one task for each shipped scenario with a learner."""
 
     @staticmethod
     def associated_class() -> type[LineTask]:
-        """Return ``LineTask``, the class of all tasks."""
+        """Return ``LineTask``, because every task here is a ``LineTask``."""
         return LineTask
 
     def get_from_yaml(self, path: str | None = None) -> LineTask:
-        """Return the task for the scenario file ``path``, or, if it is None, for the shipped scenario of this entry.
+        """Return the task for the scenario file ``path``; if ``path`` is None, for the shipped scenario of this task.
 
-        The reward is minus the harm, and the task has no shield.
+        The reward of the task is minus the harm, and there is no shield.
         """
         return LineTask(self.name, _settings(SCENARIOS[self.name] if path is None else path))
 
@@ -49,7 +49,7 @@ EthBrakeTask = _Scenarios("EthBrakeTask", list(SCENARIOS))
 
 
 def register_tasks() -> None:
-    """Add the tasks to BenchMARL's tables, with names such as ``ethbrake/paper_random``; may be called repeatedly."""
+    """Register the tasks in BenchMARL under names such as ``ethbrake/paper_random``; repeated calls are harmless."""
     store = ConfigStore.instance()
     for task in EthBrakeTask:
         name = task.name.lower()

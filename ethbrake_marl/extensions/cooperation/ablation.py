@@ -1,4 +1,4 @@
-"""Run an ablation (a comparison of trainings at several levels of cooperation), and estimate the time it takes."""
+"""Run an ablation (train and compare policies at several levels of cooperation), and estimate the time it takes."""
 
 from __future__ import annotations
 
@@ -23,16 +23,17 @@ from ethbrake_marl.training.team import load_team
 def run_ablation(
     plan: Plan, jobs: int = 1, machine: str = "", tell: OnProgress | None = None
 ) -> tuple[Json, list[Path]] | None:
-    """Run all trainings of an ablation, measure the trained policies, and write all files. Existing files are replaced.
+    """Do all training runs of an ablation, evaluate the trained policies, and write the page, tables and figures.
 
     Args:
         plan: settings of the ablation.
-        jobs: number of trainings that run at the same time.
+        jobs: number of training runs at the same time, and of threads in the search for the joint optima.
         machine: description of this machine, which is stored with the results.
-        tell: function that receives the progress; None: the progress is not reported.
+        tell: function that is called with each progress report; None: progress is not reported.
 
     Returns the content of ``ablation.json``, and the paths of the page, the Markdown file and the figures. Returns None
-    if Ctrl-C stopped the trainings. Raises the exceptions of ``StudyFolder.work``, ``train_all`` and ``measure``.
+    if Ctrl-C stopped the training runs. Output files of an earlier call are replaced. Raises the exceptions of
+    ``StudyFolder.work``, ``train_all`` and ``measure``.
 
     """
     with plan.study_folder().work():
@@ -42,7 +43,7 @@ def run_ablation(
 
 
 class Cost(NamedTuple):
-    """Estimate of the remaining work of an ablation. Times are processor time of one core, in s."""
+    """Estimate of the time that an ablation still needs. All times are processor time of one core, in s."""
 
     trainings: int  # number of unfinished trainings
     decisions: int  # number of decisions that these trainings still need
@@ -55,7 +56,7 @@ class Cost(NamedTuple):
 
     @property
     def total_s(self) -> float:
-        """Time for all remaining work (s)."""
+        """Estimated time that the ablation still needs: training, search and evaluation (s)."""
         return self.training_s + self.search_s + self.driving_s
 
     def to_json(self) -> Json:
@@ -63,7 +64,7 @@ class Cost(NamedTuple):
         return {**self._asdict(), "damaged": [str(file) for file in self.damaged], "total_s": self.total_s}
 
     def __str__(self) -> str:
-        """Return the estimate as text, with a line for each damaged file of an earlier run."""
+        """Return the estimate as text, with one more line for each damaged result file of a search."""
         speed = f" at {self.decisions / self.training_s:,.0f}/s" if self.training_s > 0.0 else ""
         text = Timed.in_words
         line = (
@@ -81,13 +82,14 @@ HOW_MEASURED = (
 
 
 def ablation_cost(plan: Plan) -> Cost:
-    """Estimate the remaining work of an ablation, as processor time of one core.
+    """Estimate the time that an ablation still needs, as processor time of one core.
 
-    The function times a short training for each level and recipe, a short evaluation, and a short search. In a sweep it
-    times only one level, because all levels of a sweep take about the same time.
+    The function measures the time of a short training run for each level and recipe, of a short evaluation, and of a
+    short search for the joint optimum. In a sweep, the function measures these times for one level only, because all
+    levels of a sweep take about the same time.
 
     Raises the exceptions of ``TrainingJob.steps_left``. Raises the exceptions of ``load_team`` if the policies of a
-    finished training cannot be loaded.
+    finished training run cannot be loaded.
     """
     left = [(level, algorithm, training, training.steps_left()) for level, algorithm, training in plan.trainings()]
     decisions: Counter[tuple[str, str]] = Counter()  # (scenario, algorithm) -> number of decisions

@@ -1,10 +1,10 @@
 """Compare levels of cooperation: harm at each level, change of harm between levels, and distance to the joint optimum.
 
-A *level* is a scenario. The *ladder* is the sequence of levels; each level in it is compared with the level before it.
+A *level* is a scenario. The *ladder* is a sequence of levels, in which each level is compared with the previous one.
 The *joint optimum* is the least known harm that all learners of a level can achieve together.
 
-The confidence intervals account for the random choice of training seeds and of worlds, because seeds and worlds are
-both resampled (``evaluation.seeds``). Worlds from one recording are resampled together.
+The confidence intervals come from a bootstrap that resamples both training seeds and worlds (``evaluation.seeds``).
+Worlds from the same recording of traffic are resampled together.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from ethbrake_marl.shields.episodes import Shielded
 def compare(measured: Sequence[Measured], searched: int) -> Json:
     """Return the comparison of all levels as a mapping for JSON. docs/extensions/cooperation.md describes the keys.
 
-    The mapping has four keys with lists:
+    Four keys of the mapping contain a list:
 
-    - ``levels``: results of each level;
-    - ``steps``: change of harm from each level to the next, for each algorithm;
+    - ``levels``: results of each level and algorithm;
+    - ``steps``: for each algorithm, the change of harm from each level to the next;
     - ``channels``: change of harm from a level to the same level with a worse V2X channel;
-    - ``undertrained``: one sentence that names the levels whose trained policies do worse than full braking. The list
-      is empty if there are none.
+    - ``undertrained``: one sentence that names the levels whose trained policies do worse than full braking; empty if
+      there are no such levels.
 
     Args:
-        measured: results of ``measure``.
-        searched: number of worlds, counted from the first, in which the joint optimum was searched. Results that are
-            compared with the joint optimum are for these worlds.
+        measured: result of ``measure``.
+        searched: the joint optimum was searched in this number of worlds, counted from the first. Only these worlds
+            count in comparisons with the joint optimum.
 
     """
     algorithms = [m.algorithm for m in measured if m.algorithm is not None]
@@ -70,8 +70,8 @@ def _undertrained(measured: Sequence[Measured]) -> list[str]:
 def _level(one: Measured, searched: int) -> Json:
     """Return the results of one level with one algorithm: harm (m2/s2) in all worlds, and in the searched worlds.
 
-    The searched worlds are the first ``searched`` worlds. For them the result also has the joint optimum and the share
-    of the possible reduction.
+    The searched worlds are the first ``searched`` worlds. The result also has the joint optimum in the searched worlds,
+    and the share of the possible reduction.
     """
     scenario = one.level.scenario
     of_searched = None if one.clusters is None else one.clusters[:searched]
@@ -119,14 +119,13 @@ def _level(one: Measured, searched: int) -> Json:
 
 
 def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: int) -> Json:
-    """Return the results of a level's teams with a shield, and their differences from the results without a shield.
+    """Return the results of one level with a shield, and how they differ from the results without a shield.
 
     Args:
         one: results of the level without a shield.
-        shielded: results of the same teams in the same worlds, with a shield that bounds the harm ``harm_count``.
+        shielded: results of the same policies in the same worlds, with a shield that bounds the harm ``harm_count``.
         harm_count: impacts that count as harm: the first impact of each pair (``first``), or all (``total``).
-        searched: number of worlds in which the joint optimum was searched. The entry ``searched`` of the result has
-            means over these first worlds.
+        searched: the result contains, under the key ``searched``, the mean harm over the first ``searched`` worlds.
 
     """
     before, after = one.reached.vehicle[harm_count], shielded.vehicle_harm
@@ -153,8 +152,9 @@ def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: 
 def _change(before: Measured, after: Measured, algorithm: str) -> Json:
     """Return the change of harm from level ``before`` to level ``after`` in the same worlds; positive: more harm.
 
-    The result has the form ``{"from": name, "to": name, "algorithm": name, "first": changes, "total": changes}``.
-    ``changes`` has the change of the harm of the whole line and of each vehicle. ``algorithm`` is the name to record.
+    The result has the form ``{"from": name, "to": name, "algorithm": name, "first": changes, "total": changes}``. For
+    each count of harm, ``changes`` has the change for the whole line and for each vehicle. ``algorithm`` is the name of
+    the training algorithm, which is stored in the result.
     """
     entry: Json = {"from": before.level.name, "to": after.level.name, "algorithm": algorithm}
     if before.level.swept is not None and after.level.swept is not None:
@@ -176,5 +176,5 @@ def _change(before: Measured, after: Measured, algorithm: str) -> Json:
 
 
 def _columns(harms: Harms, harm_count: HarmCount) -> list[Floats]:
-    """Return the harm of each vehicle, front to rear, as an array [seeds, worlds]."""
+    """Return one array [seeds, worlds] for each vehicle, front to rear, with the harm that the vehicle bears."""
     return [harms.vehicle[harm_count][:, :, i] for i in range(harms.vehicle[harm_count].shape[2])]

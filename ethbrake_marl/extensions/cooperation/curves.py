@@ -1,4 +1,4 @@
-"""Figures of a sweep: harm of the line, and harm of each vehicle, against the swept number."""
+"""Figures of a sweep: harm of the line and of each vehicle (y axis) for each value of the varied key (x axis)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Json = dict[str, Any]
 
 
 def swept_axis(results: Json) -> str | None:
-    """Return the label of the swept key, such as ``v2x.lost`` or ``objective = social:…``; None without a sweep."""
+    """Return the label of the x axis, such as ``v2x.lost`` or ``objective = social:…``; None without a sweep."""
     first = results["levels"][0]
     if "swept_key" not in first:
         return None
@@ -36,7 +36,7 @@ def swept_axis(results: Json) -> str | None:
 
 
 def sweep_figures(results: Json, caption: str) -> list[Figure]:
-    """Return the two figures of a sweep, with the swept number on a linear x axis, and with 95 % intervals.
+    """Return the two figures of a sweep, with the values of the varied key on a linear x axis, and with 95 % intervals.
 
     Args:
         results: content of ``ablation.json``.
@@ -47,9 +47,9 @@ def sweep_figures(results: Json, caption: str) -> list[Figure]:
 
 
 def _harm_curves(results: Json, caption: str) -> Figure:
-    """Draw first-impact and total harm of each value, with full braking and the joint optimum for comparison.
+    """Draw mean harm against the value of the varied key, with full braking and the joint optimum for comparison.
 
-    The values are means over the worlds in which the joint optimum was searched.
+    All means are over the worlds in which the joint optimum was searched.
     """
     figure, panels = new_panels((10.5, 4.8), columns=2)
     for axes, harm_count in zip(panels, HARM_COUNTS, strict=True):
@@ -81,7 +81,7 @@ def _harm_curves(results: Json, caption: str) -> Figure:
 
 
 def _who_bears(results: Json, caption: str) -> Figure:
-    """Draw the mean harm of each vehicle over all worlds. Each algorithm has its own line style."""
+    """Draw the mean harm of each vehicle over all worlds, with one line style for each training algorithm."""
     figure, panels = new_panels((10.5, 4.8), columns=2)
     several = len(algorithms(results))
     for axes, harm_count in zip(panels, HARM_COUNTS, strict=True):
@@ -98,20 +98,20 @@ def _who_bears(results: Json, caption: str) -> Figure:
 
 
 def algorithms(results: Json) -> list[str]:
-    """Return the names of the algorithms that were trained, without repetition."""
+    """Return the name of each training algorithm once."""
     return list(dict.fromkeys(level["algorithm"] for level in results["levels"] if level["algorithm"] is not None))
 
 
 def with_intervals(
     axes: Axes, at: Sequence[float], estimates: Sequence[Estimate], *, upright: bool = True, **style: Any
 ) -> None:
-    """Draw estimates as marks with whiskers.
+    """Draw each estimate as a mark, and its confidence interval as whiskers.
 
     Args:
         axes: axes to draw on.
         at: position of each mark.
-        estimates: value and interval of each mark.
-        upright: True: the values are on the y axis, the positions on the x axis; False: the reverse.
+        estimates: value and confidence interval of each mark.
+        upright: if True, the y axis shows the values and the x axis the positions ``at``; if False, the reverse.
         style: further arguments of matplotlib's ``errorbar``.
 
     """
@@ -136,7 +136,7 @@ def _curve(
     shade: bool = False,
     **style: Any,
 ) -> None:
-    """Draw estimates against the swept number, with their intervals as whiskers, or as a band (``shade``)."""
+    """Draw estimates for each value of the varied key; intervals are whiskers, or a band if ``shade`` is true."""
     at = _places(levels, beside)
     if not shade:
         with_intervals(axes, at, estimates, **style)
@@ -147,13 +147,13 @@ def _curve(
 
 
 def _places(levels: Sequence[Json], beside: int) -> list[float]:
-    """Return the x positions of the swept numbers; algorithm number ``beside`` is moved that many small steps right."""
+    """Return the x position of each level: the number in its value, moved right by ``beside`` small steps."""
     low, high = _span(levels)
     return [level["swept_number"] + beside * _BESIDE * (high - low) for level in levels]
 
 
 def _span(levels: Sequence[Json]) -> tuple[float, float]:
-    """Return the smallest and the largest number on the x axis, which covers the swept numbers and 0."""
+    """Return the smallest and the largest number on the x axis, which covers the numbers of all levels and 0."""
     numbers = [level["swept_number"] for level in levels]
     return min(*numbers, 0.0), max(*numbers, 0.0)
 
@@ -161,7 +161,7 @@ def _span(levels: Sequence[Json]) -> tuple[float, float]:
 def _number_axis(axes: Axes, results: Json) -> None:
     """Set range, ticks and label of the x axis, and let the y axis begin at 0.
 
-    The ticks are at 0 and at the swept numbers, unless their labels would overlap.
+    The x axis has ticks at 0 and at the number of each level, unless the labels of these ticks would overlap.
     """
     numbers = sorted({0.0, *(level["swept_number"] for level in results["levels"])})
     low, high = _span(results["levels"])

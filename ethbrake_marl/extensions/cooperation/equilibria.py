@@ -1,8 +1,9 @@
-"""Equilibria of several learners, found by best responses: the learners take turns to improve their commands.
+"""Equilibria of several learners: each learner in turn improves its own commands, until none can.
 
 A *profile* is the sequence of a learner's commands in a whole episode. The profile is fixed at the alert (open loop),
-so no learner reacts to what the others do. The learners know the whole world. One after the other, each learner
-searches its best profile while the others keep theirs, until no learner improves.
+so no learner reacts to what the others do. The learners know the whole world. One learner after the other searches the
+profile that is best for its objective while the other learners keep their profiles. The search ends if no learner
+improves any more.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ TOLERANCE = 0.01  # m2/s2; a learner changes its profile only if it gains more t
 
 
 class Equilibrium(NamedTuple):
-    """Result of alternating best responses from one start, in n worlds with N vehicles and C learners."""
+    """Result of ``find_equilibria`` from one start, in n worlds with N vehicles and C learners."""
 
     profiles: Profiles  # commands of the learners, with one phase for each decision
     borne: dict[HarmCount, Floats]  # count of harm -> [n, N] harm of each vehicle, m2/s2
@@ -53,7 +54,7 @@ class Equilibrium(NamedTuple):
 
 
 class Spread(NamedTuple):
-    """Comparison, in each world, of the equilibria from different starts. Starts that did not converge are left out."""
+    """How much the equilibria from different starts differ in each world; starts that did not converge are left out."""
 
     found: Ints  # [n] number of starts that converged
     differs: Bools  # [n] whether the harm of a vehicle differs by more than the tolerance between two equilibria
@@ -62,7 +63,7 @@ class Spread(NamedTuple):
 
 
 class _Game(NamedTuple):
-    """The worlds, and the objective that each learner minimises in them."""
+    """Worlds, and the objective that each learner minimises in these worlds."""
 
     worlds: Worlds
     task: Task  # task of the learners
@@ -74,21 +75,21 @@ class _Game(NamedTuple):
         return self._replace(worlds=self.worlds.take(rows), joint=self.joint.take(rows), others=self.others[rows])
 
     def together(self, own: list[Profiles]) -> Profiles:
-        """Join the learners' separate profiles into one profile of all learners, with one phase for each decision."""
+        """Join the profiles ``own`` of the single learners into one profile of all, with a phase for each decision."""
         steps = np.arange(int(self.joint.last_step.max()))
         at = [np.concatenate([each.at(np.full(self.joint.n, step)) for each in own], axis=1) for step in steps]
         return Profiles(np.minimum(steps + 1, self.joint.last_step[:, np.newaxis]), np.stack(at, axis=1))
 
     def amount(self, c: int, own: list[Profiles]) -> Floats:
-        """Return the value of learner ``c``'s objective if all learners follow their profiles in ``own``, [n] m2/s2."""
+        """Return the objective of learner number ``c``, [n] m2/s2, if all learners follow their profiles in ``own``."""
         problem = minimising(self.joint, self.worlds, self.declared, self.task.vehicles[c : c + 1])
         return problem.values(self.together(own))[self.task.harm_count]
 
     def response(self, c: int, own: list[Profiles], effort: Mapping[str, int]) -> Profiles:
         """Search the best profile of learner number ``c`` while the other learners follow their profiles in ``own``.
 
-        ``effort`` has keyword arguments of ``search_profiles``. The harm in this search differs by rounding from the
-        harm in the joint search problem.
+        ``effort`` contains keyword arguments of ``search_profiles``. Because of rounding, this search may compute a
+        slightly different harm than the search problem ``joint`` of all learners.
         """
         task, others = replace(self.task, vehicles=self.task.vehicles[c : c + 1]), self.others
         problem = profile_problem(
@@ -101,7 +102,7 @@ class _Game(NamedTuple):
         return search_profiles(problem, joined(starts, problem.n), **effort)[0]
 
     def _following(self, c: int, own: list[Profiles]) -> Vehicles:
-        """Return the vehicles' parameters; all learners except number ``c`` follow their profiles in ``own``."""
+        """Return vehicle parameters with which all learners except number ``c`` follow their profiles in ``own``."""
         vehicles, clock, old = self.worlds.vehicles, self.joint.clock, self.worlds.vehicles.pieces
         count = old.shape[2] // 2
         pieces = np.full((*old.shape[:2], 2, max(count, MOST_PHASES)), np.inf)
@@ -129,13 +130,12 @@ def find_equilibria(
     seed: int = 0,
     threads: int = 1,
 ) -> dict[str, Equilibrium]:
-    """Search equilibria of the scenario's learners by alternating best responses, one equilibrium for each start.
+    """Search equilibria of the scenario's learners by alternating best responses, once from each start in ``STARTS``.
 
-    ``STARTS`` names the starts. In every round each learner searches a better profile; it changes its profile if the
-    search finds one that is better by more than ``tolerance``. If no learner changes its profile in a round, the result
-    is an approximate equilibrium of open-loop profiles. The equilibrium is not exact, because a search tries only
-    ``budget`` candidates. Other equilibria may exist. The result for a world does not depend on the other worlds or on
-    ``threads``.
+    In every round, each learner searches a better profile, and changes its profile if the new one is better by more
+    than ``tolerance``. If no learner changes its profile in a round, the result is an approximate equilibrium of
+    open-loop profiles. The equilibrium is only approximate because a search tries only ``budget`` candidate profiles.
+    Other equilibria may exist. The result for a world does not depend on the other worlds or on ``threads``.
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.extensions.cooperation import compare_starts, find_equilibria
@@ -154,7 +154,7 @@ def find_equilibria(
         rounds: largest number of rounds; every learner searches once in a round.
         tolerance: gain that a learner must exceed to change its profile, m2/s2.
         seed: seed of the random start and of the searches.
-        threads: number of threads.
+        threads: number of threads of the searches.
 
     Returns an equilibrium for each name in ``STARTS``.
 
@@ -188,7 +188,7 @@ def find_equilibria(
 
 
 def _settle(game: _Game, own: list[Profiles], rounds: int, tolerance: float, effort: Mapping[str, int]) -> Equilibrium:
-    """Let the learners search in turns, from the profiles ``own``, until none gains more than the tolerance."""
+    """Let the learners search in turns, from the profiles ``own``, until none gains more than ``tolerance``."""
     active, taken = np.arange(game.joint.n), np.zeros(game.joint.n, np.int64)
     for turn in range(rounds):
         part, mine = game.take(active), [each.take(active) for each in own]
@@ -210,12 +210,12 @@ def _settle(game: _Game, own: list[Profiles], rounds: int, tolerance: float, eff
 
 
 def compare_starts(ends: Mapping[str, Equilibrium], harm_count: HarmCount, tolerance: float = 0.1) -> Spread:
-    """Compare the equilibria from different starts in each world.
+    """Compare, in each world, the equilibria that were reached from different starts.
 
     Args:
         ends: result of ``find_equilibria``.
         harm_count: count of harm to compare, ``first`` or ``total``.
-        tolerance: largest difference in the harm of any vehicle up to which two equilibria count as equal, m2/s2.
+        tolerance: two equilibria count as different if the harm of some vehicle differs by more than this (m2/s2).
 
     """
     converged = np.stack([each.converged for each in ends.values()])
@@ -236,19 +236,20 @@ def best_joint_harm(
     seed: int = 0,
     threads: int = 1,
 ) -> dict[HarmCount, Floats]:
-    """Return the harm of each vehicle in the joint optimum: count of harm -> [n, N] m2/s2.
+    """Return the harm of each vehicle in the joint optimum, as a mapping: count of harm -> [n, N] harm (m2/s2).
 
-    The joint optimum is the least known harm of the line that the learners can achieve together. In each world it is
-    the least harm of a joint search (``best_harm``) and of the equilibria ``ends``.
+    The joint optimum is the least known harm of the line that the learners can achieve together. In each world, the
+    function takes the best of the equilibria ``ends`` and of the result of ``best_harm``, which searches the commands
+    of all learners together.
 
     Args:
         scenario: scenario of the worlds.
         worlds: the n worlds at the alert.
         ends: equilibria of the same learners in the same worlds, for any objectives.
-        harm_count: count of the line's harm that is minimised: ``first`` (first impact of each pair) or ``total``.
-        budget: number of candidates that the joint search tries per world.
-        seed: seed of the joint search.
-        threads: number of threads.
+        harm_count: impacts that count as harm in the search: ``first`` (first impact of each pair), or ``total`` (all).
+        budget: number of candidate profiles that ``best_harm`` tries per world.
+        seed: seed of ``best_harm``.
+        threads: number of threads of ``best_harm``.
 
     """
     problem = task_problem(worlds, Task(scenario, scenario.learners, harm_count))
@@ -264,8 +265,8 @@ def best_joint_harm(
 def price_of_anarchy(borne: Floats, optimum: Floats) -> Estimate | None:
     """Return (mean harm of the line in equilibrium) / (mean harm of the line in the joint optimum), with its interval.
 
-    With the harms of ``Spread.worst`` this ratio is called the price of anarchy, with ``Spread.best`` the price of
-    stability. Returns None if the harm of the joint optimum is 0 in every world.
+    If ``borne`` is ``Spread.worst``, this ratio is called the price of anarchy; if ``borne`` is ``Spread.best``, the
+    price of stability. The function returns None if the harm of the joint optimum is 0 in every world.
 
     Args:
         borne: [n, N] harm of each vehicle in equilibrium, m2/s2. Worlds with NaN (no equilibrium) are left out.

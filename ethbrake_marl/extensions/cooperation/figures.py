@@ -1,4 +1,4 @@
-"""Figures of an ablation: harm at each level, change of harm between levels, and change for each vehicle."""
+"""Figures of an ablation: harm at each level, change of harm from level to level, and this change for each vehicle."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ _BESIDE = 0.42  # distance at which a level with a worse channel is drawn to the
 def ablation_figures(results: Json, caption: str) -> list[Figure]:
     """Return the three figures of an ablation, or the two figures of a sweep (``sweep_figures``).
 
-    The three figures show the harm at each level, the change of harm between levels, and the change for each vehicle.
-    Red text above a figure names the levels whose trained policies do worse than full braking.
+    The three figures show the harm at each level, the change of harm from level to level, and this change for each
+    vehicle. Red text above a figure names the levels whose trained policies do worse than full braking.
 
     Args:
         results: content of ``ablation.json``.
@@ -67,7 +67,7 @@ def ablation_figures(results: Json, caption: str) -> list[Figure]:
 def _harm_curve(results: Json, caption: str) -> Figure:
     """Draw first-impact and total harm at each level, with full braking and the joint optimum for comparison.
 
-    All values are means over the worlds in which the joint optimum was searched.
+    All harms are means over the worlds in which the joint optimum was searched.
     """
     figure, panels = new_panels((10.5, 4.8), columns=2)
     ladder = list(dict.fromkeys(level["level"] for level in results["levels"] if level["clear"] is None))
@@ -95,9 +95,9 @@ def _harm_curve(results: Json, caption: str) -> Figure:
 
 
 def _change_figure(results: Json, caption: str) -> Figure:
-    """Draw the change of harm from level to level, and for each worse V2X channel, with 95 % intervals.
+    """Draw the change of harm from level to level and from each level to its copies with a worse V2X channel.
 
-    Marks to the left of 0 mean less harm.
+    Whiskers show 95 % intervals. A mark to the left of 0 means that the later level has less harm.
     """
     changes = results["steps"] + results["channels"]
     figure, panels = new_panels((10.5, max(_LEAST_IN, 1.6 + 0.6 * len(changes))), columns=2, sharey=True)
@@ -126,7 +126,7 @@ def _change_figure(results: Json, caption: str) -> Figure:
 
 
 def _who_pays(results: Json, caption: str) -> Figure:
-    """Draw the change of each vehicle's harm from level to level as a coloured matrix; blue means less harm."""
+    """Draw the change of each vehicle's harm from level to level as a coloured matrix; blue cells mean less harm."""
     changes = results["steps"] + results["channels"]
     figure = new_figure(10.5, max(_LEAST_IN, 1.8 + 0.42 * len(changes)))
     grids = {
@@ -152,9 +152,9 @@ def _who_pays(results: Json, caption: str) -> Figure:
 
 
 def signed_ticks(low: float, high: float) -> list[float]:
-    """Return the ticks of an axis from ``low`` to ``high``: 0 and a few round numbers.
+    """Return the ticks of an axis from ``low`` to ``high``: 0 and round numbers.
 
-    The axis is linear between -0.1 and 0.1 (``LINEAR``), and logarithmic outside this range.
+    The axis is linear between -0.1 and 0.1 m2/s2 (``LINEAR``), and logarithmic outside this range.
     """
     first = -1 if max(-low, high) > LINEAR else -3
     ticks: list[float] = []
@@ -167,9 +167,9 @@ def signed_ticks(low: float, high: float) -> list[float]:
 
 
 def _place(level: Json, ladder: Sequence[str]) -> float:
-    """Return the x position of a level: its index in ``ladder``, the list of the names of the compared levels.
+    """Return the x position of a level: the index of its name in ``ladder``.
 
-    A level with a worse V2X channel is drawn to the right of the same level with the better channel.
+    A level that is a copy of an earlier level with a worse V2X channel is drawn to the right of the earlier level.
     """
     return ladder.index(level["clear"] or level["level"]) + (0.0 if level["clear"] is None else _BESIDE)
 
@@ -182,10 +182,10 @@ def _reached(
     Args:
         axes: axes to draw on.
         levels: results of all levels, from ``ablation.json``.
-        ladder: names of the levels, in the order of their x positions.
-        harm_count: count of harm to draw.
-        algorithm: name of the algorithm.
-        number: index of the algorithm, which determines colour and offset.
+        ladder: names of the levels from left to right.
+        harm_count: count of harm to draw, ``first`` or ``total``.
+        algorithm: name of the training algorithm.
+        number: index of the training algorithm, which determines the colour and the offset of its marks.
 
     """
     own = [level for level in levels if level["algorithm"] in (None, algorithm)]
@@ -222,7 +222,7 @@ def _short(name: str) -> str:
 
 
 def _of_changes(results: Json) -> list[str]:
-    """Return labels ``LEVEL → LEVEL``: of all changes between levels, then of all changes to a worse V2X channel."""
+    """Return a label ``LEVEL → LEVEL`` for each change from level to level, then for each change of the V2X channel."""
     changes, several = results["steps"] + results["channels"], len(algorithms(results)) > 1
     words = [f"{_short(change['from'])} → {_short(change['to'])}".replace("\n", " ") for change in changes]
     return [f"{each} ({c['algorithm']})" if several else each for each, c in zip(words, changes, strict=True)]

@@ -1,9 +1,9 @@
 """Joint optimum of a level: in each world, the least known harm that the level's learners can achieve together.
 
-The joint optimum depends on the worlds, on the learners and on the scripts of the other vehicles. It does not depend on
-what the learners know or on their objectives. Levels that differ only in information or objectives therefore share one
-search of the joint optimum. The result of one level is also used for every other level whose learners can give the same
-commands.
+The joint optimum depends on the worlds, on the learners and on the scripts of the other vehicles. The joint optimum
+does not depend on what the learners know or on their objectives. Levels that differ only in information or objectives
+therefore share one search for the joint optimum. The best commands of one level are also used for every other level
+whose learners can give the same commands.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from ethbrake_marl.training.training import Training
 
 @dataclass(frozen=True, slots=True)
 class LevelOptimum:
-    """Candidates for the joint optimum of one level: the result of a search, and trained teams."""
+    """Result of the search for the joint optimum of one level, and the teams that were trained at this level."""
 
     level: Level  # the level
     worlds: Worlds  # worlds in which the joint optimum was searched
@@ -54,13 +54,13 @@ class LevelOptimum:
 
 
 def questions(plan: Plan, samples: Sequence[Sample]) -> list[tuple[Level, Sample, list[Level]]]:
-    """Return the searches for joint optima that an ablation needs: for each search (first level, worlds, all levels).
+    """Return the searches for joint optima that an ablation needs, each as (first level, worlds, all levels).
 
-    All levels with the same search problem share one search. Levels without learners need no search.
+    Levels with the same search problem share one search. Levels without learners need no search.
 
     Args:
         plan: settings of the ablation.
-        samples: worlds of each level of the plan, in the same order.
+        samples: worlds of each level, in the order of ``plan.levels``.
 
     """
     by_content: dict[bytes, tuple[Level, Sample, list[Level]]] = {}
@@ -74,15 +74,15 @@ def questions(plan: Plan, samples: Sequence[Sample]) -> list[tuple[Level, Sample
 
 
 def search_all(plan: Plan, samples: Sequence[Sample], jobs: int, tell: OnProgress) -> dict[str, BestHarmTable]:
-    """Search the joint optimum of every level with learners; return the results by the name of the level.
+    """Search the joint optimum of every level with learners; return a dictionary from a level's name to the result.
 
-    Results of earlier searches are read from the folder of the ablation.
+    Results of earlier searches are read from the folder of the ablation, and these searches are not repeated.
 
     Args:
         plan: settings of the ablation.
-        samples: worlds of each level of the plan, in the same order.
-        jobs: number of threads.
-        tell: function that receives the progress.
+        samples: worlds of each level, in the order of ``plan.levels``.
+        jobs: number of threads of the search.
+        tell: function that is called with each progress report.
 
     """
     tables: dict[str, BestHarmTable] = {}
@@ -104,12 +104,12 @@ def _tell(tell: OnProgress, name: str, done: int, total: int) -> None:
 
 
 def best_known(own: LevelOptimum, answers: Sequence[LevelOptimum]) -> dict[HarmCount, Floats]:
-    """Return the least known harm in each world of a level: count of harm -> [n] m2/s2.
+    """Return the least known harm in each world of a level, as a mapping: count of harm -> [n] harm (m2/s2).
 
     Args:
         own: the level, with the result of its search and its trained teams.
-        answers: all levels with their results, including ``own``. The result of another level is used in the worlds in
-            which the learners of ``own`` can give the same commands.
+        answers: all levels, including ``own``, with their search results and teams. In a world in which the learners of
+            ``own`` can give the same commands as the learners of another level, the results of that level count, too.
 
     """
     best = {harm_count: np.full(own.worlds.n, np.inf) for harm_count in HARM_COUNTS}
@@ -123,12 +123,12 @@ def best_known(own: LevelOptimum, answers: Sequence[LevelOptimum]) -> dict[HarmC
 
 
 def _can_imitate(own: LevelOptimum, other: LevelOptimum) -> Bools:
-    """Return for each world, [n] bool, whether the learners of ``own`` can imitate the learners of ``other``.
+    """Return for each world, [n] bool, whether learners of ``own`` can give the commands of the learners of ``other``.
 
-    They can imitate them if five conditions are met: the learners of ``other`` are also learners in ``own``; the
-    scripts of ``own`` are also scripts in ``other``; the lines of vehicles are the same; the latencies are equal; and
-    the decision times of ``other`` are also decision times of ``own``. An obstacle in ``own`` alone does not matter,
-    because ``_harms`` simulates the profiles again with it.
+    They can do this if five conditions are met: each learner of ``other`` is also a learner in ``own``; each scripted
+    vehicle of ``own`` has the same script in ``other``; the lines of vehicles are the same; the latencies are equal;
+    and each decision time of ``other`` is also a decision time of ``own``. It does not matter if only ``own`` has an
+    obstacle on the road, because ``_harms`` simulates the commands of ``other`` again with this obstacle.
     """
     mine, theirs = own.level.scenario, other.level.scenario
     same_scripts = all(theirs.scripts.get(i) == script for i, script in mine.scripts.items())
@@ -145,9 +145,9 @@ def _can_imitate(own: LevelOptimum, other: LevelOptimum) -> Bools:
 
 
 def _harms(own: LevelOptimum, other: LevelOptimum, rows: Ints) -> Iterator[dict[HarmCount, Floats]]:
-    """Yield the harm of each search result and each team of ``other`` in the worlds ``rows`` of ``own``.
+    """Yield the harm that the search results and the teams of level ``other`` cause in the worlds ``rows`` of ``own``.
 
-    Each result is a mapping: count of harm -> [rows] harm (m2/s2).
+    Each search result and each team yields one mapping: count of harm -> [rows] harm (m2/s2).
     """
     scenario, task = other.level.scenario, Task(other.level.scenario, other.level.scenario.learners)
     worlds = replace(other.worlds, obstacle_gap_m=own.worlds.obstacle_gap_m).take(rows)
@@ -162,7 +162,7 @@ def _harms(own: LevelOptimum, other: LevelOptimum, rows: Ints) -> Iterator[dict[
 
 @dataclass(frozen=True, slots=True)
 class Harms:
-    """Harm of the trainings of one level in the same worlds; a level without learners counts as one seed."""
+    """Harm of all training runs (seeds) of one level in the same worlds; a level without learners has one seed."""
 
     world: dict[HarmCount, Floats]  # count of harm -> [seeds, worlds] harm of the whole line (m2/s2)
     vehicle: dict[HarmCount, Floats]  # count of harm -> [seeds, worlds, N] harm of each vehicle (m2/s2)
@@ -172,7 +172,7 @@ class Harms:
 
 
 class Goal(NamedTuple):
-    """Quantity that the trainings of a level minimise: its mean for the trained policies and for full braking."""
+    """Quantity that the training at a level minimises, with its mean for the trained policies and for full braking."""
 
     name: str  # name of the quantity: ``objective``, ``first-impact harm`` or ``total harm``
     reached: float  # mean over seeds, worlds and learners with the trained policies
@@ -180,15 +180,15 @@ class Goal(NamedTuple):
 
     @classmethod
     def of(cls, training: Training, reached: Harms, full_brake: Harms) -> Goal:
-        """Return the mean of the quantity that a training minimises, for its policies and for full braking.
+        """Return the quantity that a training run minimises, with its mean for the policies and for full braking.
 
-        The quantity is the learners' objective if the recipe or the scenario has objectives. Otherwise it is the harm
-        of the whole line.
+        If the recipe or the scenario has objectives, the quantity is the learners' objective. If neither has one, the
+        quantity is the harm of the whole line.
 
         Args:
-            training: a training of the level.
-            reached: harm with the trained policies.
-            full_brake: harm if all vehicles brake fully.
+            training: one training run at the level.
+            reached: harm in all worlds with the trained policies.
+            full_brake: harm in the same worlds if all vehicles brake fully.
 
         """
         reward, scenario = training.recipe.reward, training.scenario
@@ -204,7 +204,7 @@ class Goal(NamedTuple):
 
     @property
     def missed(self) -> bool:
-        """Whether the mean of the trained policies is worse than the mean of full braking of all vehicles."""
+        """Whether the trained policies do worse on average than full braking of all vehicles."""
         return self.reached > self.full_brake + TOLERANCE
 
 
@@ -228,16 +228,17 @@ class Measured:
 def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[Measured]:
     """Evaluate the trained policies of all levels in the same worlds, and search the joint optimum of each level.
 
-    Results of earlier searches are reused. If a policy causes less harm in a world than the best profile of the search,
-    the policy's harm is the best known harm of this world.
+    Results of earlier searches are reused. If a policy causes less harm in a world than the best commands of the
+    search, the policy's harm is the joint optimum of this world.
 
     Args:
-        plan: settings of the ablation. All its trainings must be finished.
+        plan: settings of the ablation. All training runs of the ablation must be finished.
         jobs: number of threads of the search.
-        tell: function that receives the progress; None: the progress is not reported.
+        tell: function that is called with each progress report; None: progress is not reported.
 
-    Returns one result for each level and algorithm, in the order of the plan. Raises the exceptions of ``load_team``
-    and ``common_worlds`` before any long work.
+    Returns one result for each level and algorithm: levels in the order of ``plan.levels``, and for each level the
+    algorithms in the order of ``plan.algorithms``. Before it evaluates or searches, the function raises the exceptions
+    of ``load_team`` and ``common_worlds``.
 
     """
     say = tell or (lambda progress: None)
@@ -285,7 +286,10 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
 
 
 def _drive(scenario: Scenario, sample: Sample, drivers: Sequence[Driver], tell: OnProgress) -> Harms:
-    """Let several agents or teams drive in the worlds of ``sample``; return their harm, with each agent as one seed."""
+    """Let each of the agents or teams ``drivers`` drive in the same worlds; return their harm.
+
+    In the result, each agent or team counts as one training seed.
+    """
     outcomes = []
     for driver in drivers:
         result = evaluate(sample, {driver.name: driver}, scenario=scenario).complete()

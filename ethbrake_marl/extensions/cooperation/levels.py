@@ -61,7 +61,7 @@ _BUT_CHANNEL = {"name", "title", "description", "source", "v2x"}
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """One level of cooperation in an ablation: a scenario that is compared with other scenarios."""
+    """One of the scenarios that an ablation compares."""
 
     scenario: Scenario
     clear: str | None = None  # name of an earlier level that differs only in ``v2x``; None: there is no such level
@@ -69,17 +69,17 @@ class Level:
 
     @property
     def name(self) -> str:
-        """Name of the scenario; in a sweep followed by the value, such as ``cooperation-3-pair-social-15``."""
+        """Name of the scenario; in a sweep with the value of the key, such as ``cooperation-3-pair-social-15``."""
         return self.scenario.name if self.swept is None else f"{self.scenario.name}-{self.swept.label}"
 
     @property
     def same_lines(self) -> bool:
-        """Whether world k has the same vehicles at all levels; False for a sweep of a key that changes vehicles."""
+        """Whether world k has the same vehicles at all levels; False if a sweep varies a key of the vehicles."""
         return self.swept is None or self.swept.same_lines
 
     @property
     def columns(self) -> Json:
-        """Columns about the swept value for tables of results; empty without a sweep."""
+        """Columns on the key and value of a sweep, for tables of results; an empty dictionary without a sweep."""
         return {} if self.swept is None else self.swept.columns
 
 
@@ -87,13 +87,14 @@ def read_levels(names: Sequence[str], settings: Sequence[Override] = ()) -> list
     """Load the levels of an ablation.
 
     A level that differs from an earlier level only in ``v2x`` is compared with this earlier level (``Level.clear``).
-    All other levels form the *ladder*: each of them is compared with the level before it.
+    All other levels form the *ladder*, in which each level is compared with the previous one.
 
     Args:
         names: names or paths of scenarios, in the order of the comparison.
-        settings: settings ``KEY=VALUE`` that override keys of every scenario.
+        settings: settings ``KEY=VALUE`` that replace values in every scenario.
 
-    Raises ``InvalidInput`` for fewer than two levels or a repeated level, and the exceptions of ``load_runnable``.
+    Raises ``InvalidInput`` if there are fewer than two levels or if a level is repeated. Also raises the exceptions of
+    ``load_runnable``.
 
     """
     levels: list[Level] = []
@@ -120,13 +121,13 @@ def sweep_levels(name: str, sweep: str, settings: Sequence[Override], recipes: S
 
     Args:
         name: name or path of the scenario.
-        sweep: swept key and its values, ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``.
-        settings: settings ``KEY=VALUE`` that override other keys of the scenario.
-        recipes: recipes of the ablation.
+        sweep: key of the scenario and the values that it takes, ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``.
+        settings: settings ``KEY=VALUE`` of other keys of the scenario.
+        recipes: training recipes of the ablation.
 
-    Raises ``InvalidInput`` if the swept key is not a key of a scenario; if ``settings`` or a recipe override this key;
-    or if levels with different values of this key cannot be compared. Also raises the exceptions of ``Swept.parse`` and
-    ``load_runnable``.
+    Raises ``InvalidInput`` if the key of the sweep is not a key of a scenario; if ``settings`` or a recipe also set
+    this key; or if levels with different values of this key cannot be compared. Also raises the exceptions of
+    ``Swept.parse`` and ``load_runnable``.
 
     """
     values = Swept.parse(sweep)
@@ -158,8 +159,8 @@ def sweep_levels(name: str, sweep: str, settings: Sequence[Override], recipes: S
 def common_worlds(levels: Sequence[Level], episodes: int, seed: int) -> list[Sample]:
     """Draw worlds for each level; world k has the same line of vehicles at all levels.
 
-    Latencies may differ between levels that differ in ``v2x``. An obstacle may be ahead at some levels only. In a sweep
-    of a key that changes the vehicles, world k is drawn with the same random numbers at all levels, but its vehicles
+    Two levels with different ``v2x`` may have different latencies. There may be an obstacle at some levels only. If a
+    sweep varies a key of the vehicles, world k is drawn with the same random numbers at all levels, but its vehicles
     differ.
 
     Args:
@@ -167,8 +168,8 @@ def common_worlds(levels: Sequence[Level], episodes: int, seed: int) -> list[Sam
         episodes: number of worlds.
         seed: seed of the worlds.
 
-    Raises ``InvalidInput``, which names the level and the quantity, if levels differ in a quantity in which they must
-    not differ.
+    Raises ``InvalidInput`` if a quantity that must be the same at all levels differs. The message names the level and
+    the quantity.
 
     """
     samples = [level.scenario.sample(episodes, seed) for level in levels]
@@ -201,7 +202,7 @@ def _check_same(one: Level, first: Sample, other: Level, sample: Sample, names: 
 def _values(name: str, level: Level, sample: Sample) -> Floats:
     """Return the quantity ``name``, such as ``gaps_m``, in the worlds of ``sample``, with one row per world.
 
-    For a key of the scenario, such as ``time_step_s``, the result has a single row.
+    If ``name`` is a key of the scenario, such as ``time_step_s``, the result has a single row.
     """
     if name in _LINE:
         return np.array([getattr(level.scenario, name)], np.float64)
@@ -209,7 +210,7 @@ def _values(name: str, level: Level, sample: Sample) -> Floats:
 
 
 def quantity(name: str, worlds: Worlds) -> Floats:
-    """Return the field ``name`` of the worlds or of their vehicles, [n, ...]."""
+    """Return the attribute ``name`` of ``worlds``, or else of ``worlds.vehicles``, as an array [n, ...]."""
     values: Floats = getattr(worlds if hasattr(worlds, name) else worlds.vehicles, name)
     return values
 
@@ -223,7 +224,7 @@ _FULL = {"seeds": 5, "steps_per_learner": 400_000, "episodes": 4_000, "search_ep
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Settings of an ablation, a comparison of trainings at several levels of cooperation."""
+    """Settings of an ablation, which trains policies at several levels of cooperation and compares them."""
 
     levels: tuple[Level, ...]  # levels to compare, in order
     recipes: tuple[TrainingRecipe, ...]  # training recipes; each has its scheme for several learners
@@ -244,9 +245,9 @@ class Plan:
         return tuple(algorithm(recipe) for recipe in self.recipes)
 
     def trainings(self) -> Iterator[tuple[Level, str, TrainingJob]]:
-        """Yield all trainings as (level, name of the algorithm, training): first all of seed 0, then all of seed 1, ...
+        """Yield all training runs as (level, name of the algorithm, training run), ordered by seed.
 
-        Levels without learners are left out.
+        Levels without learners have no training runs.
         """
         for seed in range(self.seeds):
             for recipe in self.recipes:
@@ -255,7 +256,7 @@ class Plan:
                         yield level, algorithm(recipe), self.training(level, recipe, seed)
 
     def training(self, level: Level, recipe: TrainingRecipe, seed: int) -> TrainingJob:
-        """Return the training of one recipe at one level with one seed.
+        """Return the training run of one recipe at one level with one seed.
 
         Raises ``InvalidInput`` if the recipe cannot train at this level.
         """
@@ -279,7 +280,7 @@ class Plan:
         }
 
     def study_folder(self) -> StudyFolder:
-        """Return the folder of the ablation, which refuses results of an ablation with other settings."""
+        """Return the folder of the ablation, which raises an error if it contains results of other settings."""
         advice = f"give another folder (--output); to reuse its trained policies, give a copy without {SETTINGS}"
         written = (*FIGURES, *SWEEP_FIGURES, *(f"ablation.{ending}" for ending in ("html", "md", "csv", "json")))
         return StudyFolder(self.folder, "an ablation", self.settings(), record=SETTINGS, advice=advice, writes=written)
@@ -290,9 +291,9 @@ class Plan:
 
 
 def with_scheme(recipe: TrainingRecipe, scheme: str | None = None) -> TrainingRecipe:
-    """Return the recipe with a scheme for several learners.
+    """Return the recipe with ``scheme``, which says how several learners are trained.
 
-    If ``scheme`` is None, the scheme is that of the recipe, or ``shared`` if the recipe has none.
+    If ``scheme`` is None, the recipe keeps its own scheme; a recipe without a scheme gets ``shared``.
     """
     return recipe.replace(scheme=scheme or recipe.scheme or "shared")
 
@@ -311,19 +312,19 @@ def plan_ablation(
     tell: Callable[[str], None] | None = None,
     **given: Any,
 ) -> Plan:
-    """Return the settings of an ablation from the options of its command.
+    """Return the settings of an ablation, from the options of the command ``study ablate``.
 
     Args:
         levels: names or paths of scenarios, separated by commas; None: the shipped levels.
         recipes: names or paths of recipes, separated by commas.
         settings: settings ``KEY=VALUE`` of scenarios and recipes; None: no settings.
         sweep: key of a scenario and its values, ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``; None: no sweep.
-        quick: whether the defaults of seeds, worlds and decisions are small.
-        tell: function that receives notes on settings that do not fit together.
-        given: other fields of ``Plan``; None means the default.
+        quick: whether to use few seeds, worlds and decisions if ``given`` does not say how many.
+        tell: function that is called with a note if ``gamma`` and ``reward.shaping_discount`` of a recipe differ.
+        given: further fields of ``Plan``, such as ``seeds``; a field that is None gets its default.
 
-    Raises ``InvalidInput`` for recipes with the same name, numbers below 1, an unknown shield, levels without any
-    learner, and levels that cannot be trained or compared.
+    Raises ``InvalidInput`` for recipes with the same name, numbers below 1, an unknown shield, levels none of which has
+    a learner, and levels that cannot be trained or compared.
 
     """
     usual_names: tuple[str, ...] = (LADDER if quick else STANDARD) if sweep is None else (SWEPT,)

@@ -32,10 +32,10 @@ _MOST, _USUAL, _LEAST = 3, 2, 2  # number of example worlds with the largest, a 
 
 
 def choose_worlds(measured: Sequence[Measured]) -> list[Played]:
-    """Choose worlds for the page by how much total harm decreases from the first to the last level.
+    """Choose worlds for the page by the decrease of total harm from the first to the last level.
 
-    With the policies of the first seed, the chosen worlds have the largest, a median, or the least decrease. Levels
-    with a worse V2X channel are ignored.
+    Some of the chosen worlds have the largest decrease, some a median decrease, and some the least decrease, each with
+    the policies of the first seed. Copies of levels with a worse V2X channel are ignored.
     """
     ladder = [one for one in measured if one.level.clear is None]
     first, last = ladder[0], ladder[-1]
@@ -55,9 +55,10 @@ def choose_worlds(measured: Sequence[Measured]) -> list[Played]:
 
 
 def episodes_section(plan: Plan, measured: Sequence[Measured]) -> Section:
-    """Return the section of the page that shows episodes of all levels side by side (worlds of ``choose_worlds``).
+    """Return the section of the page that shows the episodes of all levels side by side.
 
-    At each level with learners, the policies of the first seed drive.
+    The episodes are in the worlds that ``choose_worlds`` returns. At levels with learners, the learners drive with the
+    policies of the first seed.
     """
     played = choose_worlds(measured)
     rows = np.array([each.number for each in played], np.int64)
@@ -86,10 +87,10 @@ def episodes_section(plan: Plan, measured: Sequence[Measured]) -> Section:
 
 
 def levels_csv(measured: Sequence[Measured], searched: int) -> str:
-    """Return CSV text with one row per level, algorithm and seed. Harms are means over the worlds (m2/s2).
+    """Return CSV text with one row per level, algorithm and seed. Harms are means over all worlds (m2/s2).
 
     The columns ``searched_*`` are means over the first ``searched`` worlds, in which the joint optimum was searched.
-    The columns about the shield are empty if no shield was used.
+    The columns on the shield are empty if the teams were not evaluated with a shield.
     """
     return csv_text(_seed_row(one, seed, searched) for one in measured for seed in range(len(one.reached.collided)))
 
@@ -153,7 +154,7 @@ def ablation_page(
         results: content of ``ablation.json``.
         conditions: text that describes the worlds, the seeds and the machine.
         figures: dictionary from the name of a figure's file to the figure.
-        episodes: sections that show episodes.
+        episodes: sections of the page that show single episodes.
 
     """
     titles = FIGURES if swept_axis(results) is None else SWEEP_FIGURES
@@ -180,7 +181,7 @@ def ablation_page(
 
 
 def _blocks(results: Json) -> list[tuple[str, list[Sheet]]]:
-    """Return the tables of an ablation in groups: (title of the group, tables).
+    """Return the tables of an ablation in groups, each as (title of the group, tables).
 
     ``results`` is the content of ``ablation.json``.
     """
@@ -263,13 +264,13 @@ _Columns = list[tuple[Column | str, str]]
 
 
 def _sheet(rows: Sequence[Json], columns: _Columns) -> Sheet:
-    """Return a table of results from ``ablation.json``.
+    """Return a table with values from ``ablation.json``.
 
-    If the results are for one algorithm only, the column with the name of the algorithm is left out.
+    If all rows are for the same algorithm, the table has no column with the name of the algorithm.
 
     Args:
-        rows: result of each row, as a nested mapping.
-        columns: pairs of the heading of a column and the path of its value; the path ``first harm`` means
+        rows: for each row of the table, a nested mapping with its values.
+        columns: for each column, its heading and the path of its values in ``rows``; the path ``first harm`` means
             ``row["first"]["harm"]``.
 
     """
@@ -287,7 +288,7 @@ def _sheet(rows: Sequence[Json], columns: _Columns) -> Sheet:
 
 
 def interval_words(seeds: int) -> str:
-    """Return a phrase for captions that says what the 95 % intervals account for; it depends on the number of seeds."""
+    """Return a phrase for captions that says what the 95 % intervals cover: other worlds, or also other seeds."""
     if seeds == 1:
         return "95 % intervals for other worlds only: one seed says nothing about others"
     rough = f" (rough: {seeds} seeds)" if seeds < 3 else ""
@@ -299,12 +300,12 @@ def _share(heading: str) -> Column:
 
 
 def write_ablation(plan: Plan, measured: Sequence[Measured], machine: str) -> tuple[Json, list[Path]]:
-    """Write page, Markdown, CSV, JSON and figures of an ablation. Existing files are replaced.
+    """Write the HTML page, the Markdown, CSV and JSON files and the figures of an ablation; replace existing files.
 
     Args:
         plan: settings of the ablation.
-        measured: results of ``measure``.
-        machine: description of this machine, for the caption.
+        measured: result of ``measure``.
+        machine: description of this machine, which the page and ``ablation.json`` show.
 
     Returns the content of ``ablation.json``, and the paths of the page, the Markdown file and the figures.
 

@@ -1,4 +1,4 @@
-"""Section of a run's report for several learners: harm of each vehicle, and benefit of each learner and of messages."""
+"""Section of a run's report on several learners: who bears the harm, and how much each learner and messages help."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ Harms = Mapping[HarmCount, Floats]  # count of harm -> harm of the whole line in
 
 
 class Stopped(Exception):
-    """Raised if a training for the comparison was interrupted or failed.
+    """Raised if a training run for the comparisons in the report was interrupted or failed.
 
     Args:
-        told: text that says which training stopped and why, without a full stop.
-        interrupted: name of the training if Ctrl-C stopped it; empty if it failed.
+        told: message that says which training run stopped and why, without a full stop.
+        interrupted: name of the training run if Ctrl-C stopped it; an empty text if it failed.
 
     """
 
@@ -54,7 +54,7 @@ class Stopped(Exception):
 
 
 class Compared(NamedTuple):
-    """Harm of another agent and of the trained team in the same worlds."""
+    """Harm of the trained team and of another agent in the same worlds."""
 
     name: str  # name of the other agent
     other: Harms  # harm of the other agent
@@ -65,16 +65,17 @@ class Compared(NamedTuple):
 def make_section(experiment: Experiment, tell: OnProgress) -> RunSection | None:
     """Compare a run's trained team with learners trained alone, a team without messages, and the joint optimum.
 
-    The function trains each learner alone and a team without messages, and searches the joint optimum. In each of these
-    trainings, a learner makes as many decisions as in the training of the run. The trainings are stored in ``alone/``
-    and ``without-messages/`` in the folder of the run, and all numbers in ``cooperation.json``. If a training is
-    interrupted or fails, the function omits the remaining trainings and the search.
+    The function trains each learner alone, trains a team without messages, and searches the joint optimum. In each of
+    these training runs, a learner makes as many decisions as in the original run. The training runs are stored in
+    ``alone/`` and ``without-messages/`` in the folder of the run, and the results of the comparison in
+    ``cooperation.json``. If a training run is interrupted or fails, the function omits the remaining training runs and
+    the search.
 
     Args:
         experiment: the finished run, with its folder, policies and evaluation.
-        tell: function that receives the progress.
+        tell: function that is called with each progress report.
 
-    Returns the section of the report; None if the run has one learner only.
+    Returns the section of the report; None if the run has only one learner.
 
     """
     evaluation, team, by = experiment.evaluation, experiment.learned, experiment.evaluation.clusters
@@ -107,9 +108,9 @@ def make_section(experiment: Experiment, tell: OnProgress) -> RunSection | None:
 
 
 def _train_alone(experiment: Experiment, tell: OnProgress) -> dict[str, Team]:
-    """Train each learner alone while all other learners brake fully; return dictionary name -> team.
+    """Train each learner alone while all other learners brake fully; return a dictionary from names to teams.
 
-    In each of these teams, the other learners brake fully.
+    A team consists of one trained learner; the other learners brake fully.
     """
     scenario, policies = experiment.evaluation.scenario, {}
     braking = make_agents(["full_brake"], scenario)["full_brake"]
@@ -124,9 +125,10 @@ def _train_alone(experiment: Experiment, tell: OnProgress) -> dict[str, Team]:
 
 
 def _without_messages(experiment: Experiment, tell: OnProgress) -> tuple[list[Compared], str]:
-    """Train a team with sensors instead of messages; return comparisons with it, and a sentence on its training.
+    """Train a team with sensors instead of messages; return comparisons with this team, and a sentence on them.
 
-    If this training makes no sense or is impossible, there are no comparisons, and the sentence says why.
+    If the scenario has no messages or is a mixture, or if such a team cannot be trained, the list of comparisons is
+    empty, and the sentence says why.
     """
     evaluation, scenario = experiment.evaluation, experiment.evaluation.scenario
     if scenario.members or scenario.v2x.channel.hears == "none":
@@ -161,7 +163,9 @@ def _without_messages(experiment: Experiment, tell: OnProgress) -> tuple[list[Co
 def _joint_optimum(
     experiment: Experiment, outcomes: Mapping[str, Outcome], tell: OnProgress
 ) -> tuple[list[Compared], str]:
-    """Search the joint optimum; return a list of one comparison with it, and a sentence on the search.
+    """Search the joint optimum; return a list with one comparison, and a sentence on the search.
+
+    The comparison is between the trained team and the joint optimum.
 
     If the search is impossible, the list of comparisons is empty, and the sentence says why.
     """
@@ -195,16 +199,16 @@ def _joint_optimum(
 
 
 def _train(experiment: Experiment, scenario: Scenario, folder: str, share: int, tell: OnProgress) -> Team:
-    """Train the learners of ``scenario`` with the recipe of the run; return the team.
+    """Train the learners of ``scenario`` with the recipe of the run; return the trained team.
 
-    Raises ``Stopped`` if the training was interrupted or failed.
+    Raises ``Stopped`` if the training run was interrupted or failed.
 
     Args:
-        experiment: the finished run.
-        scenario: scenario of the training.
-        folder: folder of the training, below the folder of the run.
-        share: divisor; the training has the decisions of the run divided by this number.
-        tell: function that receives the progress.
+        experiment: the finished run, whose recipe is used.
+        scenario: scenario to train in.
+        folder: name of the folder for this training run, inside the folder of the finished run.
+        share: the number of decisions is the finished run's number of decisions divided by ``share``.
+        tell: function that is called with each progress report.
 
     """
     recipe, path = experiment.trained.training.recipe, experiment.run.path / folder
@@ -229,7 +233,7 @@ def _harms(outcome: Outcome) -> Harms:
 
 
 def _compared(rows: list[Compared], harm_count: HarmCount) -> Sheet:
-    """Return a table that compares the harm of the team with the harm of each other agent, for one count of harm."""
+    """Return a table that compares the harm of the trained team with the harm of each agent in ``rows``."""
     columns = [
         Column("Compared with", "with", text=True),
         Column("Worlds", "worlds", digits=0),
@@ -245,7 +249,7 @@ def _compared(rows: list[Compared], harm_count: HarmCount) -> Sheet:
 
 
 def _borne(outcomes: Mapping[str, Outcome], harm_count: HarmCount, evaluation: Evaluation) -> Sheet:
-    """Return a table of the harm of each vehicle, with one row for each agent."""
+    """Return a table of the mean harm that each vehicle bears, with one row for each agent."""
     scenario, by = evaluation.scenario, evaluation.clusters
     names = [name.replace("_", " ").capitalize() for name in scenario.vehicle_names]
     learn = ", ".join(names[i] for i in scenario.learners)
@@ -260,9 +264,9 @@ def _borne(outcomes: Mapping[str, Outcome], harm_count: HarmCount, evaluation: E
 
 
 def _added(experiment: Experiment) -> Sheet:
-    """Return a table of how much harm each learner prevents.
+    """Return a table of the harm that each learner of the team prevents.
 
-    The entry for a learner is the harm of the team if this learner brakes fully, minus the harm of the team.
+    The harm that a learner prevents is (harm of the line if this learner brakes fully) - (harm with the whole team).
     """
     evaluation, scenario = experiment.evaluation, experiment.evaluation.scenario
     columns = [Column("Learner", "learner", text=True)]

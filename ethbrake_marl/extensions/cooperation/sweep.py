@@ -19,7 +19,7 @@ _WORD = re.compile(r"\s*([A-Za-z][\w-]*:)?", re.ASCII)
 
 
 class Swept(NamedTuple):
-    """The swept key with one of its values."""
+    """The key of a scenario that a sweep varies, with one of its values."""
 
     key: str  # key of a scenario, such as v2x.lost
     word: str  # text before the number in the value, such as ``social:``; usually empty
@@ -27,13 +27,13 @@ class Swept(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> list[Swept]:
-        """Read a text ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``; return the values in ascending order.
+        """Read a sweep ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``; return its values in ascending order.
 
-        A word may precede the numbers, as in ``objective=social:0..90:15``. A list may contain ranges and single
-        numbers.
+        A word may precede the numbers, such as ``social:`` in ``objective=social:0..90:15``. A list separated by commas
+        may contain single numbers and ranges.
 
-        Raises ``InvalidInput`` for a value that is not a number, a range whose steps do not meet its end, and a
-        repeated number. Also raises it if there is only one number, or too many.
+        Raises ``InvalidInput`` for a value that is not a number, for a range whose length is not a multiple of its
+        step, for a repeated number, and for fewer than 2 or more than ``MOST`` numbers.
         """
         key, equals, values = (part.strip() for part in text.partition("="))
         word = match.group(1) or "" if (match := _WORD.match(values)) else ""
@@ -65,7 +65,7 @@ class Swept(NamedTuple):
 
     @property
     def number(self) -> float:
-        """The number in the swept value, which is the x value in figures."""
+        """The number in the value of the key, such as 15 in ``social:15``; figures show it on the x axis."""
         return float(self.text)
 
     @property
@@ -75,20 +75,20 @@ class Swept(NamedTuple):
 
     @property
     def override(self) -> Override:
-        """The setting as an ``Override``, which changes the key of a scenario."""
+        """The setting ``KEY=VALUE`` as an ``Override``, which sets the key of a scenario to this value."""
         return Override.parse([self.setting])[0]
 
     @property
     def same_lines(self) -> bool:
-        """Whether worlds have the same vehicles and the same physics for all values of the key."""
+        """Whether world k has the same vehicles and the same physics for every value of the key."""
         return self.key.partition(".")[0] in ("objective", "obstacle_gap_m", "roles", "v2x")
 
     @property
     def label(self) -> str:
-        """Text that is added to the name of a level for this value, such as ``social-15`` or ``v2x.lost-0.1``."""
+        """End of the name of the level that has this value, such as ``social-15`` or ``v2x.lost-0.1``."""
         return f"{self.word.rstrip(':') or self.key}-{self.text}"
 
     @property
     def columns(self) -> dict[str, Any]:
-        """Columns for tables of results: swept key, value and number."""
+        """Columns that tables of results have in a sweep: key, value as text, and number in the value."""
         return {"swept_key": self.key, "swept_value": f"{self.word}{self.text}", "swept_number": self.number}

@@ -1,7 +1,7 @@
 """Write recorded episodes as a Minari dataset or a Parquet file.
 
-With a Minari dataset, ``dataset.recover_environment()`` makes the environment. In this environment, the recorded
-actions repeat the episodes bit for bit. To start the world of an episode, call ``env.reset(seed=seed,
+A Minari dataset also contains the environment: ``dataset.recover_environment()`` returns it. In this environment, the
+recorded actions repeat the episodes bit for bit. To start in the world of an episode, call ``env.reset(seed=seed,
 options=options)`` with the ``seed`` and ``options`` in the metadata of the episode.
 """
 
@@ -56,11 +56,12 @@ _DATASET_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]*-v\d+")
 
 
 def check_folder(path: Path, *, force: bool = False) -> None:
-    """Check, before any work, that a Minari dataset can be written to the folder ``path``.
+    """Check, before episodes are recorded, that a Minari dataset can be written to the folder ``path``.
 
-    If ``force`` is true, an existing dataset may be replaced. Raises ``AlreadyExists`` if ``path`` exists and ``force``
-    is false. Raises ``InvalidInput`` if the name does not have the form ``NAME-vNUMBER``, if the parent folder is
-    missing or not writable, or if the existing folder is not a Minari dataset.
+    If ``force`` is true, ``path`` may be an existing Minari dataset, which will be replaced. Raises ``AlreadyExists``
+    if ``path`` exists and ``force`` is false. Raises ``InvalidInput`` if the name of the folder does not have the form
+    ``NAME-vNUMBER``, if its parent folder is missing or not writable, or if ``path`` exists but is not a Minari
+    dataset.
     """
     if _DATASET_NAME.fullmatch(path.name) is None:
         raise InvalidInput(f"{path}: the folder of a Minari dataset must be named NAME-vNUMBER, for instance brakes-v0")
@@ -85,15 +86,15 @@ def minari_folder(
 ) -> Iterator[Callable[[Recording], None]]:
     """Context manager that opens a new Minari dataset, and yields a function that adds a recording to the dataset.
 
-    The folder is created at ``path`` when the block ends without an exception. Raises ``MissingExtra`` if minari or
-    h5py is not installed.
+    The folder appears at ``path`` when the ``with`` block ends without an exception. Raises ``MissingExtra`` if minari
+    or h5py is not installed.
 
     Args:
         path: path of the folder, named ``NAME-vNUMBER``.
         task: scenario, seed, reward and observation of the recordings.
-        told: metadata (result of ``tell``), which are stored as JSON under the key ``ethbrake_marl`` when the block
-            ends. Entries may still be added to ``told`` inside the block.
-        force: whether an existing dataset is replaced.
+        told: metadata (result of ``tell``), which are stored in the dataset as JSON under the key ``ethbrake_marl``
+            when the ``with`` block ends. Inside the block, the caller may still add entries.
+        force: whether to replace an existing dataset.
 
     """
     with naming_extras():
@@ -130,12 +131,10 @@ def minari_folder(
 
 
 def env_spec(task: Task) -> EnvSpec:
-    """Return a Gymnasium spec.
+    """Return a Gymnasium spec of the environment in which recorded actions can be repeated.
 
-    From this spec, ``gymnasium.make`` makes the environment in which recorded actions can be repeated.
-
-    The spec contains only plain data, so it can be stored as JSON. Raises ``InvalidInput`` if the scenario does not
-    have exactly one learner.
+    ``gymnasium.make(spec)`` makes this environment. The spec contains only plain data, so it can be stored as JSON.
+    Raises ``InvalidInput`` if the scenario does not have exactly one learner.
     """
     names = [task.scenario.vehicle_names[i] for i in task.scenario.learners]
     check_one_learner(
@@ -169,7 +168,7 @@ def _episodes(recording: Recording) -> Iterator[dict[str, Any]]:
 
 
 def _infos(recording: Recording, vehicle: int) -> dict[str, NDArray[Any]]:
-    """Return the environment's infos for ``vehicle`` (0 = front): name of the info -> array [T + 1, n, ...]."""
+    """Return the environment's ``info`` for ``vehicle`` (0 = front), as name of the entry -> values [T + 1, n, ...]."""
     infos = {name: recording.told(name)[:, :, vehicle] for name in recording.reports[0].columns()}
     cost = np.stack([each.cost for each in recording.reports])
     news = [each.known_from_s[:, vehicle] for each in recording.reports if each.known_from_s is not None]
@@ -219,25 +218,25 @@ def write_dataset(
     force: bool = False,
     on_progress: Callable[[str, int], None] | None = None,
 ) -> DatasetSummary:
-    """Let agents drive the first worlds of a list, and write their episodes as a Parquet file or a Minari dataset.
+    """Let agents drive in worlds of a scenario, and write the episodes as a Parquet file or a Minari dataset.
 
     If an environment starts in a recorded world and gets the recorded actions, it repeats the episode bit for bit.
-    docs/extensions/datasets.md describes the content. Before it begins to record, the function raises ``InvalidInput``
-    if an argument is invalid, ``AlreadyExists`` if ``path`` exists and ``force`` is false, and ``MissingExtra`` if a
-    library is not installed. Later it raises ``PhysicsError`` if the physics cannot simulate any of the worlds.
+    docs/extensions/datasets.md describes the files. Before it begins to record, the function raises ``InvalidInput`` if
+    an argument is invalid, ``AlreadyExists`` if ``path`` exists and ``force`` is false, and ``MissingExtra`` if a
+    library is not installed. At the end it raises ``PhysicsError`` if the physics could simulate none of the worlds.
 
     Args:
         path: file (``.parquet``) or folder (``NAME-v0``) to write.
-        agents: agent specs as on the command line, or a mapping from names to agents or teams. Each agent drives the
-            learners of the scenario. The agents are not changed.
-        scenario: scenario, or its name or path.
-        episodes: number of worlds that each agent drives: worlds 0 to ``episodes`` - 1 of the list.
-        seed: seed of the list of worlds.
+        agents: names of agents as on the command line, or a mapping from names to agents or teams. Each agent drives
+            the learners of the scenario. The function does not change the agents.
+        scenario: a ``Scenario``, or its name or path.
+        episodes: each agent drives in this number of worlds: worlds 0 to ``episodes`` - 1 of ``seed``.
+        seed: seed from which the worlds are drawn.
         format: ``parquet`` or ``minari``; None: the ending of ``path`` selects the format.
-        reward: reward to record.
+        reward: reward to record: a name such as ``harm``, or the weights of the reward's terms.
         observation: features to record as observation; None: the features that ``observation_for(scenario)`` returns.
-        force: whether an existing dataset is replaced.
-        on_progress: function that is called with the name of an agent and the number of worlds recorded so far.
+        force: whether to replace an existing dataset.
+        on_progress: function that is called with the name of an agent and the number of its worlds recorded so far.
 
     """
     check_whole_number("write_dataset: episodes", episodes, 1)
@@ -286,12 +285,12 @@ def write_dataset(
 def check_dataset(
     path: str | Path, scenario: Scenario, format: str | None = None, *, force: bool = False
 ) -> DatasetFormat:
-    """Check that a dataset of this scenario can be written to ``path``, and return its format.
+    """Check that a dataset of ``scenario`` can be written to ``path``, and return the format of the dataset.
 
     Raises the exceptions that ``write_dataset`` raises before it begins to record.
 
     Args:
-        path: file or folder to write.
+        path: file (``.parquet``) or folder (``NAME-v0``) to write.
         scenario: scenario whose learners are recorded.
         format: ``parquet`` or ``minari``; None: the ending of ``path`` selects the format.
         force: whether an existing dataset may be replaced.
@@ -320,12 +319,12 @@ def check_dataset(
 
 
 def tell(task: Task, agents: Mapping[str, Driver], episodes: int) -> dict[str, Any]:
-    """Return the metadata of a dataset as plain data: scenario, seed, agents, observation, reward and versions.
+    """Return the metadata of a dataset as plain data: scenario, seed, agents, observation, reward and package versions.
 
     Args:
         task: scenario, seed, reward and observation of the recordings.
-        agents: recorded agents, by name.
-        episodes: number of worlds that each agent drives.
+        agents: dictionary from names to recorded agents or teams.
+        episodes: number of worlds in which each agent drives.
 
     """
     scenario = task.scenario

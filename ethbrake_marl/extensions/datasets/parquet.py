@@ -1,4 +1,4 @@
-"""Write episodes as a Parquet file, with one row per agent, world and decision."""
+"""Write recorded episodes to a Parquet file, with one row per agent, world and decision."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ OF_STEPS = ("reward", "terminated", "truncated")
 def parquet_dataset(path: Path, told: Mapping[str, Any]) -> Iterator[Callable[[Recording], None]]:
     """Context manager that opens a new Parquet file, and yields a function that adds a recording to the file.
 
-    The file is created at ``path`` when the block ends without an exception. Raises ``MissingExtra`` if pyarrow is not
-    installed.
+    The file appears at ``path`` when the ``with`` block ends without an exception. Raises ``MissingExtra`` if pyarrow
+    is not installed.
 
     Args:
         path: path of the file.
-        told: metadata (result of ``tell``), which are stored as JSON under the key ``ethbrake_marl`` when the block
-            ends. Entries may still be added to ``told`` inside the block.
+        told: metadata (result of ``tell``), which are stored in the file as JSON under the key ``ethbrake_marl`` when
+            the ``with`` block ends. Inside the block, the caller may still add entries.
 
     """
     with naming_extras():
@@ -48,9 +48,9 @@ def parquet_dataset(path: Path, told: Mapping[str, Any]) -> Iterator[Callable[[R
 
 
 def decision_columns(recording: Recording) -> Columns:
-    """Return the rows of the file for one recording, as a dictionary: name of the column -> values.
+    """Return the columns of the Parquet file for one recording, as a dictionary from their names to their values.
 
-    Each row is one decision. The rows are ordered by world, then by time.
+    Each value of a column belongs to one decision. The decisions are ordered by world, then by time.
 
     docs/extensions/datasets.md describes the columns.
     """
@@ -58,11 +58,11 @@ def decision_columns(recording: Recording) -> Columns:
     before = recording.told
 
     def each(values: NDArray[Any]) -> NDArray[Any]:
-        """Return one row for each decision of each episode, taken from ``values`` [T or T + 1, n, ...]."""
+        """Return one element of ``values`` [T or T + 1, n, ...] for each decision, ordered by world, then by time."""
         return values[: running.shape[1]].swapaxes(0, 1)[running]
 
     def whole(values: NDArray[Any]) -> NDArray[Any]:
-        """Repeat each of ``values`` [n], one per episode, for every decision of the episode."""
+        """Repeat each episode's element of ``values`` [n] for every decision of this episode."""
         return np.repeat(values, recording.decisions)
 
     in_force, chosen = before("command_in_force_mps2"), before("chosen_command_mps2")[1:]

@@ -1,12 +1,13 @@
-"""Record episodes of any agent as if a learner in the environment had driven: with actions instead of commands.
+"""Record episodes of any agent with the actions that a learner in the environment would have taken.
 
-An agent's commands are float64 numbers in m/s2. A learner's action is a float32 number in [-1, 1], so most commands
-cannot be expressed exactly by an action. Therefore each world is simulated twice. First the agent drives the world, and
-the agent's commands are rounded to actions. Then the world is simulated again with these actions as the actions of
-learners. The second episode is recorded. An environment that gets the recorded actions repeats this episode bit for
-bit. If two vehicles almost miss each other, the last bit of an action can decide whether they have an impact.
-Therefore, if rounding to the nearest action changes the harm of a world, the code also tries to round all actions down,
-and all actions up. For each world, the rounding that changes its harm least is used.
+An agent's commands are float64 numbers in m/s2. A learner's action is a float32 number in [-1, 1], so most commands do
+not correspond exactly to an action. Therefore each world is simulated twice. In the first episode, the agent drives,
+and its commands are rounded to actions. In the second episode, which is recorded, learners take these actions. An
+environment that gets the recorded actions repeats the second episode bit for bit.
+
+If two vehicles almost miss each other, the last bit of an action can decide whether they have an impact. Therefore, if
+rounding to the nearest action changes the harm of a world, the code also tries to round all actions of this world down,
+and to round them up. It uses the rounding that changes the world's harm least.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ SLACK = 1e-6  # m2/s2; if rounding to the nearest action changes harm by less, n
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """Settings of a recording: the scenario, the seed of the worlds, the reward and the observed features."""
+    """Settings of a recording: scenario, seed from which worlds are drawn, reward and observed features."""
 
     scenario: Scenario  # scenario of the worlds; its learners are recorded
     seed: int  # seed from which the worlds are drawn
@@ -50,10 +51,10 @@ class Task:
 
 @dataclass(frozen=True)
 class Recording:
-    """Recorded episodes of ``n`` worlds.
+    """Recorded episodes of one agent in ``n`` worlds.
 
     In the shapes, ``T`` is the number of decisions in the longest episode, ``L`` the number of learners, and ``F`` the
-    number of observed features. An episode shorter than T ends earlier in the arrays; the later values have no meaning.
+    number of observed features. If an episode has fewer than T decisions, array elements after its end have no meaning.
     """
 
     agent: str  # name of the agent
@@ -76,19 +77,19 @@ class Recording:
 
     @cached_property
     def running(self) -> Bools:
-        """Whether each decision belongs to its episode, [n, T]; False after the end of the episode."""
+        """Whether decision t is part of the episode in world k, [n, T]; False after the end of the episode."""
         mask: Bools = np.arange(len(self.steps)) < self.decisions[:, np.newaxis]
         return mask
 
     def told(self, column: str) -> Floats:
-        """Return the values of one info of the environment, [T + 1, n, N].
+        """Return the values of one entry of the environment's ``info``, [T + 1, n, N].
 
-        ``column`` is the name of the info, such as ``time_s``.
+        ``column`` is the name of the entry, such as ``time_s``.
         """
         return np.stack([each.columns()[column] for each in self.reports])
 
     def terms(self) -> dict[str, Floats]:
-        """Return the unweighted values of each term of the reward: name of the term -> array [T + 1, n, L].
+        """Return the terms of the reward without their weights: name of the term -> values [T + 1, n, L].
 
         The first index is the time: values at index t + 1 belong to step t, and values at index 0 are 0.
         """
@@ -104,9 +105,9 @@ class Recording:
 def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Recording:
     """Let an agent drive the learners of the scenario, and record the episodes.
 
-    The commands of the agent are rounded to float32 actions, and the recorded episodes use these actions. Raises
-    ``PhysicsError``, which names the worlds, if the physics cannot simulate some worlds. Also raises the exceptions of
-    ``episode_engine``.
+    The commands of the agent are rounded to float32 actions, and the recorded episodes use these actions. If there are
+    worlds that the physics cannot simulate, raises ``PhysicsError``, which names these worlds. Also raises the
+    exceptions of ``episode_engine``.
 
     Args:
         sample: worlds at the alert.
@@ -150,14 +151,14 @@ def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Re
 
 
 def _rounded(commanded: Floats, worlds: Worlds, evaluated: Ledger, task: Task) -> tuple[Float32s, Floats]:
-    """Round commands to float32 actions: to the nearest, down or up, whichever changes the harm of the world least.
+    """Round all commands of a world to the nearest float32 action, down or up, whichever changes its harm least.
 
-    Returns the rounded actions, [T, n, L], and the change of the harm of each world, [n] m2/s2.
+    Returns the rounded actions, [T, n, L], and how much the rounding changes the harm of each world, [n] m2/s2.
 
     Args:
-        commanded: commands as exact actions in [-1, 1] (float64), [T, n, L].
-        worlds: worlds at the alert, [n].
-        evaluated: harm of the episodes that were simulated with the exact commands.
+        commanded: commands as float64 actions in [-1, 1], before rounding, [T, n, L].
+        worlds: the n worlds at the alert.
+        evaluated: harm of the episodes that were simulated with the commands before rounding.
         task: scenario, seed, reward and observation of the recording.
 
     """
@@ -175,9 +176,9 @@ def _rounded(commanded: Floats, worlds: Worlds, evaluated: Ledger, task: Task) -
 
 
 def _off_by(actions: Float32s, worlds: Worlds, evaluated: Ledger, task: Task) -> Floats:
-    """Return the difference between the harm with ``actions`` [T, n, L] and the harm ``evaluated``, [n] m2/s2.
+    """Return by how much the harm with ``actions`` [T, n, L] differs from the harm ``evaluated``, [n] m2/s2.
 
-    The result is the absolute difference in first-impact harm or in total harm, whichever is larger.
+    The result is the absolute difference of first-impact harm or of total harm, whichever is larger.
     """
     engine = _learners_engine(worlds, task)
     step = 0
@@ -191,11 +192,9 @@ def _off_by(actions: Float32s, worlds: Worlds, evaluated: Ledger, task: Task) ->
 
 
 def _learners_engine(worlds: Worlds, task: Task) -> Engine:
-    """Return an engine in which learners take actions, as in an environment.
+    """Return an engine in which the learners of ``task`` take actions, as in an environment.
 
-    The engine starts with ``worlds`` at the alert.
-
-    ``task`` contains the scenario, reward, observation and seed for the engine.
+    The engine starts at the alert in ``worlds``, with the scenario, reward, observation and seed of ``task``.
     """
     engine = Engine(
         task.scenario,

@@ -1,7 +1,7 @@
 """Controllers from the literature: car-following models, the driver models of UN R157, emergency braking.
 
-A *law* is the formula of a controller. It computes a command from the motion of the vehicle itself and of the vehicle
-ahead. ``LAWS`` lists all laws with their parameters and sources.
+A *law* is the formula of a controller. The formula computes a command from the motion of the vehicle itself and of the
+vehicle ahead. ``LAWS`` lists all laws with their parameters and sources.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _SAME_S = 1e-9  # tolerance for rounding of an elapsed time (s)
 
 
 class Parameters:
-    """Parameters of one law (the formula of a controller) as attributes, in SI units. ``LAWS`` lists their names."""
+    """Parameters of one law (the formula of a controller) as attributes with the names in ``LAWS``, in SI units."""
 
     def __init__(self, **values: float) -> None:
         self.__dict__.update(values)
@@ -41,9 +41,9 @@ class Parameters:
 class Seen(NamedTuple):
     """Motion of one vehicle in ``n`` worlds, and what it knows from sensors or messages about the vehicle ahead.
 
-    Old information about the vehicle ahead is extrapolated to the present time with its reported acceleration. For
-    Vehicle 1, an obstacle is treated as the vehicle ahead. If there is no obstacle, or if the vehicle knows nothing
-    about the vehicle ahead, the road ahead is treated as free.
+    If information about the vehicle ahead is old, its motion is extrapolated to the present time with the acceleration
+    that it reported. Vehicle 1 treats an obstacle like a vehicle ahead. The road ahead counts as free if nothing is
+    ahead, or if the vehicle knows nothing about the vehicle ahead.
     """
 
     gap_m: Floats  # [n] gap to the vehicle or obstacle ahead; infinite if nothing is ahead
@@ -55,7 +55,7 @@ class Seen(NamedTuple):
 
     @classmethod
     def of(cls, worlds: Worlds, vehicle: int, step_s: float) -> Seen:
-        """Return the motion of a vehicle, and what it knows about the vehicle ahead, in these worlds.
+        """Return the present motion of one vehicle, and what this vehicle knows about the vehicle ahead.
 
         Args:
             worlds: present state of the n worlds.
@@ -77,25 +77,25 @@ class Seen(NamedTuple):
 
     @property
     def closing_mps(self) -> Floats:
-        """Speed at which the gap closes, [n] m/s; negative if the gap opens."""
+        """Speed at which the gap to the vehicle ahead closes, [n] m/s; negative if the gap opens."""
         return self.speed_mps - self.front_mps
 
     @property
     def until_contact_s(self) -> Floats:
-        """Time to contact at the present speeds, [n] s; infinite if the gap does not close."""
+        """Time until contact with the vehicle ahead at present speeds, [n] s; infinite if the gap does not close."""
         closing = self.closing_mps
         return np.where(closing > 0.0, self.gap_m / np.where(closing > 0.0, closing, 1.0), np.inf)
 
     @property
     def headway_s(self) -> Floats:
-        """Gap divided by the speed of the rear vehicle, [n] s; infinite if this vehicle does not move forward."""
+        """Gap to the vehicle ahead divided by the own speed, [n] s; infinite if the own speed is not above 0."""
         return np.where(self.speed_mps > 0.0, self.gap_m / np.where(self.speed_mps > 0.0, self.speed_mps, 1.0), np.inf)
 
     def built_up(self, wanted_mps2: Floats, rate_mps3: float) -> Floats:
-        """Return the command for the next time step, [n] m/s2, with a limit on how fast the deceleration grows.
+        """Return the command for the next time step, [n] m/s2, with a limited growth of the deceleration.
 
         Args:
-            wanted_mps2: [n] wanted acceleration (m/s2).
+            wanted_mps2: [n] acceleration that the law wants (m/s2).
             rate_mps3: largest growth of the deceleration per second (m/s3).
 
         """
@@ -147,7 +147,7 @@ def _human_notices(seen: Seen, p: Parameters) -> Bools:
 
 
 def _share(distance: Floats, safe: Floats, unsafe: Floats) -> Floats:
-    """Return a degree of danger [n]: 0 for gaps above the safe distance, 1 below the unsafe distance, else linear."""
+    """Return the danger [n]: 0 for a ``distance`` above ``safe``, 1 below ``unsafe``, and linear in between."""
     between = (safe - distance) / np.where(safe > unsafe, safe - unsafe, 1.0)
     return np.where(distance > safe, 0.0, np.where(distance < unsafe, 1.0, between))
 
@@ -155,10 +155,10 @@ def _share(distance: Floats, safe: Floats, unsafe: Floats) -> Floats:
 def fuzzy(seen: Seen, p: Parameters) -> tuple[Floats, Floats]:
     """Return the proactive and the critical criterion of the fuzzy safety model of UN R157, each [n].
 
-    Both criteria range from 0 (no danger) to 1 (full danger).
+    Each criterion is a number from 0 (no danger) to 1 (full danger).
 
     Args:
-        seen: what the vehicle knows about the vehicle ahead.
+        seen: motion of the vehicle, and what it knows about the vehicle ahead.
         p: parameters of the law ``r157_fsm``.
 
     """
@@ -251,13 +251,13 @@ LAWS: dict[str, Law] = {
 class Controller:
     """Agent that follows a ``Law``, the formula of a controller from the literature.
 
-    Its memory is the time at which it noticed a danger, [n] s. The memory is infinite before a danger is noticed, and
-    NaN before the first decision.
+    The memory of the controller is the time at which it noticed a danger, [n] s: infinite if it has noticed no danger,
+    and NaN before the first decision.
 
-    The reaction time begins at the decision at which the controller notices the danger. If a danger exists at the first
-    decision, the reaction time is counted from the alert, so it overlaps with the latency. If ``law.stays`` is true
-    (law ``r157_human``), a reaction continues after the danger is over. Otherwise (law ``r157_fsm``) the reaction ends
-    with the danger, and the next danger starts a new reaction.
+    The reaction time begins when the controller notices a danger. If there is a danger at the first decision, the
+    reaction time begins at the alert, so it overlaps with the latency. If ``law.stays`` is true (law ``r157_human``),
+    the controller keeps reacting after the danger is over. If ``law.stays`` is false (law ``r157_fsm``), the reaction
+    ends with the danger, and the next danger starts a new reaction time.
 
     Args:
         name: name of the agent, such as ``idm:T=1.0``.
@@ -273,7 +273,7 @@ class Controller:
         self.name, self.law, self.parameters, self.time_step_s = name, law, Parameters(**parameters), step_s
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Floats:
-        """Return the memory before the first decision, an array [n] of NaN.
+        """Return the memory that the controller has before the first decision: an array [n] of NaN.
 
         Raises ``InvalidInput`` if the law needs a quantity of the vehicle ahead that neither messages nor sensors
         provide.
@@ -284,7 +284,7 @@ class Controller:
         return np.full(alert.n, np.nan)
 
     def act(self, worlds: Worlds, memory: Floats, vehicle: int) -> tuple[Floats, Floats]:
-        """Return the command of the law, limited by the capacities of the vehicle, [n] m/s2, and the new memory [n].
+        """Return the command, [n] m/s2, and the new memory [n]. The vehicle's capacities limit the command.
 
         Args:
             worlds: present state of the n worlds.
@@ -307,15 +307,15 @@ class Controller:
 
 
 def make_controller(argument: str | None, settings: AgentSettings) -> Controller:
-    """Return the controller for a text such as ``idm:T=1.0``.
+    """Return the controller that a text such as ``idm:T=1.0`` names.
 
     Args:
-        argument: text after the name of the law with values of parameters, such as ``T=1.0`` or ``T=1.0:a=2``; None:
-            all parameters have their default values.
-        settings: the whole text of the agent, and the time step of the scenario.
+        argument: part of this text after the name of the law: values of parameters, such as ``T=1.0`` or ``T=1.0:a=2``;
+            None: all parameters have their default values.
+        settings: the whole text (``settings.spec``), and the time step of the scenario.
 
-    Raises ``UnknownName`` for a parameter that the law does not have. Raises ``InvalidInput`` for a value that is not a
-    number or is out of range, and for a repeated parameter.
+    Raises ``UnknownName`` for a parameter that the law does not have. Raises ``InvalidInput`` if a value is not a
+    number or is out of range, or if a parameter is repeated.
 
     """
     name = settings.spec.partition(":")[0]

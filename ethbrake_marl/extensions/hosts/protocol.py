@@ -1,14 +1,16 @@
 """Let agents drive vehicles that a *host* moves: another simulator or a test bench.
 
-The host moves the vehicles. This package makes the decisions, applies latencies, keeps standing vehicles at rest,
-resolves impacts and records the harm. Every step of a host has three parts:
+The host only moves the vehicles. This package asks the agents for decisions, applies latencies, keeps standing vehicles
+at rest, resolves impacts and records the harm. Every time step has three parts:
 
-1. *Decide.* Agents whose decision is due act on the state that the host reported. A shield may replace their actions.
-2. *Move.* The host receives a command and moves the vehicles for one step. 3. *Meet.* Vehicles that overlap and still
-approach each other exchange velocity. If the host resolves impacts itself, it reports them instead.
+1. *Decide.* Agents whose decision is due choose actions in the state that the host reported. A shield may replace
+   these actions.
+2. *Move.* The host receives a command and moves the vehicles for one step.
+3. *Meet.* If the host resolves impacts itself, it reports them. If not, this package computes the speeds after an
+   impact of vehicles that overlap and still approach each other.
 
-Latencies are rounded up to whole steps of the host, because decisions are possible only between two steps. Agents know
-the rounded latencies.
+Latencies are rounded up to whole steps of the host, because commands can change only between two steps. Agents know the
+rounded latencies.
 """
 
 from __future__ import annotations
@@ -78,7 +80,7 @@ class HostState(NamedTuple):
 
 
 class HostCommand(NamedTuple):
-    """Commands for all vehicles of a host (the simulator that moves the vehicles) in one step.
+    """Commands that a host (the simulator that moves the vehicles) receives for one step.
 
     >>> import ethbrake_marl as eb
 
@@ -97,10 +99,11 @@ class HostCommand(NamedTuple):
 class Host(Protocol):
     """Interface of a host: a simulator that moves ``n`` lines of vehicles, one line per world, from the alert on.
 
-    A host has the attribute ``dt`` and the methods ``state`` and ``apply``. It need not inherit from this class.
+    A host has the attribute ``dt`` and the methods ``state`` and ``apply``. The class of the host need not inherit from
+    ``Host``.
 
-    ``dt`` is the length of every step (s). If ``dt = math.inf``, a step moves each world to the time of its next
-    decision, which is ``command.until_s``. A world that is already at this time does not move.
+    The attribute ``dt`` is the length of every step (s). If ``dt = math.inf``, each call of ``apply`` moves every world
+    to the time ``command.until_s`` of its next decision. A world that is already at this time does not move.
 
     >>> import ethbrake_marl as eb
 
@@ -125,19 +128,19 @@ class Host(Protocol):
     dt: float
 
     def state(self) -> HostState:
-        """Return the present time, gaps, speeds, and (if the host resolves impacts) the impacts since the last call."""
+        """Return the present time, gaps and speeds; if the host resolves impacts, also those since the last call."""
 
     def apply(self, command: HostCommand) -> None:
-        """Move all vehicles by one step with the accelerations of ``command``."""
+        """Move all vehicles for one time step with the accelerations in ``command``."""
 
 
 class HostFailed(EthBrakeError):
     """Raised if a host raises an exception or reports an impossible state.
 
     Args:
-        reason: message of the exception.
-        ledger: harm until the failure; also an attribute of the exception.
-        worlds: last valid state; also an attribute of the exception.
+        reason: error message.
+        ledger: harm until the failure, which is also the attribute ``ledger`` of the exception.
+        worlds: last valid state of the worlds, which is also the attribute ``worlds`` of the exception.
 
     >>> import ethbrake_marl as eb
 
@@ -162,7 +165,7 @@ class Hosted(NamedTuple):
 
     @classmethod
     def join(cls, parts: list[Hosted]) -> Hosted:
-        """Join the results for consecutive batches of worlds into one result, in the order of ``parts``."""
+        """Join the results ``parts``, each for some of the worlds, into one result for all worlds, in this order."""
         distrusted = [part.distrusted for part in parts if part.distrusted is not None]
         outcome = Outcome.join([part.outcome for part in parts])
         return cls(outcome, np.concatenate(distrusted) if distrusted else None)
@@ -173,14 +176,14 @@ def drive_host(host: Host, agent: Driver, scenario: str | Path | Scenario, world
 
     Args:
         host: the host, whose vehicles are at the alert.
-        agent: agent or team for the learners, as returned by ``make_agent``, with or without a shield. It is not
-            changed.
+        agent: agent or team that drives the learners, with or without a shield, for instance from ``make_agent``. The
+            function does not change the agent.
         scenario: the scenario. Its scripts drive all vehicles that do not learn, and agents know these scripts.
-        worlds: the worlds at the alert. The host must have the gaps and speeds of these worlds.
+        worlds: the worlds at the alert. The vehicles of the host must begin with the gaps and speeds of these worlds.
 
-    Returns the outcome of the episodes, and a mask of the worlds in which the motion differed from the prediction of a
-    shield. Raises ``InvalidInput`` for a scenario, agent or worlds that a host does not support. Raises ``HostFailed``
-    if the host raises an exception or reports an impossible state.
+    Returns the outcome of the episodes, and a mask of the worlds in which the motion differed from the prediction of
+    the shield. Raises ``InvalidInput`` if the scenario, agent or worlds cannot be used with a host. Raises
+    ``HostFailed`` if the host raises an exception or reports an impossible state.
 
     """
     scenario = load_scenario(scenario)
@@ -200,14 +203,15 @@ def drive_host(host: Host, agent: Driver, scenario: str | Path | Scenario, world
 
 
 class _Grid:
-    """Decision times that several vehicles share: in each world a first time, and then one every time step.
+    """Decision times of vehicles that always decide together: in each world a first time, then every time step.
 
-    ``made`` [n] is the number of decisions already made, ``all`` [n] the number of all decisions before the horizon.
+    The attribute ``made`` [n] is the number of decisions made so far, and ``all`` [n] the number of decisions until the
+    horizon.
 
     Args:
-        first_s: [n] time of the first decision (s).
-        vehicles: indices (0 = front) of the vehicles.
-        scenario: scenario with the time step and the horizon.
+        first_s: [n] time of the first decision in each world (s).
+        vehicles: indices (0 = front) of the vehicles that decide at these times.
+        scenario: the scenario, whose time step and horizon are used.
 
     """
 
@@ -218,16 +222,19 @@ class _Grid:
 
     @property
     def next_s(self) -> Floats:
-        """Time of the next decision in each world, [n] s; the horizon after the last decision."""
+        """Time of the next decision in each world, [n] s. After the last decision, this is the horizon."""
         return np.where(self.made < self.all, self.decisions.at(self.made), self.horizon_s)
 
     def is_due(self, time_s: Floats) -> Bools:
-        """Return for each world, [n] bool, whether the next decision or the horizon is due at ``time_s`` [n]."""
+        """Return for each world, [n] bool, whether its next decision time ``next_s`` is reached at ``time_s``."""
         return self.next_s <= time_s + ROUNDING * self.decisions.time_step_s
 
 
 class _Run:
-    """Running episodes in a host. Arguments are as in ``drive_host``; ``team`` has the agent of each learner."""
+    """Episodes that run in a host.
+
+    The arguments are the arguments of ``drive_host``; ``team`` contains the agent of each learner.
+    """
 
     def __init__(self, host: Host, worlds: Worlds, team: Team, scenario: Scenario) -> None:
         self.host, self.team, self.scenario = host, team, scenario
@@ -274,7 +281,7 @@ class _Run:
 
     # decisions
     def _decide(self) -> None:
-        """Let all vehicles whose decision is due decide, all of them on the same state."""
+        """Let all vehicles whose decision is due choose a command; all of them see the same state."""
         each = [~self.ended & (grid.made < grid.all) & grid.is_due(self.time_s) for grid in self.grids]
         if not np.any(each):
             return
@@ -293,12 +300,12 @@ class _Run:
             grid.made = grid.made + due
 
     def _ask_guard(self, worlds: Worlds, due: Bools, idle: Ints) -> None:
-        """Let the policies that the shield wraps propose actions, and use the actions that the shield applies.
+        """Let the learners' policies propose actions, and let the shield accept or replace these actions.
 
         Args:
-            worlds: the present state.
+            worlds: present state of the n worlds.
             due: [n] whether a decision is due in each world.
-            idle: row numbers of the worlds in which no decision is due; their memories are not changed.
+            idle: indices of the worlds in which no decision is due; in these worlds, agents keep their memories.
 
         """
         engine = self.engine
@@ -313,7 +320,7 @@ class _Run:
             self.wanted_mps2[due, i] = action_to_command(ruling.applied[:, c], worlds.vehicles, i)[due]
 
     def _seen(self) -> Worlds:
-        """Return the present state as agents get it: very slow vehicles have speed 0, and gaps are at least 0."""
+        """Return the present state as agents see it: very low speeds and negative gaps are set to 0."""
         latency, speeds = self.alert.vehicles.latency_s, self.speeds_mps
         in_force = np.where(has_acted(latency, self.time_s[:, np.newaxis]), self.wanted_mps2, 0.0)
         if not self.exact:
@@ -322,7 +329,7 @@ class _Run:
         return self.alert.running(self.time_s, gaps, speeds, command_mps2=in_force, pair_hit=self.ledger.count > 0)
 
     def _end(self) -> None:
-        """Mark the episodes that end with the last step. Their learners brake fully from now on."""
+        """Mark the episodes that ended with the last step. In these worlds, the learners brake fully from now on."""
         first = self.grids[0]
         if not (stepped := ~self.ended & first.is_due(self.time_s) & (first.made > 0)).any():
             return
@@ -337,7 +344,7 @@ class _Run:
 
     # the host's steps
     def _move(self) -> None:
-        """Let the host make one step, check the state that it reports, and resolve impacts if the host does not."""
+        """Let the host make one step, check the reported state, and resolve impacts if the host does not."""
         if self.exact:
             until = np.minimum.reduce([grid.next_s for grid in self.grids])
             until = np.where(self.ended, self.time_s, np.maximum(until, self.time_s))
@@ -366,17 +373,17 @@ class _Run:
     def _meet(self, before_m: Floats, begin: Floats, step_s: Floats) -> Impacts:
         """Resolve the impacts of a step by the paper's eq. (13), for one pair after another from rear to front.
 
-        A pair has an impact if its gap is at most 0 and its closing speed is above 0. At the end of the step, let w be
-        the closing speed, g <= 0 the gap, and b the mean closing acceleration of the step. If the pair was apart before
-        the step, its closing speed at the contact was ``sqrt(w^2 + 2 b g)``. The harm and eq. (13) use this speed. If
-        the pair was already in contact before the step, they use w instead.
+        A pair has an impact if, at the end of the step, its gap g is at most 0 and its closing speed w is above 0. Let
+        b be the mean closing acceleration in the step. If the pair was apart before the step, the closing speed at the
+        contact was ``sqrt(w^2 + 2 b g)``; harm and eq. (13) use this speed. If the pair was already in contact before
+        the step, harm and eq. (13) use w.
 
         Args:
-            before_m: [n, P] gaps before the step.
-            begin: [n, N] speeds at the start of the step.
-            step_s: [n] length of the step.
+            before_m: [n, P] gaps before the step (m).
+            begin: [n, N] speeds at the start of the step (m/s).
+            step_s: [n] length of the step (s).
 
-        Changes ``speeds_mps``, and returns the impacts.
+        Changes the attribute ``speeds_mps``, and returns the impacts.
 
         """
         v, gaps, speeds, speeds_seen = self.alert.vehicles, self.gaps_m, self.speeds_mps, self.speeds_mps.copy()
@@ -397,10 +404,11 @@ class _Run:
         return Impacts(first, total, count, *Impacts.no_obstacle(len(gaps)))
 
     def _read(self) -> tuple[Floats, Floats, Floats, Impacts | None]:
-        """Read and check the state of the host; return copies of its arrays.
+        """Read the state of the host, check the shapes and numbers of its arrays, and return copies.
 
-        Returns the time since the alert [n], gaps [n, P], speeds [n, N], and impacts (None: the host does not report
-        impacts). Raises ``HostFailed`` for an exception, a wrong shape or a number that is not finite.
+        Returns the time since the alert [n], gaps [n, P], speeds [n, N], and impacts (None if the host does not report
+        impacts). Raises ``HostFailed`` if the host raises an exception, or if an array has a wrong shape or contains a
+        number that is not finite.
         """
         (n, N), read = self.alert.speeds_mps.shape, list[Floats]()
         try:
@@ -431,9 +439,9 @@ class _Run:
         return read[0] - self.origin_s, read[1], read[2], impacts
 
     def _first_state(self) -> tuple[Floats, Floats]:
-        """Return the host's gaps [n, P] and speeds [n, N] at the alert, and store the time of its clock at the alert.
+        """Return the host's gaps [n, P] and speeds [n, N] at the alert, and store its clock time at the alert.
 
-        Raises ``HostFailed`` if these gaps or speeds differ from those of the worlds.
+        Raises ``HostFailed`` if the gaps or speeds in the host differ from the gaps or speeds of the worlds.
         """
         self.origin_s, gaps, speeds, _ = self._read()
         for name, told, given in (("gaps_m", gaps, self.alert.gaps_m), ("speeds_mps", speeds, self.alert.speeds_mps)):
@@ -446,7 +454,7 @@ class _Run:
         return np.maximum(gaps, 0.0), speeds
 
     def _check_clock(self, time_s: Floats, until: Floats) -> None:
-        """Raise ``HostFailed`` if the host's clock ``time_s`` [n] is more than half a step from ``until`` [n]."""
+        """Raise ``HostFailed`` if the host's clock ``time_s`` [n] is not within half a step of ``until`` [n]."""
         within = SNAP * self.scenario.time_step_s if self.exact else self.dt / 2.0
         if not (good := np.abs(time_s - until) <= within).all():
             k = int(np.argmin(good))
@@ -462,7 +470,7 @@ class _Run:
 
 
 class _Step(NamedTuple):
-    """One step of a host: the command, and the state that the host reported at the end of the step."""
+    """One step of a host: the command that it received, and the state that it reported at the end of the step."""
 
     wanted_mps2: Floats  # [n, N] acceleration that the agents chose
     begin_mps: Floats  # [n, N] commanded speeds at the start of the step
@@ -474,23 +482,23 @@ class _Step(NamedTuple):
 
 
 class _Motion:
-    """Checks whether the states that a host reports are possible, given the commands since the alert.
+    """Checks whether the states that a host reports can follow from the commands since the alert.
 
     ``refusal`` returns an error for a state that breaks one of three rules:
 
-    1. *Speed in a step.* In one step, a speed changes by no more than is possible with the commands since the alert. 2.
-    *Gaps since the alert.* The changes of the gaps agree with the speeds at the start and at the end of each step. 3.
-    *Speed since the alert.* A vehicle follows its commands with a delay of at most ``LAG_S``. Its acceleration differs
-    from the command by at most ``OFF_MPS2`` plus ``OFF_SHARE`` times the command.
+    1. *Speed in a step.* In one step, a speed changes by no more than the commands since the alert make possible.
+    2. *Gaps since the alert.* Each gap changes as the speeds at the start and at the end of each step require.
+    3. *Speed since the alert.* A vehicle follows its commands with a delay of at most ``LAG_S``, and its acceleration
+       differs from the command by at most ``OFF_MPS2`` plus ``OFF_SHARE`` times the command.
 
-    If the host does not report impacts, the rules assume that its vehicles pass through one another without pushing. If
-    the host reports impacts, vehicles in contact may push one another. For vehicles in contact, rule 1 uses the
-    commands of the whole line and the energy of the line after an impact. Rules 2 and 3 then start again from the
-    reported state, as if it were the alert.
+    If the host does not report impacts, the rules assume that its vehicles pass through one another. If the host
+    reports impacts, vehicles in contact may push one another. For such vehicles, rule 1 allows every speed that the
+    commands of the whole line make possible, and after an impact every speed that the energy of the line makes
+    possible. Rules 2 and 3 then start again from the reported state, as if this state were the alert.
 
     Args:
         alert: the worlds at the alert.
-        dt: length of the host's steps (s); infinite: each step ends at a decision.
+        dt: length of the host's steps (s); if it is infinite, each step ends at the time of a decision.
 
     """
 
@@ -505,7 +513,7 @@ class _Motion:
     def refusal(self, step: _Step) -> tuple[int, str] | None:
         """Check the state that the host reported at the end of ``step``.
 
-        Returns the row number of a world and a message on its impossible state; None if all states are possible.
+        Returns the index of a world with an impossible state and an error message; None if all states are possible.
         """
         acting_s = np.maximum(step.until_s[:, np.newaxis] - np.maximum(self._now, self.vehicles.latency_s), 0.0)
         command = np.where(acting_s > 0.0, step.wanted_mps2, 0.0)
@@ -539,7 +547,7 @@ class _Motion:
         return met
 
     def _reachable(self, step: _Step, met: Bools) -> tuple[Floats, Floats]:
-        """Return the least and the greatest possible speed at the end of the step, each [n, N] m/s.
+        """Return the least and the greatest speed that rule 1 allows at the end of the step, each [n, N] m/s.
 
         ``met`` [n, N] is True for vehicles that another vehicle may have pushed during the step.
         """
@@ -579,12 +587,11 @@ class _Motion:
         """Find a reported speed that does not agree with the commands since the alert (rule 3).
 
         Args:
-            step: the step.
-            met: [n, N] whether another vehicle may have pushed each vehicle; vehicles that may have been pushed are not
-                checked.
-            change: [n, N] change of speed (m/s) that the command causes in this step.
+            step: commands and reported state of the step.
+            met: [n, N] whether another vehicle may have pushed the vehicle, so that its speed is not checked.
+            change: [n, N] change of speed in this step according to the command (m/s).
 
-        Returns the row number of the world and a message; None if all speeds are possible.
+        Returns the index of the world and an error message; None if all speeds agree with the commands.
 
         """
         began = self.led_mps + step.begin_mps - self.speeds_mps
@@ -604,10 +611,10 @@ class _Motion:
 def _refused(
     values: Floats, low: Floats, high: Floats, describe: Callable[[int, int, str], str]
 ) -> tuple[int, str] | None:
-    """Find the first entry of ``values`` [n, k] that is outside its range from ``low`` to ``high``.
+    """Find the first element of ``values`` [n, k] that is outside its range, which is ``low`` to ``high``.
 
-    Returns the row of this entry and a message, ``describe(row, column, range as text)``; None if all values are in
-    range.
+    Returns the row of this element and the error message ``describe(row, column, range as text)``. Returns None if all
+    elements are in their ranges.
     """
     good = (low <= values) & (values <= high)
     if good.all():
@@ -619,7 +626,7 @@ def _refused(
 def _checked_dt(host: Host, scenario: Scenario) -> float:
     """Return the length ``dt`` of the host's steps (s).
 
-    Raises ``InvalidInput`` if the object is not a host, or if the scenario's time step is not a multiple of ``dt``.
+    Raises ``InvalidInput`` if ``host`` is not a host, or if the scenario's time step is not a multiple of ``dt``.
     """
     missing = [what for what in ("dt", "state", "apply") if not hasattr(host, what)]
     if missing:
@@ -639,9 +646,10 @@ def _checked_dt(host: Host, scenario: Scenario) -> float:
 
 
 def _check_known(worlds: Worlds, scenario: Scenario, vehicles: tuple[int, ...]) -> None:
-    """Raise ``InvalidInput`` if the worlds have brakes that build up, periodic messages or an obstacle.
+    """Raise ``InvalidInput`` if the worlds have a feature that hosts do not support.
 
-    Hosts do not support them. ``vehicles`` are the indices of the controlled vehicles.
+    Hosts do not support brakes that build up at a finite rate, periodic messages, and obstacles. ``vehicles`` are the
+    indices of the controlled vehicles.
     """
     scenario.play_pieces(worlds, vehicles).refuse_build_up("host")
     if worlds.messages.shape[1] or worlds.obstacle_ahead.any():
@@ -650,7 +658,7 @@ def _check_known(worlds: Worlds, scenario: Scenario, vehicles: tuple[int, ...]) 
 
 
 def _on_steps(worlds: Worlds, dt: float) -> Vehicles:
-    """Return the vehicles' parameters with all latencies rounded up to multiples of the step length ``dt`` (s)."""
+    """Return the parameters of the vehicles, with latencies rounded up to multiples of the step length ``dt`` (s)."""
 
     def up(seconds: Floats) -> Floats:
         return np.ceil(seconds / dt - SNAP) * dt

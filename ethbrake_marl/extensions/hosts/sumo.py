@@ -36,18 +36,18 @@ _SUMO_OPTIONS = (
 
 
 class SumoHost:
-    """Host that runs worlds as parallel roads of one SUMO simulation. A process can run one simulation at a time.
+    """Host that runs worlds as parallel roads of one SUMO simulation. A process can run only one simulation at a time.
 
-    In each step, vehicles reach the commanded speed. SUMO moves them with its ballistic integration, and lets vehicles
-    pass through one another. SUMO has no negative speeds, so a vehicle that should move backwards after an impact
-    stands still. The method ``close`` ends the simulation.
+    At the end of each step, every vehicle has the commanded speed. SUMO integrates the motion with its ballistic
+    method, and lets vehicles pass through one another. SUMO has no negative speeds, so a vehicle that should move
+    backwards after an impact stands still. The method ``close`` ends the simulation.
 
     Args:
         worlds: the worlds at the alert.
         dt: step length (s), a whole number of milliseconds.
 
-    Raises ``MissingExtra`` without libsumo. Raises ``InvalidInput`` for a step length that is not a whole number of
-    milliseconds, or while another simulation is open.
+    Raises ``MissingExtra`` if libsumo is not installed. Raises ``InvalidInput`` if ``dt`` is not a whole number of
+    milliseconds, or if another SUMO simulation is open in this process.
 
     """
 
@@ -84,7 +84,7 @@ class SumoHost:
         return HostState(self._sumo.simulation.getTime(), gaps, self._speeds)
 
     def apply(self, command: HostCommand) -> None:
-        """Compute the speed of every vehicle at the end of the step from ``command``, and let SUMO make the step."""
+        """Compute from ``command`` the speed of each vehicle at the end of the step, and let SUMO make the step."""
         vehicle, begin = self._sumo.vehicle, np.maximum(command.speeds_mps, 0.0)
         end = np.maximum(command.speeds_mps + command.acceleration_mps2 * self.dt, 0.0)
         for k, line in enumerate(self._names):
@@ -95,7 +95,7 @@ class SumoHost:
         self._sumo.simulationStep()
 
     def close(self) -> None:
-        """End the SUMO simulation. Afterwards this process can start another one."""
+        """End the SUMO simulation, so that this process can start another simulation."""
         self._sumo.close()
 
 
@@ -118,13 +118,13 @@ def _net(edges: int) -> str:
 
 
 def _routes(worlds: Worlds, names: Sequence[Sequence[str]]) -> str:
-    """Return the XML of SUMO's routes file: all vehicles with their positions and speeds at the alert.
+    """Return the XML of SUMO's routes file, which contains the positions and speeds of all vehicles at the alert.
 
-    The last vehicle of each line is at one tenth of the length of its road.
+    The last vehicle of each line begins at one tenth of the length of its road, measured from the start of the road.
 
     Args:
         worlds: the worlds at the alert.
-        names: names of the vehicles of each world, front to rear.
+        names: for each world, SUMO's names of the vehicles, front to rear.
 
     """
     lines = [
@@ -145,7 +145,7 @@ def _routes(worlds: Worlds, names: Sequence[Sequence[str]]) -> str:
 
 
 class FoundHost(NamedTuple):
-    """Kind of host (a simulator that moves the vehicles), with settings; its method ``evaluate`` evaluates agents."""
+    """Kind of host (a simulator that moves the vehicles) with its settings; ``evaluate`` evaluates agents in it."""
 
     name: str  # name and version of the simulator, for tables
     # function that starts a host with worlds at the alert, as a context manager
@@ -165,14 +165,16 @@ class FoundHost(NamedTuple):
 
         Args:
             sample: the worlds at the alert.
-            agents: agents or teams by name.
+            agents: dictionary from names to agents or teams.
             scenario: scenario of the worlds.
-            seed: seed of the worlds, which is stored in the evaluation; None: the worlds have no seed.
-            at_once: number of worlds that one simulation contains.
-            on_progress: function that receives the name of an agent and the number of finished worlds.
+            seed: seed from which the worlds were drawn, which is stored in the evaluation; None: there is no seed.
+            at_once: largest number of worlds in one simulation.
+            on_progress: function that is called with the name of an agent and the number of worlds that it has
+                finished.
 
-        Returns the evaluation, and for each agent whether the motion in each world [n] differed from the prediction of
-        its shield (None without a shield that makes predictions).
+        Returns the evaluation, and a dictionary from each agent's name to an array [n] bool: whether the motion in a
+        world differed from the prediction of the agent's shield. The entry is None if the agent has no shield that
+        makes predictions.
 
         """
         results: dict[str, Hosted] = {}
@@ -193,10 +195,10 @@ class FoundHost(NamedTuple):
 
 
 def find_host(spec: str) -> FoundHost:
-    """Return the kind of host for a text: ``sumo``, or ``sumo:0.05`` with the step length in s.
+    """Return the kind of host that ``spec`` names: ``sumo``, or ``sumo:0.05`` with the step length in s.
 
-    Raises ``UnknownName`` for an unknown host, ``InvalidInput`` for an invalid step length, and ``MissingExtra``
-    without libsumo.
+    Raises ``UnknownName`` for an unknown host, ``InvalidInput`` for an invalid step length, and ``MissingExtra`` if
+    libsumo is not installed.
     """
     name, colon, text = spec.partition(":")
     if name != "sumo":

@@ -31,7 +31,7 @@ LEAST_M2 = 100.0  # positions are checked if the squared distances driven in a l
 
 
 class Link(NamedTuple):
-    """A vehicle, and the gap between it and the vehicle ahead."""
+    """A vehicle that follows another vehicle, and the gap between the two."""
 
     gap_m: float  # length of the gap (m)
     opens_mps: float  # speed at which the gap opens (m/s)
@@ -39,14 +39,15 @@ class Link(NamedTuple):
 
 
 class Chains:
-    """Cuts the queues of vehicles in one file into chains, and checks the gaps and positions in the file.
+    """Cuts the queues of vehicles in one recorded file into chains, and checks the recorded gaps and positions.
 
     Args:
-        file: path of the file, for messages.
+        file: path of the file, for error messages.
         entry: format of the file.
-        every_s: time between two moments at which chains are formed (s).
+        every_s: chains are formed at moments that are this time apart (s).
         vehicles: number of vehicles in a chain.
-        names: dictionary from the number of a vehicle or lane to its name. Messages show a number that has no name.
+        names: dictionary from the number of a vehicle or lane to its name, for error messages. If a number has no name,
+            the message shows the number.
 
     """
 
@@ -63,14 +64,14 @@ class Chains:
     def cut(self, moments: Iterator[tuple[float, list[Any]]]) -> Iterator[tuple[list[float], str]]:
         """Yield each chain: its gaps (m) and speeds (m/s) from front to rear, and the ids of its vehicles (``2-3-4``).
 
-        The first chain of a queue begins with the queue's front vehicle, and each chain begins behind the previous one.
-        At one moment, a vehicle belongs to at most one chain.
+        The first chain of a queue begins with the front vehicle of the queue; the next chain begins directly behind the
+        first chain, and so on. At one moment, a vehicle belongs to at most one chain.
 
-        Raises ``InvalidInput`` at the end of the file if too many vehicles have a fault, or if gaps or positions do not
-        change as the speeds say.
+        After the last chain, the function raises ``InvalidInput`` if too many vehicles have faulty data, or if changes
+        of the recorded gaps or positions do not agree with the recorded speeds.
 
         Args:
-            moments: time, in units of ``every_s``, and states of all vehicles at each moment.
+            moments: pairs of a time (in units of ``every_s``) and the states of all vehicles at this time.
 
         """
         last, before, before_by_id = math.nan, dict[float, Link](), dict[float, Any]()
@@ -104,12 +105,14 @@ class Chains:
         return self.names.get(number) or f"{number:.0f}"
 
     def _links(self, there: list[Any], by_id: dict[float, Any], row: bool) -> dict[float, Link]:
-        """Return a dictionary from the id of each vehicle to the vehicle that follows it at one moment. Count faults.
+        """Return a dictionary from a vehicle's id to the vehicle that follows it at this moment; count faulty data.
 
         Args:
-            there: states of all vehicles.
-            by_id: dictionary from the id of a vehicle to its state; its first state if the vehicle is recorded twice.
-            row: whether chains are formed at this moment. Only then the function counts the data that it leaves out.
+            there: states of all vehicles at this moment.
+            by_id: dictionary from the id of a vehicle to its state. If a vehicle is recorded twice, this is the first
+                state.
+            row: whether chains are formed at this moment. If False, the function does not count the data that it leaves
+                out.
 
         """
         behind, in_lane = dict[float, Link](), dict[float, float]()  # in_lane: vehicle -> vehicle ahead in the lane
@@ -156,11 +159,11 @@ class Chains:
         by_id_before: dict[float, Any],
         passed_s: float,
     ) -> None:
-        """Add the changes of gaps and positions since the previous moment to the sums that ``cut`` checks.
+        """Add the changes of gaps and positions since the previous moment to sums, which ``cut`` checks at the end.
 
         Args:
-            behind: followers at this moment, as ``_links`` returns them.
-            before: followers at the previous moment, as ``_links`` returns them.
+            behind: result of ``_links`` at this moment: the follower of each vehicle.
+            before: result of ``_links`` at the previous moment.
             by_id: dictionary from the id of a vehicle to its state at this moment.
             by_id_before: dictionary from the id of a vehicle to its state at the previous moment.
             passed_s: time between the two moments (s).

@@ -59,8 +59,8 @@ def from_data_command(
     """Create a scenario from recorded traffic.
 
     The formats are highD, exiD, NGSIM, OpenACC, and any table of trajectories. Vehicles that follow each other in a
-    lane become rows of the scenario. A row has the speeds of the vehicles, and the gaps between them from bumper to
-    bumper.
+    lane form a chain. Each chain becomes a row of the scenario's table, with the speeds of the vehicles and the gaps
+    between them, measured from bumper to bumper.
     """
     with Out(as_json=as_json, force=force) as out:
         from ethbrake_marl.extensions.recorded.scenario import scenario_from_data

@@ -1,7 +1,7 @@
-"""Distributions that are fitted to recorded rows of gaps and speeds.
+"""Distributions that are fitted to recorded gaps and speeds.
 
-The distributions are independent: one of the time gaps, one of the mean speed of a row, and one of the deviations of
-the vehicles' speeds from this mean.
+There are independent distributions of each pair's time gap (gap divided by speed), of the mean speed of the line of
+vehicles, and of each vehicle's deviation from this mean speed.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ SLOWEST_MPS, LONGEST_S = 0.5, 60.0  # least speed and longest time gap of rows t
 
 
 def fit_rows(rows: Floats, draw: DataDraw) -> dict[str, Any]:
-    """Return keys of a scenario with distributions of time gaps, of mean speeds of rows, and of deviations from them.
+    """Return scenario keys with distributions of time gaps, of the line's mean speed, and of deviations from this mean.
 
-    Raises ``InvalidInput`` if too few rows have time gaps that can be used.
+    Raises ``InvalidInput`` if too few chains have speeds and time gaps in the range that is used for fits.
 
     Args:
         rows: [k, 2 N - 1] gaps (m) and speeds (m/s) of k chains of N vehicles.
-        draw: kind of the distributions.
+        draw: kind of distribution: ``normal``, ``lognormal`` or ``quantiles``.
 
     """
     gaps, speeds = np.split(rows, [rows.shape[1] // 2], axis=1)
@@ -52,7 +52,7 @@ def fit_rows(rows: Floats, draw: DataDraw) -> dict[str, Any]:
 
 
 def _fit(values: Floats, draw: DataDraw) -> Any:
-    """Return a distribution for a scenario file, fitted to ``values`` [k] and limited to the range of these values.
+    """Return a distribution as a scenario file declares it, fitted to ``values`` [k] and limited to their range.
 
     ``draw`` is the kind of distribution: ``normal``, ``lognormal`` or ``quantiles``.
     """

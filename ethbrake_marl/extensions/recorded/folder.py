@@ -1,8 +1,8 @@
-"""Read all recordings of a folder, and return rows of gaps and speeds.
+"""Read all recordings in a folder, and return rows: the gaps and speeds of a chain of vehicles at one moment.
 
-Each file is read once, and only some of its lines are in memory at a time. The states of its vehicles at regular times
-are stored in a temporary database on disk, which returns them in order of time. Memory therefore contains only some
-lines of a file, the states at one moment, and the resulting rows.
+Each file is read once. The states of its vehicles at regular times are stored in a temporary database on disk, which
+returns the states in order of time. Therefore memory contains only some lines of a file, the states at one moment, and
+the resulting rows.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from ethbrake_marl.scenario.vehicle_types import MOST_NUMBERS
 
 
 class Rows(NamedTuple):
-    """Rows from all recordings of a folder, and information on its files."""
+    """Gaps and speeds of chains of vehicles from all recordings in a folder, and information on the files."""
 
     numbers: list[list[float]]  # gaps (m) and speeds (m/s) of each row
     of: list[tuple[str, str]]  # recording and vehicles of each row
@@ -44,16 +44,17 @@ def read_rows(
 ) -> Rows:
     """Read the chains of vehicles in all recordings of a folder and its subfolders.
 
-    A file with an error adds no row, and its error is returned.
+    If a file has an error, none of its chains are used, and the result contains the error message.
 
     Args:
-        folder: the folder, or one file.
+        folder: folder with the recordings, or a single file.
         entry: format of the files.
-        every_s: time between two moments at which chains are read (s).
+        every_s: chains are read at moments that are this time apart (s).
         vehicles: number of vehicles in a chain.
-        progress: function that receives the name of a file, how much of it was read (KiB), and its size (KiB).
+        progress: function that is called with the name of a file, the amount of data read from it so far (KiB), and its
+            size (KiB).
 
-    Raises ``InvalidInput`` for a folder without recordings.
+    Raises ``InvalidInput`` if the folder contains no recordings of this format.
 
     """
     files, refused, twice = _search(folder, entry)
@@ -99,10 +100,10 @@ def read_rows(
 def _search(folder: Path, entry: Format) -> tuple[dict[str, Path], list[str], list[str]]:
     """Find the files of a format in a folder and its subfolders by their names.
 
-    Returns the files by their printable path below the folder, the errors for subfolders that cannot be read, and the
-    names of further files with the same content. The further files are links, copies, and text files without a header
-    that lie beside a CSV file of the same name. Names that begin with a dot are ignored, and links to folders are not
-    followed.
+    Returns a dictionary from printable paths to files, the errors for subfolders that cannot be read, and the names of
+    files that are left out because they repeat another file. A file repeats another file if it is a link to it or a
+    copy of it, or if it is a text file without a header beside a CSV file of the same name. Names that begin with a dot
+    are ignored, and links to folders are not followed.
     """
     if folder.is_file():
         return {plain_text(folder.name): folder}, [], []
@@ -134,7 +135,7 @@ def _size(file: Path) -> int:
 
 
 def _content(file: Path) -> object:
-    """Return a value that is equal for files with the same content: a hash; for an unreadable file its real path."""
+    """Return a hash, which is equal for files with the same content; if the file is unreadable, its real path."""
     try:
         with open_plain(file, LARGEST_BYTES) as stream:
             return hashlib.file_digest(stream, "sha256").digest()

@@ -1,4 +1,4 @@
-"""Formats of recorded traffic: files, columns, units, licence, and the share of faulty data that is accepted."""
+"""Formats of recorded traffic: names of files and columns, units, licence, and how much faulty data is accepted."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NUMBER = "<number>"  # placeholder for the number of a vehicle in the name of a 
 
 
 class Format(NamedTuple):
-    """One format of recorded traffic. The factors ``metres`` and ``mps`` convert lengths to m and speeds to m/s."""
+    """One format of recorded traffic: names of its files and columns, its units, and what is known about the data."""
 
     title: str  # name of the data set
     files: tuple[str, ...]  # patterns of the names of its files, in lower case
@@ -43,12 +43,12 @@ class Format(NamedTuple):
 
     @property
     def gaps(self) -> bool:
-        """Whether files contain gaps instead of positions and lengths; an empty cell then means "not measured"."""
+        """Whether files contain gaps instead of positions and lengths; an empty gap in such a file was not measured."""
         return "gap" in self.columns
 
     @property
     def by_lane(self) -> bool:
-        """Whether the vehicle ahead must be derived from lanes and positions, because the files do not name it."""
+        """Whether the vehicle ahead must be determined from lanes and positions, because no column contains its id."""
         return "preceding" not in self.columns and not self.gaps
 
 
@@ -102,15 +102,15 @@ _ROLES = {"time": "tick", "vehicle": "id", "lane": "lane", "front": "front", "le
 
 
 def format_of(name: DataFormat, columns: str = "") -> Format:
-    """Return the format with the name ``name``.
+    """Return the format that is called ``name``.
 
     Args:
-        name: name of the format.
-        columns: for the format ``table``: ``time=t,vehicle=id,lane=lane,front=x,length=l,speed=v,units=m``. Each value
-            except the last is the name of a column. ``time=t/1000`` means that the column ``t`` contains times in
-            1/1000 s. ``units`` is ``m`` (lengths in m, speeds in m/s), ``ft`` (ft and ft/s) or ``km/h`` (m and km/h).
+    name: name of the format.
+    columns: for the format ``table``: ``time=t,vehicle=id,lane=lane,front=x,length=l,speed=v,units=m``. Each value
+        except ``units`` is the name of a column of the file. ``time=t/1000`` means that the column ``t`` contains times
+        in 1/1000 s. ``units`` is ``m`` (lengths in m, speeds in m/s), ``ft`` (ft and ft/s) or ``km/h`` (m and km/h).
 
-    Raises ``InvalidInput`` for missing, repeated and unknown keys, and for unknown units.
+    Raises ``InvalidInput`` if ``columns`` has missing, repeated or unknown keys, or unknown units.
 
     """
     if name != "table":

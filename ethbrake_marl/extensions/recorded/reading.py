@@ -1,6 +1,7 @@
 """Read files of recorded traffic (CSV, text with blanks, Parquet), some lines at a time.
 
-The number of the line in the file (for Parquet, of the row) is stored with each row of numbers, for error messages.
+Each row of numbers is stored with its line number in the file (in a Parquet file, its row number), which error messages
+show.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class NotARecording(InvalidInput):
 
 
 class Piece(NamedTuple):
-    """Some rows of a file."""
+    """Consecutive rows of a file, as numbers."""
 
     file: Path  # path of the file
     columns: Sequence[str]  # names of the columns that were read
@@ -51,13 +52,13 @@ class Piece(NamedTuple):
     lines: Floats  # [rows] number of the line of each row
 
     def refuse(self, bad: Bools, k: int, right: str, shown: Floats | None = None) -> None:
-        """Raise ``InvalidInput`` with file, line and column if a value is wrong.
+        """Raise ``InvalidInput``, which names file, line and column, if a value of one column is wrong.
 
         Args:
-            bad: [rows] whether the value in each row is wrong. The error names the first such row.
-            k: index of the column.
-            right: text that says what a valid value is, for the message.
-            shown: [rows] values for the message; None: the values of the column.
+            bad: [rows] whether the value in each row is wrong. The error message names the first wrong row.
+            k: index of the column whose values are wrong.
+            right: end of the error message, which says what a valid value is.
+            shown: [rows] values that the error message shows; None: the values in column ``k``.
 
         """
         if bad.any():
@@ -67,7 +68,7 @@ class Piece(NamedTuple):
 
 
 def place_of(file: Path, line: float) -> str:
-    """Return a text for messages with the file and the number of a line (for Parquet, of a row)."""
+    """Return the place of a row for error messages: the file, and the line number (in a Parquet file, row number)."""
     return f"{file}, {'row' if _is_parquet(file) else 'line'} {line:.0f}"
 
 
@@ -78,19 +79,20 @@ def read_pieces(
     names: dict[str, float] | None = None,
     progress: Callable[[int, int], None] = lambda *_: None,
 ) -> Iterator[Piece]:
-    """Yield the numbers in some columns of a file, with up to ``PIECE`` rows at a time.
+    """Yield the numbers in the columns ``columns`` of a file, with up to ``PIECE`` rows at a time.
 
-    All values are finite numbers. In a format with gaps, an empty cell is NaN.
+    All numbers that it yields are finite. If the format has gaps instead of positions, an empty cell is read as NaN.
 
     Args:
         file: path of the file.
         entry: format of the file.
         columns: names of the columns to read, in this order.
-        names: dictionary from name to number, for columns that contain names instead of numbers; new names are added.
-        progress: function that receives how much was read (KiB), and the size of the file (KiB).
+        names: dictionary from names to numbers, for columns that contain names instead of numbers; the function adds
+            new names.
+        progress: function that is called with the amount of data read so far (KiB) and the size of the file (KiB).
 
-    Raises ``InvalidInput`` with file, line and column for a missing column or a cell that is not a number. Raises
-    ``NotARecording`` for a file that is not a recording.
+    Raises ``InvalidInput``, which names file, line and column, for a missing column or a cell that is not a number.
+    Raises ``NotARecording`` for a file that is not a recording.
 
     """
     with open_plain(file, LARGEST_BYTES) as stream:
@@ -120,9 +122,9 @@ def _is_parquet(file: Path) -> bool:
 def _numbers(
     file: Path, rows: Iterable[_Row], shown: Sequence[str], readers: Sequence[tuple[int, Callable[[str], float]]]
 ) -> Iterator[tuple[int, list[float]]]:
-    """Yield the number of the line of each row, and the numbers in some of its cells.
+    """Yield, for each row, its line number and the numbers in some of its cells.
 
-    ``readers`` has, for each number, the index of the cell and the function that reads the cell.
+    ``readers`` contains, for each cell to read, its index and the function that converts its text to a number.
     """
     for line, cells in rows:
         if len(cells) != len(shown):
@@ -167,9 +169,9 @@ def _parquet(text: TextIOWrapper, file: Path, entry: Format, columns: Sequence[s
 
 
 def _text(text: TextIOWrapper, file: Path, entry: Format, columns: Sequence[str]) -> _Table:
-    """Find the header of a text file in its first lines.
+    """Find the header among the first lines of a text file.
 
-    Returns the names of all columns, the indices of ``columns``, and an iterator over the rows.
+    Returns the names of all columns, the indices of the columns ``columns``, and an iterator over the rows below.
     """
     lines, best, have = _lines(file, text), list(columns), list[str]()
     for number, line in islice(lines, HEAD):
@@ -191,7 +193,7 @@ def _text(text: TextIOWrapper, file: Path, entry: Format, columns: Sequence[str]
 
 
 def _rows(file: Path, lines: Iterator[tuple[int, str]], separator: str, streets: Sequence[str]) -> Iterator[_Row]:
-    """Yield number and cells of each line, except blank lines and lines that contain one of the texts ``streets``."""
+    """Yield the line number and the cells of each line that is not blank and contains no text of ``streets``."""
     elsewhere = seen = 0
     for number, line in lines:
         if streets and any(street in line for street in streets):
@@ -216,7 +218,7 @@ def _lines(file: Path, text: TextIOWrapper) -> Iterator[tuple[int, str]]:
 def _cells(line: str, separator: str) -> list[str]:
     """Return the cells of a line, without quotes and without commas between thousands.
 
-    The separator " " means any number of blanks.
+    If ``separator`` is " ", any number of blanks separates two cells.
     """
     if '"' not in line:
         return line.split(None if separator == " " else separator)
@@ -237,21 +239,24 @@ def _measured(cell: str) -> float:
 
 
 def _number_of(names: dict[str, float], cell: str) -> float:
-    """Return the number of a name: new names get the numbers 1, 2, 3, ... Raise ``ValueError`` for an empty name."""
+    """Return the number that ``names`` gives to the name in ``cell``; a new name gets the next number: 1, 2, 3, ...
+
+    Raises ``ValueError`` for an empty name.
+    """
     if not (name := cell.strip()):
         raise ValueError
     return names.setdefault(name, len(names) + 1.0)
 
 
 def _match(file: Path, columns: Sequence[str], shown: Sequence[str]) -> tuple[list[int], list[str]]:
-    """Find columns of a file by name; return the indices of the columns found, and the names of the missing columns.
+    """Find columns of a file by name; return the indices of these columns, and the names of the missing columns.
 
-    Numbered columns (Speed1, Speed2, ...) are in the order of their numbers.
+    The indices of numbered columns (Speed1, Speed2, ...) are in the order of these numbers.
 
-    Raises ``InvalidInput`` if a column occurs twice.
+    Raises ``InvalidInput`` if two columns of the file have the same name.
 
     Args:
-        file: path of the file, for the message.
+        file: path of the file, for the error message.
         columns: names of the columns to find.
         shown: names of all columns of the file.
 
@@ -267,7 +272,10 @@ def _match(file: Path, columns: Sequence[str], shown: Sequence[str]) -> tuple[li
 
 
 def _unknown(file: Path, entry: Format, missing: list[str], have: Sequence[str]) -> InvalidInput:
-    """Return the error for a file that lacks the columns ``missing``. ``have`` are the cells of its first lines."""
+    """Return the error for a file that lacks the columns ``missing``.
+
+    The list ``have`` contains the cells of the file's first lines, which show whether the file has another format.
+    """
     small = {name.lower() for name in have}
     for title, (there, absent) in REFUSED.items():
         if small >= there and not small & absent:

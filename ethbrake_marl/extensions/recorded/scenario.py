@@ -1,4 +1,4 @@
-"""Create a scenario (a scenario file, and a file with rows of gaps and speeds) from a folder of recorded traffic."""
+"""Create a scenario (a scenario file, and a CSV file with gaps and speeds) from a folder of recorded traffic."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _LISTED = 10  # largest number of skipped files that a note names
 
 
 class FromData(NamedTuple):
-    """A scenario from a folder of recordings, and information on the files."""
+    """A scenario that was created from a folder of recordings, and information on the files in the folder."""
 
     text: str  # content of the scenario file (YAML)
     csv: str  # content of the file of its rows (CSV): gaps (m), speeds (m/s), and the column ``recording``
@@ -53,24 +53,26 @@ def scenario_from_data(
 ) -> FromData:
     """Create a scenario from the recordings in a folder and in all its subfolders.
 
-    At regular times, queues of vehicles are cut from the front into chains. A chain has as many vehicles as the
-    scenario ``based_on``. At one time, a vehicle belongs to at most one chain. Each chain is a row of speeds and gaps.
-    If there are more rows than a table may have, every k-th row is used. Files with errors are left out; all other
-    files are used.
+    At regular times, each queue of vehicles in a recording is cut into chains, beginning at its front. A chain has as
+    many vehicles as the scenario ``based_on``. At one time, a vehicle belongs to at most one chain. Each chain is one
+    row of speeds and gaps. If there are more rows than a table may have, every k-th row is used. Files with errors are
+    left out; all other files are used.
 
     Args:
         name: name of the scenario.
         folder: folder with the files, or one file.
         format: format of the files.
-        columns: columns of the files, for the format ``table`` only, in the form that ``format_of`` describes.
+        columns: for the format ``table`` only: names of the columns, in the form that ``format_of`` describes.
         based_on: scenario that provides the number of vehicles and all quantities that are not recorded.
-        every_s: time between two moments of a recording from which rows are taken (s).
-        draw: how the scenario draws worlds: whole ``rows``, or each quantity from a distribution fitted to the rows.
-        strict: whether to raise an error if some file has errors.
-        progress: function that receives the name of a file, how much of it was read (KiB), and its size (KiB).
+        every_s: chains are formed at moments of a recording that are this time apart (s).
+        draw: how the scenario draws a world: ``rows`` draws a recorded chain; ``normal``, ``lognormal`` and
+            ``quantiles`` draw each quantity from a distribution of this kind, which is fitted to the chains.
+        strict: whether to raise an error if at least one file has errors.
+        progress: function that is called with the name of a file, the amount of data read from it so far (KiB), and its
+            size (KiB).
 
-    Raises ``InvalidInput`` with file, line and column if no file can be used. The notes of the exception describe the
-    errors of the other files.
+    Raises ``InvalidInput``, which names file, line and column, if no file can be used. If several files have errors,
+    notes on the exception (``__notes__``) describe the errors of all files but the first.
 
     """
     entry, base = format_of(format, columns), load_scenario(based_on)
@@ -128,12 +130,12 @@ def scenario_from_data(
 
 
 def _name(file: str, vehicles: str) -> str:
-    """Return the name of a row: recording and vehicles, such as ``drive_1.csv: 2-3-4``. A long name loses its start."""
+    """Return the name of a chain, such as ``drive_1.csv: 2-3-4``; a long name loses its beginning."""
     return f"{file}: {vehicles}".strip()[-MOST_CHARACTERS:].strip()
 
 
 def _found(rows: Rows, vehicles: int, every_s: float) -> list[str]:
-    """Return phrases that say what the recordings of a folder contain, and what was left out."""
+    """Return phrases that say what the recordings in a folder contain, and which data were left out."""
     groups = {2: "pair", 3: "trio"}.get(vehicles, "queue")
     parts = [
         f"{count_of(rows.seen, 'chain')} of {vehicles} vehicles, every {every_s:g} s; at one time, a vehicle is in at"

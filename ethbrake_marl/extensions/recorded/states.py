@@ -1,6 +1,7 @@
 """Convert the numbers of a recording to states of vehicles: position, direction, length and speed, in m and m/s.
 
-The states at regular times are stored in a temporary database on disk, which returns them in order of time.
+The states of all vehicles at regular times are stored in a temporary database on disk, which returns the states in
+order of time.
 """
 
 from __future__ import annotations
@@ -42,9 +43,10 @@ STATE_TABLE = f"CREATE TABLE state({','.join(State._fields)})"
 
 
 def check_every(every_s: float, entry: Format, what: str) -> int:
-    """Return the number of ticks (intervals between recorded moments) in the time ``every_s``.
+    """Return how many ticks (intervals between recorded moments) the time ``every_s`` contains.
 
-    Raises ``InvalidInput`` if the number is not a whole number. ``what`` is the name of the data for the message.
+    Raises ``InvalidInput`` if ``every_s`` is not a multiple of a tick. The text ``what`` names the data in the error
+    message.
     """
     stride = every_s * entry.hertz
     off = 0.01 * stride if entry.title == "the table" else 1e-6  # video has 29.97 pictures in a second
@@ -64,17 +66,17 @@ def keep_states(
     names: dict[str, float],
     progress: Callable[[int, int], None],
 ) -> None:
-    """Write the states of the vehicles of a file at regular times into the table ``state`` of a database.
+    """Read a recording, and write the states of its vehicles at regular times into the table ``state`` of a database.
 
     Args:
         store: database with an empty table ``state``.
         file: path of the file.
         entry: format of the file.
-        every_s: time between two moments that become rows (s).
-        names: name of a vehicle or lane -> its number, if the file has names; new names are added.
-        progress: function that receives how much was read (KiB), and the size of the file (KiB).
+        every_s: chains of vehicles are formed at moments that are this time apart (s).
+        names: dictionary from the name of a vehicle or lane to its number; the function adds new names.
+        progress: function that is called with the amount of data read so far (KiB) and the size of the file (KiB).
 
-    Raises ``InvalidInput`` with file, line and column for an impossible value.
+    Raises ``InvalidInput``, which names file, line and column, for an impossible value.
 
     """
     turned, first, stride, cars, states = np.empty((0, 2)), None, 1, 0, 0
@@ -102,24 +104,24 @@ def keep_states(
 
 
 def moments(store: sqlite3.Connection) -> Iterator[tuple[float, list[Any]]]:
-    """Yield each moment in the table ``state``, in order of time: its tick, and its states in the order of the file."""
+    """Yield each moment in the table ``state``, in order of time: its tick, and all states in the order of the file."""
     for tick, rows in groupby(store.execute("SELECT * FROM state ORDER BY tick, line"), itemgetter(0)):
         yield tick, [State(*row) for row in rows]
 
 
 def _directions(file: Path, entry: Format) -> Floats:
-    """Return id and driving direction of each vehicle in a file of highD, [vehicles, 2], sorted by id."""
+    """Return the id and the driving direction of each vehicle in a highD recording, [vehicles, 2], sorted by id."""
     meta = read_pieces(Path(f"{str(file)[:-4]}Meta.csv"), entry, ("id", "drivingDirection"))
     turned = np.concatenate([piece.values for piece in meta])
     return turned[np.argsort(turned[:, 0])]
 
 
 def _with_rate(entry: Format, times: Floats, every_s: float) -> Format:
-    """Return the format with the rate of one file; the tick is the smallest difference between the ``times`` [rows].
+    """Return the format with the sampling rate of one file, whose recorded times are ``times`` [rows].
 
-    If some times are not multiples of the tick, the recorded times are rounded. In this case a rate within 2 % of a
-    whole number is replaced by the whole number; for example, times of 0.033 s and 0.067 s mean 30 Hz. If all times are
-    equal, the tick is ``every_s``.
+    A tick is the smallest difference between two times, and the rate is 1 / tick. If some times are not multiples of
+    the tick, the recorded times were rounded. A rate within 2 % of a whole number is then replaced by this whole
+    number; for example, times of 0.033 s and 0.067 s mean 30 Hz. If all times are equal, the tick is ``every_s``.
     """
     seconds = np.unique(np.round(times * entry.ticks, 6))
     steps = np.diff(seconds)
@@ -131,13 +133,13 @@ def _with_rate(entry: Format, times: Floats, every_s: float) -> Format:
 
 
 def _states(piece: Piece, entry: Format, ticks: Floats, turned: Floats) -> Floats:
-    """Return the fields of ``State`` for each vehicle and moment, [rows, fields].
+    """Return the states of the vehicles in rows of a file, [states, fields of ``State``].
 
     Args:
         piece: rows of a file.
         entry: format of the file.
-        ticks: [rows] time of each row, in units of the time between two moments that become rows.
-        turned: [vehicles, 2] for highD: id and driving direction of each vehicle, sorted by id.
+        ticks: [rows] time of each row, in units of the time between two moments at which chains are formed.
+        turned: [vehicles, 2] id and driving direction of each vehicle, sorted by id; used for highD only.
 
     """
     if entry.gaps:
@@ -170,10 +172,11 @@ def _states(piece: Piece, entry: Format, ticks: Floats, turned: Floats) -> Float
 
 
 def _of_gaps(piece: Piece, entry: Format, ticks: Floats) -> Floats:
-    """Return the fields of ``State`` for OpenACC, [rows, fields].
+    """Return the states of the cars in rows of an OpenACC file, [states, fields of ``State``].
 
-    Car k counts as the follower of car k - 1 if both speeds and the gap between them (column IVS k - 1) are recorded.
-    The first car of a queue is at position 0. The position of another car is minus the sum of the gaps ahead of it.
+    Car k follows car k - 1 if the speeds of both cars and the gap between these cars (column ``IVS`` with the number
+    k - 1) are recorded. The first car of a queue has position 0. The position of every other car is minus the sum of
+    the gaps ahead of it.
     """
     at = {name.lower(): k for k, name in enumerate(piece.columns)}
     cars = sorted(int(name.removeprefix("speed")) for name in at if name.startswith("speed"))

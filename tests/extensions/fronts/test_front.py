@@ -99,7 +99,7 @@ def test_team__has_a_front_but_no_agents() -> None:
 
 
 def test_weights__of_another_number_are_refused() -> None:
-    with pytest.raises(InvalidInput, match="give 3 numbers"):
+    with pytest.raises(InvalidInput, match="give one number for each of the 3 vehicles"):
         search_front(PAPER, WORLDS, [[1.0, 1.0]])
 
 
