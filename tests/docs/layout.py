@@ -36,10 +36,10 @@ A module imports only from its own folder or from folders that this page lists b
 | How do I add a column to every evaluation? | [a set of measures](../extend.md#a-set-of-measures) |
 """
 END = """
-`scenarios/` has one YAML file per scenario, and `train/` one per training recipe. The files that
-belong to an extension are in a subfolder with the extension's name. The wheel (the installable
-package) contains `scenarios/` and `train/`. Another page explains [how the code is
-tested](tests.md).
+The folder `scenarios/` contains one YAML file for each scenario, and the folder `train/` one YAML
+file for each training recipe. The scenarios and recipes of an extension are in a subfolder with the
+extension's name. The wheel (the installable package) contains `scenarios/` and `train/`. Another
+page explains [how the code is tested](tests.md).
 """
 
 
@@ -107,14 +107,14 @@ def page() -> str:
         [
             BEGINNING,
             "## The core\n",
-            "The core from the top down; a folder or file uses only those in the lines below it:\n",
+            "This list shows the core. A folder or file uses only folders and files in the lines below it:\n",
             "```text",
             *drawing,
             "```",
             "",
             *table([layer for layer in core if layer], "", uses),
             "\n## Extensions\n",
-            "Every extension may use the core and the extensions in the lines below it:\n",
+            "An extension may use the core and the extensions in the lines below it:\n",
             "```text",
             *beside,
             "```",

@@ -263,7 +263,7 @@ def test_paper__treats_every_label_and_everything_that_has_a_number_once(title: 
 def test_paper__says_how_the_report_and_the_code_differ_from_it() -> None:
     sentences = (
         "one `k_energy` for all pairs",
-        "but not masses and e",
+        "but neither masses nor the restitution e",
         "predicts a harm of 3.07",
         "above v_max when pushed",
     )
