@@ -302,8 +302,8 @@ def digest_of_sources(source: Path) -> str:
         written_s = file.stat().st_mtime
         if written_s > time.time():
             warnings.warn(
-                f"{_PACKAGE}: files have dates in the future, so each process compiles the kernels again; correct the"
-                " clock of this machine, or the dates (find FOLDER -exec touch {} +)",
+                f"{_PACKAGE}: a file in this folder has a date in the future, so each process compiles the physics"
+                " again; correct the clock of this machine, or the dates of the files (find FOLDER -exec touch {} +)",
                 stacklevel=2,
             )
         if written_s > _IMPORTED_S:

@@ -298,8 +298,8 @@ def _refuse_unsampled(worlds: Worlds, until: Floats, step_s: float) -> None:
     if not good.all():
         k = int(np.argmin(good))
         raise InvalidInput(
-            f"advance_sampled: world {k} cannot be advanced from {worlds.time_s[k]:g} s to {until[k]:g} s; this must"
-            f" take 0 to {MOST_STEPS:,} steps of {step_s:g} s"
+            f"advance_sampled: world {k} cannot be advanced from {worlds.time_s[k]:g} s to {until[k]:g} s; the"
+            f" end must not be earlier than the start, and at most {MOST_STEPS:,} steps of {step_s:g} s later"
         )
     start = worlds.vehicles.latency_s[:, 1]
     position = (worlds.time_s - start) / step_s

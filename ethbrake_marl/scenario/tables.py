@@ -166,7 +166,7 @@ def _known_columns(header: list[str], scenario: ScenarioFields, where: str) -> l
         if name == RECORDING:
             raise InvalidInput(
                 f"{where}: column {name!r} is possible only in the table of a scenario; put this table into a scenario"
-                " (key table), or remove the column, but then confidence intervals treat all worlds as independent"
+                " (key table), or remove the column (confidence intervals then treat all worlds as independent)"
             )
         if name not in known:
             hint = suggestion(name, known) or f"known: {', '.join(known)}"

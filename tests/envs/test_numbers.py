@@ -19,7 +19,7 @@ BAD: dict[str, tuple[Make, str]] = {
     "tensor of a truth": (lambda x: torch.tensor(bool(x)), "is a boolean"),
     "masked": (lambda x: np.ma.masked, "is masked"),
     "masked array": (lambda x: np.ma.array(x, mask=True), "is masked"),
-    "gradient": (lambda x: torch.tensor(x, requires_grad=True), r"needs gradients; pass its \.detach\(\)"),
+    "gradient": (lambda x: torch.tensor(x, requires_grad=True), r"requires gradients; pass tensor\.detach\(\)"),
     "parameter": (lambda x: torch.nn.Parameter(torch.tensor(x)), "needs gradients"),
     "elsewhere": (lambda x: torch.zeros((), device="meta"), "is not a number"),
     "half": (lambda x: torch.tensor(x, dtype=torch.bfloat16), "is not a number"),

@@ -98,7 +98,7 @@ GIVEN: dict[str, Callable[[], object]] = {
         PAPER, COLUMNS | {"gaps_1_m": [1, 2, 3]}
     ),
     "initial states: column 'recording' is possible only in the table of a scenario; put this table into a scenario "
-    "(key table), or remove the column, but then confidence intervals treat all": lambda: worlds_from_table(
+    "(key table), or remove the column (confidence intervals then treat all": lambda: worlds_from_table(
         PAPER, COLUMNS | {"recording": ["a", "a", "b"]}
     ),
     "initial states: column obstacle_gap_m is missing; scenario": lambda: worlds_from_table(OBSTACLE, COLUMNS),

@@ -278,7 +278,7 @@ ROADS: dict[str, Callable[[], object]] = {
     ),
     "scenario 'paper-random': friction = 0: must be finite and in (0, 2]": lambda: FIXED.replace(friction=0),
     "must be a number or a distribution; leave the key out if you do not need it": lambda: FIXED.replace(friction=None),
-    "scenario 'paper-random': has nothing random, so all its worlds are the same": lambda: ranges(
+    "scenario 'paper-random': no quantity is random, so all its worlds are the same": lambda: ranges(
         eb.Scenario(**{**FIXED.declared(), "table": {"columns": ["gap_1_m", "mass_3_t"], "rows": [[12, 30]]}})
     ),
     "only with v2x: paper, because messages before the alert are not": lambda: FIXED.replace(alert_s=2, v2x="nominal"),

@@ -309,7 +309,7 @@ def test_own_features__say_what_they_read_or_are_refused() -> None:
         lacking = LINE.replace(v2x={"tells": {"vehicle_3": ["place"]}})
         assert seen_by(engine_of(lacking, said), 1) == pytest.approx({said[0]: 0.0, said[1]: 0.9})
         with pytest.raises(
-            InvalidInput, match=r"feature 'double_mass': may read all that messages can contain, but the messages"
+            InvalidInput, match=r"feature 'double_mass': may read everything that a message can contain, but messages"
         ):
             seen_by(engine_of(lacking, unsaid), 1)
         with pytest.raises(InvalidInput, match="reads = 'mass': must be a list with some of the names place, speed"):

@@ -113,7 +113,7 @@ TUNINGS: dict[str, Callable[[], object]] = {
     "t.yaml, line 6: recipe 'ppo': vf_coef = -0.5: must be greater than or equal to 0": lambda: plan(
         WRITTEN.replace("vf_coef: 0.5", "vf_coef: -0.5", 1)
     ),
-    "t.yaml, line 6: set.seed: this key is not allowed under set; at the top of the file": lambda: plan(
+    "t.yaml, line 6: set.seed: this key is not allowed under set; to choose the seed and": lambda: plan(
         WRITTEN.replace("vf_coef: 0.5", "seed: 3", 1)
     ),
 }
@@ -298,7 +298,7 @@ FALSIFICATIONS: dict[str, Callable[[], object]] = {
     "scenario 'cooperation-2-blocked': its v2x channel has delays and losses, which a table of worlds": lambda: ranges(
         load_scenario("cooperation-2-blocked")
     ),
-    "scenario 'paper-scenario-1': has nothing random, so all its worlds are the same": lambda: ranges(
+    "scenario 'paper-scenario-1': no quantity is random, so all its worlds are the same": lambda: ranges(
         load_scenario("paper-scenario-1")
     ),
     "--against coast: --measure harm uses no second agent; leave --against out": lambda: Measure.of(
