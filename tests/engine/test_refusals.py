@@ -145,7 +145,7 @@ OBJECTIVES: dict[str, Callable[[], object]] = {
     "reward: objective = 5: must be the name of an objective, for instance": lambda: parallel_env(
         PAPER, reward={"objective": 5}
     ),
-    "scored: 'own': must be a list of objectives, for instance ['own']": lambda: scored(
+    "scored = 'own': must be a list of objectives, for instance ['own']": lambda: scored(
         empty_ledger(line([5.0], [9.0, 9.0])), "first", "own"
     ),
     "objective 'social:91': social needs an angle from 0 to 90 degrees, as in social:45": lambda: objectives_of(

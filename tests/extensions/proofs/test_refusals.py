@@ -54,13 +54,13 @@ PROOFS: dict[str, Callable[[], object]] = {
         THREE, horizon_s=float("inf")
     ),
     "lower_bound: horizon_s = '8': the horizon must be a number (time in s)": lambda: lower_bound(THREE, horizon_s="8"),
-    "lower_bound: time_step_s = 0.0: the time step must be a finite number of at least 0.001": lambda: lower_bound(
+    "lower_bound: time_step_s = 0.0: must be a finite number of at least 0.001": lambda: lower_bound(
         THREE, time_step_s=0.0
     ),
-    "lower_bound: time_step_s = True: the time step must be a finite number of at least 0.001": lambda: lower_bound(
+    "lower_bound: time_step_s = True: must be a finite number of at least 0.001": lambda: lower_bound(
         THREE, time_step_s=True
     ),
-    "lower_bound: time_step_s = nan: the time step must be a finite number of at least 0.001": lambda: lower_bound(
+    "lower_bound: time_step_s = nan: must be a finite number of at least 0.001": lambda: lower_bound(
         THREE, time_step_s=float("nan")
     ),
     "team_bound: vehicles = (): must have at least one vehicle and no vehicle twice": lambda: team_bound(TEAM, ()),
