@@ -276,7 +276,7 @@ def policy_agent(
     if shape not in (None, (size,)):
         raise InvalidInput(
             f"agent {named!r}: the policy was trained for observations of shape {shape}, but would get observations of"
-            f" {size} features; pass the scenario, observation or appended of the training"
+            f" {size} features; pass the same scenario, observation or appended as in the training"
         )
     seen = spec if trained is None or ignore_wrappers else trained.engine.observation
     if [f.name for f in spec.features] != [f.name for f in seen.features]:

@@ -121,7 +121,7 @@ def unflat(arrays: Mapping[str, NDArray[Any]], place: str) -> Memory:
     inner = dict.fromkeys(name[len(place) + 1 :].partition(".")[0] for name in arrays if name.startswith(f"{place}."))
     if not inner:
         raise InvalidInput(
-            f"engine snapshot: the array {place} is missing, which contains the memory of a vehicle's script"
+            f"engine snapshot: the array {place}, which contains the memory of a vehicle's script, is missing"
         )
     parts = {name: unflat(arrays, f"{place}.{name}") for name in inner}
     return tuple(parts[str(k)] for k in range(len(parts))) if "0" in parts else parts

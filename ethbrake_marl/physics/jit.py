@@ -263,7 +263,7 @@ def keep_kernel(name: str, content: bytes) -> None:
             Path(part).unlink(missing_ok=True)
             raise
     except OSError as error:
-        warnings.warn(f"{folder}: a compiled kernel could not be written to this folder: {error}", stacklevel=2)
+        warnings.warn(f"{folder}: compiled code could not be written to this folder: {error}", stacklevel=2)
 
 
 def _digest_of(name: str, content: bytes) -> bytes:

@@ -315,7 +315,9 @@ def worlds_from_table(scenario: ScenarioFields, columns: Mapping[str, ArrayLike]
     shapes = {column.shape for column in by_entry.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 1:
         lengths = ", ".join(f"{name} {list(np.shape(column))}" for name, column in columns.items())
-        raise InvalidInput(f"initial states: all columns must be lists of one length; they have the shapes {lengths}")
+        raise InvalidInput(
+            f"initial states: all columns must be lists of the same length; they have the shapes {lengths}"
+        )
     return _worlds(by_entry, scenario, _Naming("initial states", "table"))
 
 

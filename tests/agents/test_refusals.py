@@ -70,8 +70,8 @@ SPECS: dict[str, Callable[[], object]] = {
     "agent 'constant:fast': constant needs a finite deceleration in m/s2 after the colon": lambda: make_agent(
         "constant:fast"
     ),
-    "agent 'e_v2x_bm:total': the argument must be 'coupled' or 'pairwise', then 'estimated'": lambda: make_agent(
-        "e_v2x_bm:total"
+    "agent 'e_v2x_bm:total': after the first colon, write 'coupled' or 'pairwise', then 'estimated'": lambda: (
+        make_agent("e_v2x_bm:total")
     ),
     "harm_count = 'both': must be 'first' or 'total'": lambda: make_agent("e_v2x_bm", harm_count="both"),
     "horizon_s = 0.0: must be a finite number of seconds above 0": lambda: make_agent("e_v2x_bm", horizon_s=0.0),

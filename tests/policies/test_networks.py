@@ -353,7 +353,7 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "list_manifest": (_manifest(lambda _: b"[]"), r"manifest.json: must be a mapping"),
     "key_twice": (
         _manifest(lambda data: data.replace(b"{", b'{"algorithm": "ppo",', 1)),
-        r"manifest.json: key 'algorithm' occurs twice",
+        r"manifest.json: a JSON object contains the key 'algorithm' twice",
     ),
     "nan": (_manifest(lambda data: data.replace(b"1024", b"NaN")), r"manifest.json: NaN is not a JSON number"),
     "huge_number": (_manifest(lambda data: data.replace(b"1024", b"1e999")), r"manifest.json: 1e999 is too large"),
@@ -481,7 +481,10 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "offsets_backwards": (_first_tensor(data_offsets=[52, 0]), r"weights.safetensors: not a safetensors file"),
     "offsets_negative": (_first_tensor(data_offsets=[-52, 0]), r"weights.safetensors: not a safetensors file"),
     "deep_header": (_raw_header(b"[" * 200_000), r"weights.safetensors: nested too deeply"),
-    "key_twice_in_header": (_raw_header(b'{"a": {}, "a": {}}'), r"weights.safetensors: key 'a' occurs twice"),
+    "key_twice_in_header": (
+        _raw_header(b'{"a": {}, "a": {}}'),
+        r"weights.safetensors: a JSON object contains the key 'a' twice",
+    ),
     "empty_header": (_raw_header(b"{}"), r"the file does not contain the tensor 'policy.0.bias'"),
     "minus_infinite_weight": (
         _tensors(lambda t: {**t, "value.0.bias": t["value.0.bias"] - np.float32(np.inf)}),

@@ -383,5 +383,5 @@ def test_table_of_a_file__is_refused_with_the_row_of_the_file(empty_folder: Path
 
 def test_state_that_is_given__needs_a_channel_that_draws_nothing() -> None:
     kinds = {"equipped": {"weight": 7}, "without": {"weight": 3, "v2x": SILENT}}
-    with refused("initial_state: with v2x: nominal, it is random which messages arrive, and when; worlds"):
+    with refused("initial_state: with v2x: nominal, it is random what the vehicles learn about each other"):
         worlds_from_state(FIXED.replace(vehicle_types=kinds, v2x=LINKS), {"gaps_m": [7, 7], "speeds_mps": [20, 20, 20]})

@@ -25,7 +25,7 @@ def front_command(
         str | None,
         typer.Option(
             metavar="A,B,...",
-            help="Agents to compare with the front.",
+            help="Agents to compare with the Pareto front.",
             show_default="e_v2x_bm,universal with one learner, else none",
         ),
     ] = None,
