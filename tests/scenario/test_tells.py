@@ -209,7 +209,9 @@ def test_tells__a_mixture_holds_scenarios_whose_messages_contain_different_piece
     lacks = Messages.of(mixture.sample(60, 7).worlds).withhold_from(1)
     assert lacks.any() and not lacks.all()
     entries[1]["scenario"] = PAPER.replace(name="part-1").declared()
-    with pytest.raises(InvalidInput, match=r"mixture: part-0 has v2x\.tells, but part-1 does not; write"):
+    with pytest.raises(
+        InvalidInput, match=r"mixture: scenario part-0 has the key v2x\.tells, but scenario part-1 does not"
+    ):
         eb.Scenario(name="both", mixture=entries)
 
 
