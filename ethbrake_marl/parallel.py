@@ -77,7 +77,7 @@ def run_each(calls: Iterable[Call], jobs: int | None = None, ray: str | None = N
                 yield result
         except BrokenProcessPool:
             raise WorkerLost(
-                "a worker process was killed, perhaps because memory ran out; run fewer calls at once (--jobs)"
+                "a worker process was killed, perhaps because memory ran out; use fewer processes at once (--jobs)"
             ) from None
         finally:
             with warnings.catch_warnings(action="ignore"):  # warnings about calls that are cancelled

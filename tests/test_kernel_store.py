@@ -173,7 +173,7 @@ def test_digest_of_sources__is_not_known_of_code_in_no_file_edited_since_or_from
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
             assert digest_in(copied, "physics/advance.py") == ""
-        expected = [f"{copied}: files have dates in the future"] * (date > now)
+        expected = [f"{copied}: a file in this folder has a date in the future"] * (date > now)
         assert [str(each.message)[: len(expected[0])] for each in told] == expected
 
 

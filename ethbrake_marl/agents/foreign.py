@@ -72,8 +72,8 @@ def adapt_policy(policy: Any, name: str, features: int, initial_state: Begin | N
 def _without_memory(action: Any) -> Any:
     if isinstance(action, tuple):
         raise InvalidInput(
-            f"returned a tuple of {len(action)} values; must return the actions alone; a function that returns"
-            " (action, state) also needs the argument initial_state"
+            f"returned a tuple of {len(action)} values; the function must return the actions alone, or, if it returns"
+            " (action, state), you must also pass initial_state"
         )
     return action
 
@@ -276,13 +276,13 @@ def policy_agent(
     if shape not in (None, (size,)):
         raise InvalidInput(
             f"agent {named!r}: the policy was trained for observations of shape {shape}, but would get observations of"
-            f" {size} features; pass the scenario, observation or appended of the training"
+            f" {size} features; pass the same scenario, observation or appended as in the training"
         )
     seen = spec if trained is None or ignore_wrappers else trained.engine.observation
     if [f.name for f in spec.features] != [f.name for f in seen.features]:
         raise InvalidInput(
-            f"agent {named!r}: the model was trained with the observation {seen}, not with {spec}; leave observation"
-            " out, and pass the training scenario or no scenario"
+            f"agent {named!r}: the model was trained with the observation {seen}, not with {spec}; leave the"
+            " argument observation out, and pass the training scenario or no scenario"
         )
     actions = getattr(trained, "actions", None) if actions is None else actions
     if not ignore_wrappers:

@@ -65,7 +65,9 @@ def make_agent(
         raise InvalidInput(f"horizon_s = {horizon_s!r}: must be a finite number of seconds above 0")
     written = parse_spec(spec)
     if written.name == PROFILE:
-        raise InvalidInput(f"agent {spec!r}: a braking profile can only be the role of a vehicle in a scenario")
+        raise InvalidInput(
+            f"agent {spec!r}: a braking profile can only be the role of a vehicle; write it under roles in the scenario"
+        )
     settings = AgentSettings(
         written.core, written.policy, scenario, harm_count, float(horizon_s), most_candidates, uncertainty,
         time_step_s or (0.1 if scenario is None else scenario.time_step_s),

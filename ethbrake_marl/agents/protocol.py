@@ -167,8 +167,8 @@ def fixed_commands(
     pieces = {i: getattr(script, "braking_pieces", ()) for i, script in scripts.items() if i != vehicle}
     if not np.array_equal(worlds.play_pieces(pieces).vehicles.pieces, worlds.vehicles.pieces):
         raise InvalidInput(
-            f"{who}: in these worlds, vehicles follow other braking profiles than the scripts of the scenario do; draw"
-            " or read the worlds with the same scenario"
+            f"{who}: the braking profiles in these worlds differ from the braking profiles in the scenario's roles;"
+            " draw or read the worlds with the same scenario"
         )
     return command
 

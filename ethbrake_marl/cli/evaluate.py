@@ -257,7 +257,7 @@ def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, repo
     """
     if output is None:
         for option in (name for name, value in (("--per-world", per_world), ("--report", report)) if value):
-            raise InvalidInput(f"{option}: can be used only with a folder; add --output FOLDER")
+            raise InvalidInput(f"{option}: needs a folder for its file; add --output FOLDER")
         return
     if per_world == "parquet":
         need("pyarrow")

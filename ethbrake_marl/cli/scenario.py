@@ -283,7 +283,7 @@ def scenario_new(
     based_on: Annotated[
         str, typer.Option(metavar="NAME|PATH", help="Scenario from which the new scenario takes its values.")
     ] = "paper-random",
-    output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for the new file.")] = Path(),
+    output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for the new scenario file.")] = Path(),
     force: ForceOption = False,
 ) -> None:
     """Write a new scenario file, NAME.yaml, with comments.

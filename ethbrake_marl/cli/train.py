@@ -39,7 +39,8 @@ TrainingSeedOption = Annotated[
 ]
 
 OutputOption = Annotated[
-    Path | None, typer.Option(metavar="FOLDER", help="Folder of the run.", show_default="runs/SCENARIO-RECIPE-seedSEED")
+    Path | None,
+    typer.Option(metavar="FOLDER", help="Folder to write the run to.", show_default="runs/SCENARIO-RECIPE-seedSEED"),
 ]
 
 

@@ -77,7 +77,8 @@ def checked_memory(memory: Memory, n: int, what: str = "state") -> Memory:
         shape = tuple(getattr(array, "shape", ()))
         if not shape or shape[0] != n:
             raise InvalidInput(
-                f"{what}: has {type(array).__name__} of shape {shape}; must have arrays of length {n} (worlds)"
+                f"{what}: contains {type(array).__name__} of shape {shape}; must contain only arrays of length {n}, the"
+                " number of worlds"
             )
         if array.dtype.hasobject:
             raise InvalidInput(f"{what}: contains an array of objects; arrays must contain numbers, booleans or texts")
@@ -120,7 +121,7 @@ def unflat(arrays: Mapping[str, NDArray[Any]], place: str) -> Memory:
     inner = dict.fromkeys(name[len(place) + 1 :].partition(".")[0] for name in arrays if name.startswith(f"{place}."))
     if not inner:
         raise InvalidInput(
-            f"engine snapshot: the array {place} is missing, which contains the memory of a vehicle's script"
+            f"engine snapshot: the array {place}, which contains the memory of a vehicle's script, is missing"
         )
     parts = {name: unflat(arrays, f"{place}.{name}") for name in inner}
     return tuple(parts[str(k)] for k in range(len(parts))) if "0" in parts else parts
@@ -174,7 +175,8 @@ def begin_script(script: Script, alert: Worlds, vehicle: int, scripts: Mapping[i
             return begin(alert, vehicle, scripts)
         if len(inspect.signature(script.act).parameters) == 2:
             raise InvalidInput(
-                f"{_who(script, vehicle)}: the agent has begin, but act has no argument memory; {_SHAPES}"
+                f"{_who(script, vehicle)}: the agent has a method begin, but its method act has no argument memory;"
+                f" {_SHAPES}"
             )
         with _as_it_was(script, vehicle):
             return checked_memory(
@@ -229,8 +231,8 @@ def _as_it_was(script: Script, vehicle: int) -> Iterator[None]:
         is_cached = name not in before and isinstance(getattr(type(script), name, None), cached_property)
         if not is_cached and (name not in before or getattr(script, name, None) is not before[name]):
             raise InvalidInput(
-                f"{_who(script, vehicle)}: the agent changed its attribute {name!r}, which all episodes share;"
-                f" {_SHAPES}"
+                f"{_who(script, vehicle)}: the agent changed its attribute {name!r}, which all episodes share; keep"
+                f" such values in the memory: {_SHAPES}"
             )
 
 

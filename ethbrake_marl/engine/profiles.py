@@ -214,8 +214,8 @@ class ProfileProblem(NamedTuple):
         ).all()
         if not ordered:
             raise InvalidInput(
-                "profiles: ends, the steps at which the phases end, must not decrease along a row, and the last phase"
-                " of each row must end at the last step"
+                "profiles: ends (the steps at which phases end) must not decrease within a profile, and the last phase"
+                " of each profile must end at the last step"
             )
 
 

@@ -76,7 +76,7 @@ class State(NamedTuple):
         because memories of guards cannot be joined.
         """
         if states[0].guarded is not None:
-            raise InvalidInput("states: cannot be joined if the engine has a shield; use an engine without a shield")
+            raise InvalidInput("states of an engine with a shield cannot be joined; use an engine without a shield")
         joined = State(*map_memory(lambda *parts: np.concatenate(parts), *(state[:6] for state in states)))
         impacts = [state.impacts for state in states if state.impacts is not None]
         return joined._replace(impacts=EpisodeImpacts.join(impacts) if impacts else None)

@@ -208,13 +208,15 @@ class Result:
         """
         beside = self.about.get("per_world")
         if not isinstance(beside, dict) or not isinstance(beside.get("file"), str):
-            raise InvalidInput(f"{self.path} was written without a file with one row per world (--per-world)")
+            raise InvalidInput(
+                f"{self.path} was written without a file that has one row per world; evaluate again with --per-world"
+            )
         file = self.path.parent / Path(beside["file"]).name
         if not file.is_file():
             raise InvalidInput(f"{file}, the file with one row per world of {self.path}, does not exist")
         data = read_plain(file, _MOST_BYTES)
         if hashlib.sha256(data).hexdigest() != beside.get("sha256"):
-            raise InvalidInput(f"{file} was changed after {self.path} was written")
+            raise InvalidInput(f"{file} was changed after {self.path} was written; evaluate again")
         return read_harms(file, data)
 
 
@@ -228,7 +230,7 @@ def read_result(path: Path) -> Result:
     except ValueError as error:
         if isinstance(error, EthBrakeError):
             raise
-        raise InvalidInput(f"{path}: is not JSON, or is incomplete: {error}") from None
+        raise InvalidInput(f"{path}: must contain complete JSON: {error}") from None
     rows = _rows_of(path, content)
     for row in rows:
         for key, kind in _NEEDED.items():
@@ -322,5 +324,5 @@ def _rows_of(path: Path, content: Any) -> list[dict[str, Any]]:
     about = {key: value for key, value in content.items() if key != "agents"}
     agents = content.get("agents")
     if not isinstance(agents, list) or not agents or not all(isinstance(row, dict) for row in agents):
-        raise InvalidInput(f"{path}: agents is missing or not a list of objects; the file is incomplete")
+        raise InvalidInput(f"{path}: the key agents must be a list of one or more objects; evaluate again")
     return [row | about for row in agents]

@@ -214,8 +214,8 @@ def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
     if set(learners) - {vehicle}:
         raise InvalidInput(
             f"scenario {scenario.name!r} has the learners {', '.join(names)}, but vehicle ="
-            f" {scenario.vehicle_names[vehicle]} is the only controlled vehicle; give each other learner a script"
-            " (scenario.replace(roles=...))"
+            f" {scenario.vehicle_names[vehicle]} is the only controlled vehicle; give a script to every other"
+            " learner (scenario.replace(roles=...))"
         )
     return int(vehicle)
 

@@ -71,7 +71,7 @@ def check_arrays(found: Mapping[str, ArrayHeader], wanted: Sequence[ArrayRow], w
     """
     names = {row.name for row in wanted}
     for name in sorted(names - found.keys()):
-        raise ValueError(f"{word} {name!r} is missing")
+        raise ValueError(f"the file does not contain the {word} {name!r}")
     for name in sorted(found.keys() - names):
         raise ValueError(
             f"{word} {name!r} must not be in this file; the file must have only {', '.join(sorted(names))}"
@@ -86,8 +86,8 @@ def check_arrays(found: Mapping[str, ArrayHeader], wanted: Sequence[ArrayRow], w
         right = [lengths.get(each, each) if isinstance(each, str) else each for each in row.shape]
         if header.dtype != row.dtype or list(header.shape) != right:
             raise ValueError(
-                f"{word} {row.name!r} has type and shape {header.dtype} {list(header.shape)}; must be {row.dtype}"
-                f" [{', '.join(map(str, right))}]"
+                f"{word} {row.name!r} has type {header.dtype} and shape {list(header.shape)}; must have type"
+                f" {row.dtype} and shape [{', '.join(map(str, right))}]"
             )
     return lengths
 
@@ -158,13 +158,13 @@ class ArrayArchive:
     def _read_header(self, member: zipfile.ZipInfo) -> None:
         name = _name(member)
         if name in self.headers:
-            raise ValueError(f"array {name!r} occurs twice")
+            raise ValueError(f"the file contains the array {name!r} twice")
         if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise ValueError(
                 f"array {name!r} has zip compression method {member.compress_type}; only stored or deflated is accepted"
             )
         if member.flag_bits & ~_HARMLESS_FLAGS:
-            raise ValueError(f"array {name!r} is encrypted or patched")
+            raise ValueError(f"array {name!r} has a zip flag that is not accepted, for instance of encryption")
         with _damage(), self._zip.open(member) as stream:
             beginning = stream.read(10 + _NPY_HEADER_LIMIT_BYTES)
         header, start = _npy_header(name, beginning)
@@ -194,7 +194,7 @@ def _npy_header(name: str, beginning: bytes) -> tuple[ArrayHeader, int]:
     if dtype[1:] not in ("b1", "f4", "f8", "i4", "i8", "u1", "u2", "u4", "u8"):
         raise ValueError(f"array {name!r}: has type {dtype}; must be a boolean, integer or floating-point type")
     if _SHAPE.fullmatch(shape) is None:
-        raise ValueError(f"array {name!r}: has the invalid shape ({shape:.60})")
+        raise ValueError(f"array {name!r}: has the shape ({shape:.60}); must have whole numbers separated by commas")
     return ArrayHeader(dtype, tuple(int(each) for each in shape.split(",") if each.strip())), 10 + length
 
 
@@ -208,9 +208,14 @@ def _check_directory(data: bytes) -> None:
         raise ValueError("not a plain .npz archive")
     disk, first_disk, here, members, size, start, comment = struct.unpack("<4H2LH", data[-18:])
     if disk or first_disk or comment or here != members or data[-42:-38] == b"PK\x06\x07":
-        raise ValueError("not a plain .npz archive: it has several disks or a comment, or is a zip64 archive")
+        raise ValueError(
+            "not a plain .npz archive: must be one zip file without a comment and without the zip64 extension"
+        )
     if members > _MEMBERS_LIMIT or size > _DIRECTORY_LIMIT_BYTES or start + size != len(data) - 22:
-        raise ValueError(f"not a plain .npz archive: its directory has {members} entries in {size:,} bytes")
+        raise ValueError(
+            f"not a plain .npz archive: its directory ({members} entries, {size:,} bytes) must be small and stand at"
+            " the end of the file"
+        )
 
 
 @contextmanager

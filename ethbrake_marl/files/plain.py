@@ -137,7 +137,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     parsed: dict[str, Any] = {}
     for key, value in pairs:
         if key in parsed:
-            raise ValueError(f"key {key!r} occurs twice")
+            raise ValueError(f"a JSON object contains the key {key!r} twice")
         parsed[key] = value
     return parsed
 
@@ -149,5 +149,5 @@ def _not_a_number(text: str) -> NoReturn:
 def _finite(text: str) -> float:
     number = float(text)
     if not math.isfinite(number):
-        raise ValueError(f"{text} is too large for a number")
+        raise ValueError(f"{text} is too large for a floating-point number")
     return number

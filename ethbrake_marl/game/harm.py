@@ -78,8 +78,8 @@ class Ledger:
         names = [column.name for column in fields(self) if column.name not in ("mass_t", "restitution", "harm_weight")]
         if before.count.shape != self.count.shape or (before.count > self.count).any():
             raise InvalidInput(
-                "since: before is not an earlier ledger (record of harm) of the same episodes; call since before a new"
-                " episode begins"
+                "since: the argument before must be an earlier ledger (record of harm) of the same episodes; call since"
+                " before a new episode begins"
             )
         return replace(self, **{name: getattr(self, name) - getattr(before, name) for name in names})
 

@@ -293,7 +293,7 @@ def scored(ledger: Ledger, harm_count: HarmCount, declared: Sequence[Declared] |
 
     """
     if isinstance(declared, str):
-        raise InvalidInput(f"scored: {declared!r}: must be a list of objectives, for instance [{declared!r}]")
+        raise InvalidInput(f"scored = {declared!r}: must be a list of objectives, for instance [{declared!r}]")
     for each in declared or ():
         check_declared(each)
     vehicles, declared = ledger.mass_t.shape[1], standard_objectives() if declared is None else declared

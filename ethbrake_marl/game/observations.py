@@ -225,9 +225,9 @@ class Extra(NamedTuple):
         if reads is None:
             for piece in messages.lacks(neighbour):
                 raise InvalidInput(
-                    f"feature {self.entry.feature.name!r}: may read all that messages can contain, but the messages of"
-                    f" vehicle_{neighbour + 1} do not contain its {piece} (key v2x.tells); add it to v2x.tells, or"
-                    " register the feature with a list of what it reads: register_feature(..., reads=['place'])"
+                    f"feature {self.entry.feature.name!r}: may read everything that a message can contain, but messages"
+                    f" of vehicle_{neighbour + 1} do not contain its {piece}; add {piece} to the key v2x.tells of the"
+                    " scenario, or list what the feature reads: register_feature(..., reads=['place'])"
                 )
             return np.ones(worlds.n, np.bool_)
         known = messages.known_pieces(vehicle, worlds.time_s)[:, neighbour]

@@ -64,7 +64,7 @@ def common_observation(observations: tuple[ObservationSpec, ...], scenario: Game
             one, two = (scenario.vehicle_names[i] for i in (first, other))
             raise InvalidInput(
                 f"observation: {one} and {two} of {scenario.name!r} observe different features, but must observe the"
-                " same features here; give one list for all vehicles, use a single learner, or use parallel_env (in a"
-                " recipe: scheme: independent)"
+                " same features here; give one list of features for all vehicles, use a single learner, or use"
+                " parallel_env (in a recipe: scheme: independent)"
             )
     return observations[first]

@@ -114,8 +114,8 @@ class RewardParams(FileModel):
         inside = value.get("terms", {})
         if not isinstance(inside, dict) or beside.keys() & inside.keys():
             raise ValueError(
-                "terms must be a mapping; the weight of a registered measure must stand either in terms or next to the"
-                " other settings, not in both places"
+                "write the weight of a registered measure either in the mapping terms or next to the other settings,"
+                " not in both places"
             )
         return {**{name: each for name, each in value.items() if name not in beside}, "terms": {**inside, **beside}}
 

@@ -263,7 +263,7 @@ def keep_kernel(name: str, content: bytes) -> None:
             Path(part).unlink(missing_ok=True)
             raise
     except OSError as error:
-        warnings.warn(f"{folder}: a compiled kernel could not be written to this folder: {error}", stacklevel=2)
+        warnings.warn(f"{folder}: compiled code could not be written to this folder: {error}", stacklevel=2)
 
 
 def _digest_of(name: str, content: bytes) -> bytes:
@@ -302,8 +302,8 @@ def digest_of_sources(source: Path) -> str:
         written_s = file.stat().st_mtime
         if written_s > time.time():
             warnings.warn(
-                f"{_PACKAGE}: files have dates in the future, so each process compiles the kernels again; correct the"
-                " clock of this machine, or the dates (find FOLDER -exec touch {} +)",
+                f"{_PACKAGE}: a file in this folder has a date in the future, so each process compiles the physics"
+                " again; correct the clock of this machine, or the dates of the files (find FOLDER -exec touch {} +)",
                 stacklevel=2,
             )
         if written_s > _IMPORTED_S:

@@ -372,8 +372,8 @@ def refuse_untold(
         if tuple(vehicles) != (sender,) and (missing := messages.lacks(sender, needs)):
             raise InvalidInput(
                 f"{who}: messages of vehicle_{sender + 1} do not contain its {missing[0]} (key v2x.tells), but"
-                f" {', '.join(needs)} of the other vehicles are needed; add them to v2x.tells, or use a policy alone,"
-                " which needs only its observation"
+                f" {', '.join(needs)} of the other vehicles are needed; add them to v2x.tells, or use a policy"
+                " without shield and search, which needs only its observation"
             )
 
 

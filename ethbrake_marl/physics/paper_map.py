@@ -248,7 +248,7 @@ def advance_sampled(
         k = int(np.argmax(worlds.obstacle_ahead))
         raise InvalidInput(
             f"advance_sampled: world {k} has an obstacle ahead (obstacle_gap_m = {worlds.obstacle_gap_m[k]:g}); the"
-            " paper's fixed-step map has no obstacle; use advance"
+            " paper's fixed-step physics has no obstacle; use advance"
         )
     worlds.refuse_build_up("advance_sampled")
     command = shaped("command_mps2", command_mps2, worlds.speeds_mps.shape)
@@ -298,8 +298,8 @@ def _refuse_unsampled(worlds: Worlds, until: Floats, step_s: float) -> None:
     if not good.all():
         k = int(np.argmin(good))
         raise InvalidInput(
-            f"advance_sampled: world {k} cannot be advanced from {worlds.time_s[k]:g} s to {until[k]:g} s; this must"
-            f" take 0 to {MOST_STEPS:,} steps of {step_s:g} s"
+            f"advance_sampled: world {k} cannot be advanced from {worlds.time_s[k]:g} s to {until[k]:g} s; the"
+            f" end must not be earlier than the start, and at most {MOST_STEPS:,} steps of {step_s:g} s later"
         )
     start = worlds.vehicles.latency_s[:, 1]
     position = (worlds.time_s - start) / step_s
@@ -316,6 +316,6 @@ def _refuse_unsampled(worlds: Worlds, until: Floats, step_s: float) -> None:
         k = int(np.argmin(good.all(axis=1)))
         raise InvalidInput(
             f"advance_sampled: world {k} has a negative speed at {worlds.time_s[k]:g} s, before its first sample at"
-            f" {start[k]:g} s; speeds must be at least 0 there, because impacts before the first sample are not"
-            " part of the fixed-step map"
+            f" {start[k]:g} s; speeds must be at least 0 there, because the paper's fixed-step physics has no impacts"
+            " before the first sample"
         )

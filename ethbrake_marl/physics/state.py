@@ -518,7 +518,7 @@ def real_numbers(value: ArrayLike) -> Floats:
     if np.ma.is_masked(value):
         raise ValueError("is masked")
     if getattr(value, "requires_grad", False):
-        raise ValueError("needs gradients; pass its .detach()")
+        raise ValueError("is a tensor that requires gradients; pass tensor.detach()")
     try:
         array = np.asarray(value)
         if array.dtype.hasobject and array.ndim > 0:

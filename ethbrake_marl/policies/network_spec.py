@@ -82,7 +82,9 @@ class NetworkSpec(FileModel):
             raise ValueError("output = 'choice': needs networks = 1, action_size = 1 and an empty value_hidden")
         for m, member in enumerate(self.among):
             if self.choices is None or member.among:
-                raise ValueError("among: needs output = 'choice', and the policies in the list must have no key among")
+                raise ValueError(
+                    "among: needs output = 'choice', and a policy in this list must not have a key among of its own"
+                )
             if (member.observation_size, member.action_size) != (self.observation_size, self.action_size):
                 raise ValueError(
                     f"among[{m}]: observation_size and action_size are {member.observation_size} and"

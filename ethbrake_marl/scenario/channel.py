@@ -446,8 +446,9 @@ class V2X(FileModel):
             return worlds
         if self.drawn or equipped is None:
             raise InvalidInput(
-                f"{where}: with v2x: {self.preset}, it is random which messages arrive, and when; worlds of your own"
-                " need a scenario in which this is fixed, for instance scenario.replace(v2x='paper')"
+                f"{where}: with v2x: {self.preset}, it is random what the vehicles learn about each other, and when;"
+                " worlds of your own need a channel in which this is not random, for instance"
+                " scenario.replace(v2x='paper')"
             )
         n, N = worlds.speeds_mps.shape
         return self.with_channel(worlds, np.zeros((n, self.width(N))), np.zeros(n), time_step_s, equipped)

@@ -139,8 +139,8 @@ def _check_members(document: Document, members: Sequence[ScenarioFields]) -> Non
         if says[0] != says[1]:
             giver, silent = (first, member) if says[0] else (member, first)
             raise InvalidInput(
-                f"{where}: {giver.name} has v2x.tells, but {silent.name} does not; write v2x.tells in every scenario"
-                f" of the mixture (the default is [{', '.join(USUAL_PIECES)}])"
+                f"{where}: scenario {giver.name} has the key v2x.tells, but scenario {silent.name} does not; write"
+                f" v2x.tells in every scenario of the mixture (the default is [{', '.join(USUAL_PIECES)}])"
             )
 
 

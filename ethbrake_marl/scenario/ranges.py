@@ -123,7 +123,7 @@ def ranges(scenario: ScenarioFields) -> Ranges:
     entries = {**_of_types(scenario), **_of_quantities(scenario)}
     if not entries:
         raise InvalidInput(
-            f"scenario {scenario.name!r}: has nothing random, so all its worlds are the same; give at least one"
+            f"scenario {scenario.name!r}: no quantity is random, so all its worlds are the same; give at least one"
             " quantity a distribution"
         )
     return Ranges(scenario, tuple(entries), tuple(entries.values()))

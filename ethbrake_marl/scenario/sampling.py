@@ -72,7 +72,7 @@ def sample(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, chann
             f"sample: first = {first!r}: first + n must be at most {_MOST_WORLDS}, the number of worlds of one seed"
         )
     if channel not in CHANNELS:
-        raise InvalidInput(f"sample: channel {channel!r}: must be one of {', '.join(CHANNELS)}")
+        raise InvalidInput(f"sample: channel = {channel!r}: must be one of {', '.join(CHANNELS)}")
     if scenario.mixture is None:
         return _draw_numbers(scenario, np.arange(first, first + n, dtype=np.int64), int(seed), channel)
     chosen = members_of(scenario, n, int(seed), first=first, channel=channel)

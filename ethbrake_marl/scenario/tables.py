@@ -166,7 +166,7 @@ def _known_columns(header: list[str], scenario: ScenarioFields, where: str) -> l
         if name == RECORDING:
             raise InvalidInput(
                 f"{where}: column {name!r} is possible only in the table of a scenario; put this table into a scenario"
-                " (key table), or remove the column, but then confidence intervals treat all worlds as independent"
+                " (key table), or remove the column (confidence intervals then treat all worlds as independent)"
             )
         if name not in known:
             hint = suggestion(name, known) or f"known: {', '.join(known)}"
@@ -315,7 +315,9 @@ def worlds_from_table(scenario: ScenarioFields, columns: Mapping[str, ArrayLike]
     shapes = {column.shape for column in by_entry.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 1:
         lengths = ", ".join(f"{name} {list(np.shape(column))}" for name, column in columns.items())
-        raise InvalidInput(f"initial states: all columns must be lists of one length; they have the shapes {lengths}")
+        raise InvalidInput(
+            f"initial states: all columns must be lists of the same length; they have the shapes {lengths}"
+        )
     return _worlds(by_entry, scenario, _Naming("initial states", "table"))
 
 

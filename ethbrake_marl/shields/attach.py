@@ -123,7 +123,7 @@ class Attached:
             first = engine.guard
             raise InvalidInput(
                 f"{where}: this environment already has a shield, a {first.where} (mode {first.mode.name.lower()}),"
-                " and can have only one; give that shield other options, or close() it first"
+                " and can have only one; close() that shield before you add another"
             )
         if isinstance(getattr(env, "attached", None), Attached):
             raise InvalidInput(f"{where}: {env} is a shield that was closed; pass the environment inside it instead")

@@ -160,7 +160,7 @@ class TrainingRecipe(FileModel):
     def _some_reward(cls, value: RewardParams) -> RewardParams:
         if not any(weight for name, weight in value.weights.items() if name != "shaping"):
             raise ValueError(
-                "all weights are 0, so there is nothing to learn; give at least one term a weight other than 0"
+                "all weights of the reward are 0, so there is nothing to learn; give at least one term another weight"
             )
         return value
 
@@ -412,8 +412,8 @@ def register_algorithm(name: str, recipe: type[TrainingRecipe], algorithm: type[
     is_place = isinstance(algorithm, str) and ":" in algorithm
     if not (is_place or (isinstance(algorithm, type) and hasattr(algorithm, "build"))):
         raise InvalidInput(
-            f"algorithm {name!r}: algorithm = {algorithm!r:.80}: must be a class with the method build, or its place"
-            " as 'module:class'"
+            f"algorithm {name!r}: algorithm = {algorithm!r:.80}: must be a class with the method build, or the text"
+            " 'module:class' that says where this class is"
         )
     ALGORITHMS.add(name, (recipe, algorithm), lambda entry: entry == (recipe, algorithm))
 

@@ -143,7 +143,8 @@ def recorded_training(run: RunDirectory, config: Mapping[str, Any]) -> Training:
     """
     if "library" in config:
         raise InvalidInput(
-            f"{run.path}: this run was trained by {config['library']} and cannot be resumed; train again"
+            f"{run.path}: this run was trained with the library {config['library']}, so it cannot be resumed; train"
+            " again"
         )
     try:
         recipe = TrainingRecipe.of(config["recipe"])

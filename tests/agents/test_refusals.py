@@ -70,15 +70,15 @@ SPECS: dict[str, Callable[[], object]] = {
     "agent 'constant:fast': constant needs a finite deceleration in m/s2 after the colon": lambda: make_agent(
         "constant:fast"
     ),
-    "agent 'e_v2x_bm:total': the argument must be 'coupled' or 'pairwise', then 'estimated'": lambda: make_agent(
-        "e_v2x_bm:total"
+    "agent 'e_v2x_bm:total': after the first colon, write 'coupled' or 'pairwise', then 'estimated'": lambda: (
+        make_agent("e_v2x_bm:total")
     ),
     "harm_count = 'both': must be 'first' or 'total'": lambda: make_agent("e_v2x_bm", harm_count="both"),
     "horizon_s = 0.0: must be a finite number of seconds above 0": lambda: make_agent("e_v2x_bm", horizon_s=0.0),
     "agent name 'mine:x': must be a name without ':' and '@', for instance": lambda: register_agent("mine:x", Own),
     "file 'nowhere/none.py': does not exist": lambda: make_agent("nowhere/none.py:make_agent"),
-    "agent 'profile:0=3,1=5+step': a braking profile can only be the role of a vehicle in a scenario": lambda: (
-        make_agent("profile:0=3,1=5+step", scenario=PAPER)
+    "agent 'profile:0=3,1=5+step': a braking profile can only be the role of a vehicle; write it": lambda: make_agent(
+        "profile:0=3,1=5+step", scenario=PAPER
     ),
     "agent 'policy' needs a policy: write policy@PATH, where PATH is the folder of": lambda: make_agent(
         "policy+step", scenario=PAPER
@@ -342,9 +342,7 @@ def test_agent__has_a_name_and_its_act_takes_a_memory_if_it_begins_with_one() ->
         def begin(self, worlds: Any) -> None:
             return None
 
-    with refused(
-        "agent 'own' of vehicle_2: the agent has begin, but act has no argument memory; an agent with memory has"
-    ):
+    with refused("agent 'own' of vehicle_2: the agent has a method begin, but its method act has no argument memory;"):
         evaluated(Begins(len))
 
 
@@ -364,7 +362,9 @@ def test_policy__gives_one_action_per_world_and_a_state_per_world() -> None:
     with refused("27 features: an array of the policy's state has shape (1, 8) for two worlds and (1, 8) for three"):
         eb.policy_agent(Shared())
     states = eb.policy_agent(lambda seen, state: (seen, state), name="mine", initial_state=lambda n: np.zeros(3))
-    with refused("initial_state(12): state: has ndarray of shape (3,); must have arrays of length 12", AgentFailed):
+    with refused(
+        "initial_state(12): state: contains ndarray of shape (3,); must contain only arrays of length 12", AgentFailed
+    ):
         states.begin(WORLDS, 1, {})
 
 

@@ -91,8 +91,8 @@ EVALUATIONS = [
     ("evaluate --agents ppo@shipped/ppo", "'ppo@shipped/ppo' is now written ppo"),
     ("agent export shipped/ppo --onnx policy.onnx", "'shipped/ppo' is now written ppo"),
     ("evaluate --output /proc/out", "/proc/out: cannot be written to (No such file or directory)"),
-    ("evaluate --per-world csv", "--per-world: can be used only with a folder; add --output FOLDER"),
-    ("evaluate --report", "--report: can be used only with a folder; add --output FOLDER"),
+    ("evaluate --per-world csv", "--per-world: needs a folder for its file; add --output FOLDER"),
+    ("evaluate --report", "--report: needs a folder for its file; add --output FOLDER"),
 ]
 
 

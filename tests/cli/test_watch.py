@@ -173,7 +173,7 @@ def test_compare__difference_is_paired_by_world_where_every_world_is_there(resul
     both = [found.differences[1].harms["total_harm"].value for found in (paired, apart)]
     assert both[0] == pytest.approx(both[1])
     assert [found.to_json()["intervals"] for found in (paired, apart)] == ["paired", "unpaired"]
-    assert "alone.json was written without a file with one row" in str(apart.unpaired_because)
+    assert "alone.json was written without a file that has one row" in str(apart.unpaired_because)
 
 
 def test_compare__marks_who_exploits_what_harm_does_not_count(ethbrake: Command, results: Path) -> None:

@@ -145,7 +145,7 @@ OBJECTIVES: dict[str, Callable[[], object]] = {
     "reward: objective = 5: must be the name of an objective, for instance": lambda: parallel_env(
         PAPER, reward={"objective": 5}
     ),
-    "scored: 'own': must be a list of objectives, for instance ['own']": lambda: scored(
+    "scored = 'own': must be a list of objectives, for instance ['own']": lambda: scored(
         empty_ledger(line([5.0], [9.0, 9.0])), "first", "own"
     ),
     "objective 'social:91': social needs an angle from 0 to 90 degrees, as in social:45": lambda: objectives_of(
@@ -172,9 +172,9 @@ ENGINE: dict[str, Callable[[], object]] = {
     ).restore(make_engine(PAPER, 6).snapshot()),
     "renew: rows = [1, 9]: must be different row numbers from 0 to 5": lambda: make_engine(PAPER, 6).renew([1, 9]),
     "observe: vehicle = 'vehicle_2': must be a vehicle index": lambda: make_engine(PAPER, 6).observe("vehicle_2"),
-    "since: before is not an earlier ledger (record of harm) of the same episodes; call since": lambda: make_engine(
-        PAPER, 6
-    ).ledger.since(make_engine(PAPER, 1).ledger),
+    "since: the argument before must be an earlier ledger (record of harm) of the same episodes; call since": lambda: (
+        make_engine(PAPER, 6).ledger.since(make_engine(PAPER, 1).ledger)
+    ),
 }
 
 

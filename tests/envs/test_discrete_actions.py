@@ -148,7 +148,7 @@ BAD: list[tuple[Any, str]] = [
     (True, "is a boolean; with"),
     ("full", "is not a number; with"),
     (np.ma.masked, "is masked; with"),
-    (torch.tensor(1.0, requires_grad=True), r"needs gradients; .*; with"),
+    (torch.tensor(1.0, requires_grad=True), r"requires gradients; .*; with"),
     (None, "is not a number; with"),
 ]
 

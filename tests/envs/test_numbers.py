@@ -19,8 +19,8 @@ BAD: dict[str, tuple[Make, str]] = {
     "tensor of a truth": (lambda x: torch.tensor(bool(x)), "is a boolean"),
     "masked": (lambda x: np.ma.masked, "is masked"),
     "masked array": (lambda x: np.ma.array(x, mask=True), "is masked"),
-    "gradient": (lambda x: torch.tensor(x, requires_grad=True), r"needs gradients; pass its \.detach\(\)"),
-    "parameter": (lambda x: torch.nn.Parameter(torch.tensor(x)), "needs gradients"),
+    "gradient": (lambda x: torch.tensor(x, requires_grad=True), r"requires gradients; pass tensor\.detach\(\)"),
+    "parameter": (lambda x: torch.nn.Parameter(torch.tensor(x)), "requires gradients"),
     "elsewhere": (lambda x: torch.zeros((), device="meta"), "is not a number"),
     "half": (lambda x: torch.tensor(x, dtype=torch.bfloat16), "is not a number"),
     "text": (str, "is not a number"),
@@ -139,7 +139,7 @@ def test_row__beside_one_that_is_reset_must_be_a_number() -> None:
     env.engine.cut(env.engine.step(np.zeros((2, 1))), 1)
     env.reset(options={"reset_mask": np.array([True, False])})
     for bad in (np.ma.array([[0.5], [0.5]], mask=[[True], [False]]), [[torch.tensor(0.5, requires_grad=True)], [0.5]]):
-        with pytest.raises(InvalidInput, match=r"action of the learners: (?s:.*)is masked|needs gradients"):
+        with pytest.raises(InvalidInput, match=r"action of the learners: (?s:.*)is masked|requires gradients"):
             env.step(bad)
     assert env.step(np.array([[0.5], [np.nan]]))[4]["chosen_action"][:, 0].tolist() == [0.5, 0.0]
 
@@ -149,7 +149,7 @@ def test_row__beside_one_that_is_reset_must_be_a_number() -> None:
 )
 def test_advance__refuses_commands_and_times_that_are_no_numbers(wrong: Any) -> None:
     worlds = eb.load_scenario("paper-random").sample(1, 0).worlds
-    with pytest.raises(InvalidInput, match=r"^command_mps2: (?s:.*)(is masked|is a boolean|needs gradients)"):
+    with pytest.raises(InvalidInput, match=r"^command_mps2: (?s:.*)(is masked|is a boolean|requires gradients)"):
         eb.advance(worlds, wrong, 0.1)
     for time in ({"duration_s": True}, {"until_s": True}):
         with pytest.raises(InvalidInput, match=r"^(duration|until)_s: True is a boolean"):

@@ -94,13 +94,8 @@ MADE: dict[str, Callable[[], object]] = {
         PAPER.replace(observation={"vehicle_2": ["own", "own.speed"]})
     ),
     "scenario 'paper-random': observation = {}: must be a list of groups": lambda: PAPER.replace(observation={}),
-    "observe different features, but must observe the same features here; give one list for all vehicles,": lambda: (
-        eb.train(
-            "cooperation-ppo",
-            FIVE.with_learners(PAIR).replace(observation={"vehicle_2": ["own"]}),
-            "run",
-            scheme="shared",
-        )
+    "observe different features, but must observe the same features here; give one list of features": lambda: eb.train(
+        "cooperation-ppo", FIVE.with_learners(PAIR).replace(observation={"vehicle_2": ["own"]}), "run", scheme="shared"
     ),
 }
 

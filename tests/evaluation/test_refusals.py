@@ -94,7 +94,7 @@ EVALUATIONS: dict[str, Callable[[], object]] = {
     "agent 'confused': predicted_harm in its memory has type float64 and shape (3, 2); must be one": lambda: (
         eb.evaluate(WORLDS, {"x": Confused((3, 2))}, scenario=PAPER)
     ),
-    "agent 'confused' of vehicle_2: memory: has ndarray of shape (2,); must have arrays of length 3 (worlds)": lambda: (
+    "agent 'confused' of vehicle_2: memory: contains ndarray of shape (2,); must contain only arrays": lambda: (
         eb.evaluate(WORLDS, {"x": Confused((2,))}, scenario=PAPER)
     ),
     "agent 'ppo' was not evaluated; evaluated agents: full_brake": lambda: eb.evaluate(
@@ -167,14 +167,14 @@ def row(**changes: Any) -> dict[str, Any]:
 
 
 RESULTS: dict[str, Callable[[], object]] = {
-    "x.json: is not JSON, or is incomplete: Expecting value: line 1 column 2 (char 1)": lambda: result("["),
+    "x.json: must contain complete JSON: Expecting value: line 1 column 2 (char 1)": lambda: result("["),
     "x.json: is not a results file, because the key kind is missing; give a file with the output": lambda: result("{}"),
     "x.json: is not a results file; give a file with the output of ethbrake evaluate": lambda: result("3"),
     "x.json: unknown kind of results 'evalute'; did you mean 'evaluate'?": lambda: result('[{"kind": "evalute"}]'),
     "x.json: results of the kind best-harm cannot be compared; give results of the kind evaluate or shield": lambda: (
         result('{"kind": "best-harm"}')
     ),
-    "x.json: agents is missing or not a list of objects; the file is incomplete": lambda: result(
+    "x.json: the key agents must be a list of one or more objects; evaluate again": lambda: result(
         '{"kind": "evaluate", "seed": 7}'
     ),
     "x.json: worlds_sha256 is missing or not of type str; run ethbrake evaluate again": lambda: result(

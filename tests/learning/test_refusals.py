@@ -78,7 +78,7 @@ RECIPES: dict[str, Callable[[], object]] = {
     ),
     "n_envs x n_steps = 3200000000 decisions per update": lambda: recipe("n_envs: 16", "n_envs: 100000000"),
     "mine.yaml, line 15: network.policy = []: must not be empty": lambda: recipe("policy: [8]", "policy: []"),
-    "mine.yaml, line 16: reward = {harm: 0}: all weights are 0, so there is nothing to learn; give at least": lambda: (
+    "mine.yaml, line 16: reward = {harm: 0}: all weights of the reward are 0, so there is nothing to learn": lambda: (
         recipe("harm: 1", "harm: 0")
     ),
     "mine.yaml, line 17: evaluation.every_updates = 0: must be greater than or equal to 1": lambda: recipe(
@@ -136,7 +136,7 @@ TRAININGS: dict[str, Callable[[], object]] = {
     "algorithm 'new': recipe = <class 'dict'>: must be a class with the method network_spec, a subclass": lambda: (
         register_algorithm("new", dict, Ppo)
     ),
-    "algorithm 'new': algorithm = <built-in function len>: must be a class with the method build, or its": lambda: (
+    "algorithm 'new': algorithm = <built-in function len>: must be a class with the method build, or the": lambda: (
         register_algorithm("new", PpoRecipe, len)
     ),
     "recipe 'ppo': total_steps = 0: must be greater than or equal to 1": lambda: train(
@@ -293,7 +293,10 @@ def test_status_of_a_run__is_refused(status: str | None, message: str, run: RunD
         ({"recipe": None}, "run/config.json: does not describe a training run, because the key 'recipe' is missing"),
         ({"recipe": 3}, "run/config.json: recipe: must be a mapping of keys to values, for instance algorithm: ppo"),
         ({"scenario": {"name": "paper-random"}}, "run/config.json: scenario: braking_capacity_mps2: missing"),
-        ({"library": "benchmarl"}, "run: this run was trained by benchmarl and cannot be resumed; train again"),
+        (
+            {"library": "benchmarl"},
+            "run: this run was trained with the library benchmarl, so it cannot be resumed; train again",
+        ),
     ],
     ids=lambda value: str(value)[:30],
 )

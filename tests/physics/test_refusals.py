@@ -83,13 +83,13 @@ def test_advance_and_forecast__are_refused(message: str) -> None:
 SAMPLED: dict[str, Callable[[], object]] = {
     "command_mps2[0, 2] = -9: must be in [-6, 16] m/s2": lambda: advance_sampled(FOUR, [0.0, 0.0, -9.0], until_s=1.0),
     "command_mps2: has shape (2,); must have shape (4, 3)": lambda: advance_sampled(FOUR, [0.0, 0.0], until_s=1.0),
-    "advance_sampled: world 0 cannot be advanced from 0 s to -1 s; this must take 0 to 1,000": lambda: advance_sampled(
-        FOUR, 0.0, until_s=-1.0
+    "advance_sampled: world 0 cannot be advanced from 0 s to -1 s; the end must not be earlier than the": lambda: (
+        advance_sampled(FOUR, 0.0, until_s=-1.0)
     ),
-    "advance_sampled: world 2 cannot be advanced from 0 s to nan s; this must take 0 to 1,000,000,000 steps": lambda: (
+    "advance_sampled: world 2 cannot be advanced from 0 s to nan s; the end must not be earlier": lambda: (
         advance_sampled(FOUR, 0.0, until_s=[1.0, 1.0, nan, 1.0])
     ),
-    "to 1907.35 s; this must take 0 to 1,000,000,000 steps of 1.90735e-06 s": lambda: advance_sampled(
+    "than the start, and at most 1,000,000,000 steps of 1.90735e-06 s later": lambda: advance_sampled(
         PAIR, 0.0, until_s=np.nextafter(1e9 * 2.0**-19, inf), step_s=2.0**-19
     ),
     "step_s = 0: must be finite and at least 1e-06 s": lambda: advance_sampled(FOUR, 0.0, until_s=1.0, step_s=0.0),

@@ -168,8 +168,8 @@ def test_among__acts_as_the_policy_or_the_action_of_the_highest_score(
     (action,) = onnx_of(policy).run(["action"], {"observation": seen})
     np.testing.assert_allclose(action, policy(seen), rtol=0.0, atol=1e-5)
     for wrong, why in (
-        ({"output": "clip", "choices": None}, "among: needs output = 'choice', and the policies in the list"),
-        ({"among": (spec,)}, "must have no key among"),
+        ({"output": "clip", "choices": None}, "among: needs output = 'choice', and a policy in this list"),
+        ({"among": (spec,)}, "must not have a key among"),
         (
             {"among": (squashed.model_copy(update={"observation_size": 26}),)},
             r"among\[0\]: observation_size and action_size are",
@@ -353,7 +353,7 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "list_manifest": (_manifest(lambda _: b"[]"), r"manifest.json: must be a mapping"),
     "key_twice": (
         _manifest(lambda data: data.replace(b"{", b'{"algorithm": "ppo",', 1)),
-        r"manifest.json: key 'algorithm' occurs twice",
+        r"manifest.json: a JSON object contains the key 'algorithm' twice",
     ),
     "nan": (_manifest(lambda data: data.replace(b"1024", b"NaN")), r"manifest.json: NaN is not a JSON number"),
     "huge_number": (_manifest(lambda data: data.replace(b"1024", b"1e999")), r"manifest.json: 1e999 is too large"),
@@ -398,7 +398,7 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "too_many_networks": (_edit(network__networks=17), r"manifest.json: network.networks"),
     "networks_without_their_tensors": (
         _edit(format_version=3, network__networks=2, network__gate_hidden=[4], network__value_hidden=[]),
-        r"weights.safetensors: tensor 'gate.0.bias' is missing",
+        r"weights.safetensors: the file does not contain the tensor 'gate.0.bias'",
     ),
     "wrong_type": (_edit(steps="many"), r"manifest.json: steps: must be a whole number"),
     "giant_layer": (_edit(network__policy_hidden=[10**9]), r"manifest.json: network.policy_hidden.0"),
@@ -464,25 +464,28 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     ),
     "tensor_path": (
         _header(lambda h: h.update({"../../policy.0.bias": h.pop("policy.0.bias")})),
-        r"tensor 'policy.0.bias' is missing",
+        r"the file does not contain the tensor 'policy.0.bias'",
     ),
     "tensor_dunder": (
         _header(lambda h: h.update({"__class__.__init__": h.pop("policy.0.bias")})),
-        r"tensor 'policy.0.bias' is missing",
+        r"the file does not contain the tensor 'policy.0.bias'",
     ),
-    "unknown_dtype": (_first_tensor(dtype="F99"), r"tensor 'policy.0.bias' has type and shape F99"),
-    "object_dtype": (_first_tensor(dtype="O"), r"tensor 'policy.0.bias' has type and shape O"),
-    "negative_shape": (_first_tensor(shape=[-13]), r"tensor 'policy.0.bias' has type and shape F32 \[-13\]"),
+    "unknown_dtype": (_first_tensor(dtype="F99"), r"tensor 'policy.0.bias' has type F99 and shape"),
+    "object_dtype": (_first_tensor(dtype="O"), r"tensor 'policy.0.bias' has type O and shape"),
+    "negative_shape": (_first_tensor(shape=[-13]), r"tensor 'policy.0.bias' has type F32 and shape \[-13\]"),
     "overflowing_shape": (
         _first_tensor(shape=[2**63, 2]),
-        r"tensor 'policy.0.bias' has type and shape F32 \[9223372036854775808, 2\]",
+        r"tensor 'policy.0.bias' has type F32 and shape \[9223372036854775808, 2\]",
     ),
     "offsets_beyond": (_first_tensor(data_offsets=[0, 2**40]), r"weights.safetensors: not a safetensors file"),
     "offsets_backwards": (_first_tensor(data_offsets=[52, 0]), r"weights.safetensors: not a safetensors file"),
     "offsets_negative": (_first_tensor(data_offsets=[-52, 0]), r"weights.safetensors: not a safetensors file"),
     "deep_header": (_raw_header(b"[" * 200_000), r"weights.safetensors: nested too deeply"),
-    "key_twice_in_header": (_raw_header(b'{"a": {}, "a": {}}'), r"weights.safetensors: key 'a' occurs twice"),
-    "empty_header": (_raw_header(b"{}"), r"tensor 'policy.0.bias' is missing"),
+    "key_twice_in_header": (
+        _raw_header(b'{"a": {}, "a": {}}'),
+        r"weights.safetensors: a JSON object contains the key 'a' twice",
+    ),
+    "empty_header": (_raw_header(b"{}"), r"the file does not contain the tensor 'policy.0.bias'"),
     "minus_infinite_weight": (
         _tensors(lambda t: {**t, "value.0.bias": t["value.0.bias"] - np.float32(np.inf)}),
         r"tensor 'value.0.bias': contains a number",
@@ -504,7 +507,7 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     ),
     "missing_tensor": (
         _tensors(lambda t: {name: t[name] for name in t if name != "policy.1.bias"}),
-        r"tensor 'policy.1.bias' is missing",
+        r"the file does not contain the tensor 'policy.1.bias'",
     ),
     "extra_tensor": (
         _tensors(lambda t: {**t, "policy.9.bias": np.zeros(3, "f4")}),
@@ -512,15 +515,15 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     ),
     "wrong_shape": (
         _tensors(lambda t: {**t, "policy.0.bias": np.zeros(14, "f4")}),
-        r"tensor 'policy.0.bias' has type and shape F32 \[14\]; must be F32 \[13\]",
+        r"tensor 'policy.0.bias' has type F32 and shape \[14\]; must have type F32 and shape \[13\]",
     ),
     "transposed": (
         _tensors(lambda t: {**t, "policy.1.weight": np.ascontiguousarray(t["policy.1.weight"].T)}),
-        r"tensor 'policy.1.weight' has type and shape F32 \[13, 9\]; must be F32 \[9, 13\]",
+        r"tensor 'policy.1.weight' has type F32 and shape \[13, 9\]; must have type F32 and shape \[9, 13\]",
     ),
     "wrong_dtype": (
         _tensors(lambda t: {**t, "policy.0.bias": np.zeros(13, "f8")}),
-        r"tensor 'policy.0.bias' has type and shape F64 \[13\]; must be F32 \[13\]",
+        r"tensor 'policy.0.bias' has type F64 and shape \[13\]; must have type F32 and shape \[13\]",
     ),
     "nan_weight": (
         _tensors(lambda t: {**t, "value.0.bias": np.append(t["value.0.bias"][1:], np.float32(np.nan))}),

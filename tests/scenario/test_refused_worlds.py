@@ -76,10 +76,10 @@ def test_table__is_refused_with_its_line_and_column(message: str) -> None:
 
 
 GIVEN: dict[str, Callable[[], object]] = {
-    "initial states: all columns must be lists of one length; they have the shapes gap_1_m [2], gap_2_m [3],": lambda: (
+    "initial states: all columns must be lists of the same length; they have the shapes gap_1_m [2],": lambda: (
         worlds_from_table(PAPER, COLUMNS | {"gap_1_m": [1, 2]})
     ),
-    "initial states: all columns must be lists of one length; they have the shapes gap_1_m [], gap_2_m [3],": lambda: (
+    "initial states: all columns must be lists of the same length; they have the shapes gap_1_m [],": lambda: (
         worlds_from_table(PAPER, COLUMNS | {"gap_1_m": 1})
     ),
     "initial states: gap_1_m = ['1', '2', '3']: is not a number; must be a number or a list of numbers": lambda: (
@@ -98,7 +98,7 @@ GIVEN: dict[str, Callable[[], object]] = {
         PAPER, COLUMNS | {"gaps_1_m": [1, 2, 3]}
     ),
     "initial states: column 'recording' is possible only in the table of a scenario; put this table into a scenario "
-    "(key table), or remove the column, but then confidence intervals treat all": lambda: worlds_from_table(
+    "(key table), or remove the column (confidence intervals then treat all": lambda: worlds_from_table(
         PAPER, COLUMNS | {"recording": ["a", "a", "b"]}
     ),
     "initial states: column obstacle_gap_m is missing; scenario": lambda: worlds_from_table(OBSTACLE, COLUMNS),
@@ -124,7 +124,7 @@ GIVEN: dict[str, Callable[[], object]] = {
     "initial_state: gaps_m[1] = 12000: must be finite and in [0, 10000] m (metres)": lambda: worlds_from_state(
         PAPER.replace(time_gaps_s=[1, 60]), {"speeds_mps": [20, 20, 200], "speed_limit_mps": 200}
     ),
-    "initial_state: with v2x: nominal, it is random which messages arrive, and when; worlds": lambda: worlds_from_state(
+    "initial_state: with v2x: nominal, it is random what the vehicles learn about": lambda: worlds_from_state(
         PAPER.replace(v2x="nominal", early_impacts="keep"), {"gaps_m": 7, "speeds_mps": 20}
     ),
 }
@@ -145,7 +145,7 @@ LISTS: dict[str, Callable[[], object]] = {
     "sample: first = 4611686018427387904: first + n must be at most 4611686018427387904": lambda: PAPER.sample(
         n=1, seed=1, first=4611686018427387904
     ),
-    "sample: channel 'test': must be one of list, training": lambda: PAPER.sample(n=1, seed=1, channel="test"),
+    "sample: channel = 'test': must be one of list, training": lambda: PAPER.sample(n=1, seed=1, channel="test"),
     "scenario 'paper-random': early_impacts: reject, but in all 1000 draws of": lambda: CLOSE.sample(1, 0),
     "1000 draws of world 0 an impact happens before vehicle_3 can act; use larger": lambda: (
         CLOSE.replace(gaps_m=2, latency_s=[0, 0.5, 1]).with_learners(["vehicle_3"]).sample(1, 0)

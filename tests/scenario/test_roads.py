@@ -278,7 +278,7 @@ ROADS: dict[str, Callable[[], object]] = {
     ),
     "scenario 'paper-random': friction = 0: must be finite and in (0, 2]": lambda: FIXED.replace(friction=0),
     "must be a number or a distribution; leave the key out if you do not need it": lambda: FIXED.replace(friction=None),
-    "scenario 'paper-random': has nothing random, so all its worlds are the same": lambda: ranges(
+    "scenario 'paper-random': no quantity is random, so all its worlds are the same": lambda: ranges(
         eb.Scenario(**{**FIXED.declared(), "table": {"columns": ["gap_1_m", "mass_3_t"], "rows": [[12, 30]]}})
     ),
     "only with v2x: paper, because messages before the alert are not": lambda: FIXED.replace(alert_s=2, v2x="nominal"),
@@ -383,5 +383,5 @@ def test_table_of_a_file__is_refused_with_the_row_of_the_file(empty_folder: Path
 
 def test_state_that_is_given__needs_a_channel_that_draws_nothing() -> None:
     kinds = {"equipped": {"weight": 7}, "without": {"weight": 3, "v2x": SILENT}}
-    with refused("initial_state: with v2x: nominal, it is random which messages arrive, and when; worlds"):
+    with refused("initial_state: with v2x: nominal, it is random what the vehicles learn about each other"):
         worlds_from_state(FIXED.replace(vehicle_types=kinds, v2x=LINKS), {"gaps_m": [7, 7], "speeds_mps": [20, 20, 20]})

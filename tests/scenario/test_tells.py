@@ -209,7 +209,9 @@ def test_tells__a_mixture_holds_scenarios_whose_messages_contain_different_piece
     lacks = Messages.of(mixture.sample(60, 7).worlds).withhold_from(1)
     assert lacks.any() and not lacks.all()
     entries[1]["scenario"] = PAPER.replace(name="part-1").declared()
-    with pytest.raises(InvalidInput, match=r"mixture: part-0 has v2x\.tells, but part-1 does not; write"):
+    with pytest.raises(
+        InvalidInput, match=r"mixture: scenario part-0 has the key v2x\.tells, but scenario part-1 does not"
+    ):
         eb.Scenario(name="both", mixture=entries)
 
 
@@ -309,7 +311,7 @@ def test_own_features__say_what_they_read_or_are_refused() -> None:
         lacking = LINE.replace(v2x={"tells": {"vehicle_3": ["place"]}})
         assert seen_by(engine_of(lacking, said), 1) == pytest.approx({said[0]: 0.0, said[1]: 0.9})
         with pytest.raises(
-            InvalidInput, match=r"feature 'double_mass': may read all that messages can contain, but the messages"
+            InvalidInput, match=r"feature 'double_mass': may read everything that a message can contain, but messages"
         ):
             seen_by(engine_of(lacking, unsaid), 1)
         with pytest.raises(InvalidInput, match="reads = 'mass': must be a list with some of the names place, speed"):

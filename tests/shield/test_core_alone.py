@@ -68,5 +68,5 @@ def test_what_an_extension_has__is_refused_in_one_line(message: str) -> None:
 
 
 def test_variant__of_an_agent_is_an_argument_that_it_does_not_take() -> None:
-    with refused("agent 'e_v2x_bm:estimated': the argument must be 'coupled' or 'pairwise'"):
+    with refused("agent 'e_v2x_bm:estimated': after the first colon, write 'coupled' or 'pairwise'"):
         make_agent("e_v2x_bm:estimated", scenario=PAPER)

@@ -226,7 +226,7 @@ ALREADY: dict[str, Callable[[], object]] = {
 
 @pytest.mark.parametrize("interface", ALREADY)
 def test_second_shield__is_refused_because_a_bound_holds_for_one_alone(interface: str) -> None:
-    with refused("(mode step), and can have only one; give that shield other options"):
+    with refused("(mode step), and can have only one; close() that shield before you add another"):
         ALREADY[interface]()
 
 

@@ -245,6 +245,6 @@ def make_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
     """
     if argument not in (None, "coupled", "pairwise"):
         then = "".join(f", then {variant!r}" for variant in variants_of("e_v2x_bm"))
-        raise InvalidInput(f"agent {settings.spec!r}: the argument must be 'coupled' or 'pairwise'{then}")
+        raise InvalidInput(f"agent {settings.spec!r}: after the first colon, write 'coupled' or 'pairwise'{then}")
     mode: Mode = "pairwise" if argument == "pairwise" else "coupled"
     return EV2XBM(mode, harm_count=settings.harm_count, horizon_s=settings.horizon_s)

@@ -253,7 +253,8 @@ def onset_s(worlds: Worlds, vehicle: int) -> Floats:
     if not np.all(worlds.speeds_mps >= 0.0):
         k, i = (int(x) for x in np.argwhere(~(worlds.speeds_mps >= 0.0))[0])
         raise InvalidInput(
-            f"speeds_mps[{k}, {i}] = {worlds.speeds_mps[k, i]:g}: must be at least 0, as the closed form requires"
+            f"speeds_mps[{k}, {i}] = {worlds.speeds_mps[k, i]:g}: must be at least 0, because the formula"
+            " for a pair holds only then"
         )
     onset: Floats = np.maximum(worlds.vehicles.latency_s - worlds.time_s[:, None], 0.0)
     return onset

@@ -497,8 +497,8 @@ class Boxes(NamedTuple):
             name = getattr(script, "name", type(script).__name__)
             if name.split(":")[0] not in SCRIPTS:
                 raise InvalidInput(
-                    f"shield: robust interior: vehicle_{i + 1} follows the script {name!r}; the script must be"
-                    " full_brake, coast or constant:A; for other scripts, use robust corners"
+                    f"shield: robust='interior': vehicle_{i + 1} follows the script {name!r}; the script must be"
+                    " full_brake, coast or constant:A; for other scripts, use robust='corners'"
                 )
 
     @classmethod
@@ -535,7 +535,7 @@ class Boxes(NamedTuple):
                 continue
             if not (command[:, :, i] == command[:, :1, i]).all():
                 raise InvalidInput(
-                    f"shield: robust interior: vehicle_{i + 1} follows the script {name!r}, whose command differs"
+                    f"shield: robust='interior': vehicle_{i + 1} follows the script {name!r}, whose command differs"
                     " between the possible worlds; the script must be full_brake, coast, or constant:A with A at most"
                     " the smallest capacity of this vehicle"
                 )
@@ -611,8 +611,8 @@ class Boxes(NamedTuple):
 
 def _refusal(what: str) -> InvalidInput:
     return InvalidInput(
-        f"shield: robust interior: {what}: cannot be certified; use robust corners, or first-impact harm of at most"
-        f" {MOST_VEHICLES} vehicles without an obstacle"
+        f"shield: robust='interior': {what}: cannot be certified; use robust='corners', or first-impact harm of at"
+        f" most {MOST_VEHICLES} vehicles without an obstacle"
     )
 
 

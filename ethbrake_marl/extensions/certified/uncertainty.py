@@ -149,7 +149,7 @@ class Uncertainty:
         if corners > MOST_CORNERS:
             raise InvalidInput(
                 f"uncertainty: {len(sides)} intervals in each world make {corners} combinations of values (corners),"
-                f" but at most {MOST_CORNERS} are allowed; limit quantities to some vehicles or pairs, as in"
+                f" but at most {MOST_CORNERS} are allowed; give intervals for fewer vehicles or pairs, as in"
                 f" {UNCERTAINTY_EXAMPLE}"
             )
         every = [shares[::-1] for shares in product(*ends)] if sides else []

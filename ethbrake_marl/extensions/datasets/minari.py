@@ -70,7 +70,7 @@ def check_folder(path: Path, *, force: bool = False) -> None:
             raise AlreadyExists(f"{path}: already exists; give another name, or replace it with force (--force)")
         if path.is_symlink() or not (path / DATA / "metadata.json").is_file():
             raise InvalidInput(
-                f"{path}: force cannot replace this, because it is not a Minari dataset; give another name"
+                f"{path}: this is not a Minari dataset, so force (--force) does not replace it; give another name"
             )
     if not path.parent.is_dir():
         raise InvalidInput(f"{path}: the folder {path.parent} does not exist; create it first")

@@ -25,7 +25,7 @@ def front_command(
         str | None,
         typer.Option(
             metavar="A,B,...",
-            help="Agents to compare with the front.",
+            help="Agents to compare with the Pareto front.",
             show_default="e_v2x_bm,universal with one learner, else none",
         ),
     ] = None,
@@ -38,10 +38,10 @@ def front_command(
         ),
     ] = None,
     steps: Annotated[
-        int, typer.Option(help="Default grid of weights: number of steps from weight 0 to weight 1.", min=1, max=50)
+        int, typer.Option(help="Number of steps from weight 0 to weight 1 in the default grid.", min=1, max=50)
     ] = 5,
     episodes: Annotated[int, typer.Option(help="Number of worlds.", min=2)] = 500,
-    seed: Annotated[int, typer.Option(help="Seed of the list of worlds.", min=0)] = 7,
+    seed: Annotated[int, typer.Option(help="Seed with which the worlds are drawn.", min=0)] = 7,
     budget: Annotated[
         int, typer.Option(help="Number of profiles that the search tries per world and choice of weights.", min=1)
     ] = 3000,

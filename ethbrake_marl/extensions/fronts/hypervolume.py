@@ -47,8 +47,10 @@ def hypervolume(points: Floats, reference: Floats) -> float:
         )
     finite = np.isfinite(points).all() and np.isfinite(reference).all()
     if points.ndim != 2 or points.shape[1] != len(reference) or not finite:
-        shapes = f"points {points.shape}, reference {reference.shape}"
-        raise InvalidInput(f"hypervolume: shapes {shapes}: points must be finite numbers [Q, N], reference [N]")
+        shapes = f"points has shape {points.shape} and reference has shape {reference.shape}"
+        raise InvalidInput(
+            f"hypervolume: {shapes}; points must be finite numbers of shape [Q, N], and reference of shape [N]"
+        )
     return _volume(points[(points < reference).all(axis=1)], reference)
 
 

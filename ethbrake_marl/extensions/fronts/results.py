@@ -110,7 +110,7 @@ def hypervolumes(front: Front, full_brake: Floats, clusters: Texts | None = None
         return []
     sets = {"front": front.borne[front.harm_count], **{k: each[front.harm_count] for k, each in front.agents.items()}}
     if "front" in front.agents:
-        raise InvalidInput("agent 'front': this name is used for the front itself; give the agent another name")
+        raise InvalidInput("agent 'front': this name is reserved for the Pareto front; give the agent another name")
     n = len(full_brake)
     names = np.arange(n) if clusters is None else np.unique(clusters, return_inverse=True)[1]
     members = [np.flatnonzero(names == k) for k in range(names.max() + 1)]  # rows of each cluster

@@ -38,7 +38,7 @@ def weight_grid(vehicles: int, steps: int = STEPS) -> Floats:
     number = comb(steps + vehicles - 1, steps)
     if number > MOST:
         raise InvalidInput(
-            f"{steps} steps: the grid has {number:,} choices of weights for {vehicles} vehicles, but at most"
+            f"steps = {steps}: the grid has {number:,} choices of weights for {vehicles} vehicles, but at most"
             f" {MOST:,} are allowed; give fewer steps, or give the choices of weights yourself"
         )
 

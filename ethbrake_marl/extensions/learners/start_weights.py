@@ -21,8 +21,8 @@ def widened(policy: Policy, training: Training) -> dict[str, NDArray[np.float32]
     network = policy.manifest.network
     if network.networks > 1:
         raise InvalidInput(
-            f"recipe {recipe.name!r}: start: this policy is a mixture of {network.networks} networks; name a policy"
-            " that has one network"
+            f"recipe {recipe.name!r}: start: the policy that this key names is a mixture of {network.networks}"
+            " networks; name a policy that has one network"
         )
     for name in ("policy_hidden", "activation", "output"):
         if getattr(network, name) != getattr(wanted, name):

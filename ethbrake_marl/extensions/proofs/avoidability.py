@@ -450,7 +450,7 @@ def check_covered(worlds: Worlds, vehicle: int, scripts: Mapping[int, str] | Non
     if (worlds.N, vehicle) not in ((3, 1), (2, 0), (2, 1)):
         raise InvalidInput(
             f"avoidability: vehicle_{vehicle + 1} of {worlds.N} vehicles is controlled, but the proofs cover only"
-            " vehicle_2 of 3 vehicles, and either of 2 vehicles"
+            " vehicle_2 in a line of 3 vehicles, and both vehicles in a line of 2"
         )
     for index, script in (scripts or {}).items():
         if index != vehicle and script != "full_brake":

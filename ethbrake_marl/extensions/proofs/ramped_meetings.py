@@ -414,8 +414,8 @@ def at_onset_of(
     start = np.maximum(worlds.vehicles.latency_s[:, vehicles].min(axis=1), worlds.time_s)
     if not (np.all(start <= horizon_s) and horizon_s < np.inf):
         raise InvalidInput(
-            f"{where}: horizon_s = {horizon_s!r}: the horizon must be finite and at least {start.max():g} s, the time"
-            " from which a controlled vehicle may act in every world"
+            f"{where}: horizon_s = {horizon_s!r}: the horizon must be finite and at least {start.max():g} s; by then"
+            " a controlled vehicle may act in every world"
         )
     now, impacts = advance(worlds, -worlds.vehicles.braking_capacity_mps2, until_s=start)
     early = empty_ledger(worlds).add(impacts).world_harm(harm_count)
@@ -436,10 +436,11 @@ def check_asked(where: str, harm_count: str, horizon_s: object, time_step_s: obj
     """
     check_harm_count(harm_count)
     if not _is_number(horizon_s):
-        raise InvalidInput(f"{where}: horizon_s = {horizon_s!r}: the horizon must be a number of seconds")
+        raise InvalidInput(f"{where}: horizon_s = {horizon_s!r}: the horizon must be a number (time in s)")
     if time_step_s is not None and not (_is_number(time_step_s) and LEAST_TIME_STEP_S <= time_step_s < np.inf):  # type: ignore[operator]  # a number
         raise InvalidInput(
-            f"{where}: time_step_s = {time_step_s!r}: the time step must be at least {LEAST_TIME_STEP_S:g} s, or None"
+            f"{where}: time_step_s = {time_step_s!r}: must be a finite number of at least"
+            f" {LEAST_TIME_STEP_S:g} (time in s), or None"
         )
 
 

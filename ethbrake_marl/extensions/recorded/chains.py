@@ -194,7 +194,7 @@ class Chains:
             raise InvalidInput(
                 f"{self._first_fault}; {self._faults:,} of {self._states:,} positions of vehicles are faulty (recorded"
                 " twice, overlapping, or behind a vehicle that is not recorded), but at most"
-                f" {entry.impossible:.0%} may be"
+                f" {entry.impossible:.0%} may be faulty"
             )
         self.left_out["vehicles that overlap, are recorded twice, or follow one that is not recorded"] += self._faults
         opened, said, product = self._gaps.tolist()

@@ -45,9 +45,7 @@ def from_data_command(
             " realistic-pair has two vehicles.",
         ),
     ] = "realistic-motorway",
-    every: Annotated[
-        float, typer.Option(help="Time between two moments of a recording from which rows are taken (s).")
-    ] = 1.0,
+    every: Annotated[float, typer.Option(help="Take rows from the recordings every so many seconds.")] = 1.0,
     draw: Annotated[
         Literal["rows", "normal", "lognormal", "quantiles"],
         typer.Option(help="Draw worlds as whole recorded rows, or from distributions that are fitted to the rows."),

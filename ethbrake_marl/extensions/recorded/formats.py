@@ -116,7 +116,7 @@ def format_of(name: DataFormat, columns: str = "") -> Format:
     if name != "table":
         if columns:
             raise InvalidInput(
-                f"columns: the columns of {FORMATS[name].title} are known; leave out --columns, or use --format table"
+                f"columns: the columns of {FORMATS[name].title} are fixed; leave out --columns, or use --format table"
             )
         return FORMATS[name]
     pairs = [[each.strip() for each in part.partition("=")[::2]] for part in columns.split(",")]
@@ -133,7 +133,8 @@ def format_of(name: DataFormat, columns: str = "") -> Format:
         settings["time"] = column
         if not 0.0 < second < math.inf:
             raise InvalidInput(
-                f"columns: time = .../{divisor}: the number after / must say how many time units a second has"
+                f"columns: time = .../{divisor}: the number after / must be the number of time units in 1 s,"
+                " for instance 1000 for ms"
             )
     return Format(
         "the table", ("*.csv", "*.txt", "*.parquet"), {role: settings[key] for key, role in _ROLES.items()},

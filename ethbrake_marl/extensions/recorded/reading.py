@@ -203,8 +203,8 @@ def _rows(file: Path, lines: Iterator[tuple[int, str]], separator: str, streets:
             yield number, _cells(line, separator)
     if elsewhere and not seen:
         raise InvalidInput(
-            f"{file}: all {elsewhere:,} rows are from {' or '.join(streets)}, but rows from streets with crossings are"
-            " left out; give recordings of a motorway"
+            f"{file}: all {elsewhere:,} rows are from {' or '.join(streets)}, which have crossings; such rows are left"
+            " out; give recordings of a motorway"
         )
 
 

@@ -80,7 +80,7 @@ def scenario_from_data(
     if entry.hertz:
         check_every(every_s, entry, entry.title)
     if not 0.0 < every_s < math.inf:
-        raise InvalidInput(f"every = {every_s:g} s: the time between two moments must be above 0")
+        raise InvalidInput(f"every = {every_s:g} s: the time between the moments that are read must be above 0")
     if base.members or base.table is not None:
         raise InvalidInput(
             f"based_on = {based_on!r}: the scenario must not be a mixture, and must not draw worlds from a table"
@@ -99,7 +99,7 @@ def scenario_from_data(
             f" {rows.longest} vehicles, for instance realistic-pair with 2"
         )
         raise InvalidInput(
-            f"{folder}: no {vehicles} vehicles follow each other in a lane at any moment that was read"
+            f"{folder}: the moments that were read contain no lane in which {vehicles} vehicles follow each other"
             f"{longest * (rows.longest > 1)}"
         )
     recordings, summary = count_of(len({file for file, _ in rows.of}), "recording"), _found(rows, vehicles, every_s)

@@ -52,8 +52,8 @@ def check_every(every_s: float, entry: Format, what: str) -> int:
     off = 0.01 * stride if entry.title == "the table" else 1e-6  # video has 29.97 pictures in a second
     if not (1.0 - 1e-6 <= stride < 1e9 and abs(stride - round(stride)) <= off):
         raise InvalidInput(
-            f"every = {every_s:g} s: the time between two moments must be a multiple of {1 / entry.hertz:g} s, the time"
-            f" step of {what}"
+            f"every = {every_s:g} s: the time between the moments that are read must be a multiple of"
+            f" {1 / entry.hertz:g} s, the time step of {what}"
         )
     return round(stride)
 

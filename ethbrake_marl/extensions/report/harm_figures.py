@@ -118,8 +118,8 @@ def harm_in_parts(evaluation: Evaluation) -> Figure:
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
     if regrets is None or avoidable is None:
         raise InvalidInput(
-            "harm_in_parts: there is no proof in which worlds contact is avoidable; give an evaluation whose scenario"
-            " the proofs cover"
+            "harm_in_parts: the figure needs, for each world, a proof whether contact is avoidable; give an evaluation"
+            " whose scenario the proofs cover"
         )
     figure, panels = new_panels((10.0, 1.4 + 0.36 * len(evaluation.outcomes)), columns=2, sharey=True)
     for axes, count in zip(panels, HARM_COUNTS, strict=True):

@@ -82,9 +82,9 @@ def check_papers_test(task: Task, seed: int | None) -> None:
     """Raise ``InvalidInput`` if an evaluation cannot be compared with the paper's rows (see ``is_papers_test``)."""
     if not is_papers_test(task, seed):
         raise InvalidInput(
-            f"paper: the paper's results are for Vehicle 2 in the shipped scenario {' or '.join(_SHOWN_WITH)}, but the"
-            f" evaluation has {'worlds without a seed' if seed is None else 'an evaluation list'} of"
-            f" {task.scenario.name!r} with the controlled vehicles {task.names};"
+            f"paper: the paper's results are for Vehicle 2 in the shipped scenario {' or '.join(_SHOWN_WITH)}, but here"
+            f" the scenario is {task.scenario.name!r}, the controlled vehicles are {task.names}, and the worlds"
+            f" {'have no seed' if seed is None else 'are an evaluation list'};"
             f" {'pass the seed of the evaluation list to evaluate, or ' if seed is None else ''}leave paper out"
         )
 

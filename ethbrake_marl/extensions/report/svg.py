@@ -74,7 +74,7 @@ def inline_svg(figure: Figure | bytes, label: str, *, recolour: bool = True) -> 
     """
     svg = figure if isinstance(figure, bytes) else picture_bytes(figure, "figure.svg")
     if svg is figure and not _is_ours(svg):
-        raise InvalidInput("the file is not an SVG figure as this package writes it; draw the figure again (--force)")
+        raise InvalidInput("the file is not an SVG figure of this package; draw the figure again (--force)")
     root = ElementTree.fromstring(svg, ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True)))
     group, caption = root.find(f".//{{{_SVG}}}g[@id='{CAPTION}']"), ""
     if group is not None:  # the caption is in comments; later texts use the outlines of its letters, so these stay

@@ -28,8 +28,7 @@ def reproduce_command(
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Use shipped policies and train none (default).")] = False,
     full: Annotated[
-        bool,
-        typer.Option("--full", help="Also train policies: for learning curves, and for a policy before convergence."),
+        bool, typer.Option("--full", help="Also train policies, for example for the learning curves.")
     ] = False,
     output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for all results.")] = Path("runs/reproduction"),
     episodes: Annotated[

@@ -66,7 +66,7 @@ class BestHarm:
         time_step_s: float = TIME_STEP_S,
     ) -> None:
         if not budget >= 1:
-            raise InvalidInput(f"best_harm: budget = {budget}: the number of candidates must be at least 1")
+            raise InvalidInput(f"best_harm: budget = {budget}: the number of profiles to try must be at least 1")
         check_harm_count(harm_count)
         self._recall, self._budget, self._scenario = recall, budget, scenario
         self._outlook = Outlook(harm_count, horizon_s, time_step_s, "total" if scenario is None else scenario.objective)

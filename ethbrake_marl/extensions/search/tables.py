@@ -105,8 +105,8 @@ class BestHarmTable:
         if not (self.rows(identity) >= 0).any():
             contents = ", ".join(f"{key} {self.header[key]}" for key in _ABOUT if key in self.header)
             raise InvalidInput(
-                f"table of best known harm ({contents}): the table contains none of the {len(identity)} worlds; give"
-                " the scenario, seed and vehicles of the table"
+                f"table of best known harm ({contents}): the table contains none of the {len(identity)} worlds; use"
+                " the scenario, seed and vehicles for which the table was computed"
             )
 
     def check_fits(self, problem: ProfileProblem) -> None:
@@ -280,8 +280,8 @@ def _read_best(arrays: Mapping[str, NDArray[Any]], harm_count: HarmCount) -> Bes
     commands = np.where(inside[..., np.newaxis], commands, commands[rows, last][:, np.newaxis])
     if not ((np.diff(ends, axis=1) >= 0).all() and ((ends[:, -1] > 0) == (used > 0)).all()):
         raise ValueError(
-            f"{harm_count}_ends: the end times of a world's phases must not decrease, and the last end time must be"
-            " above 0"
+            f"{harm_count}_ends: the end times of a world's phases (intervals of constant command) must not decrease,"
+            " and the last end time must be above 0"
         )
     return BestKnown(harm, Profiles(ends, commands))
 

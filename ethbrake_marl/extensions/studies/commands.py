@@ -45,7 +45,7 @@ study_group = typer.Typer(
 @study_group.command("sweep", epilog=example("study sweep sweep.yaml --output runs/sweep"))
 def sweep_command(
     file: Annotated[
-        Path, typer.Argument(metavar="SWEEP.yaml", help="File that lists the jobs (training runs), or a grid of them.")
+        Path, typer.Argument(metavar="SWEEP.yaml", help="File with the list or grid of jobs (training runs).")
     ],
     output: FolderOption,
     jobs: Annotated[
@@ -104,7 +104,7 @@ def tune_command(
     jobs: Annotated[
         int,
         typer.Option(
-            help="Number of trials that run at once, one process each. Another number leads to other tried values.",
+            help="Number of trials that run at once, one process each. This number changes which values are tried.",
             min=1,
             max=MOST_WORKERS,
         ),
@@ -234,7 +234,9 @@ def falsify_command(
     ] = None,
     again: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.yaml", help="Do not search; drive the worlds of this file (from --output) again."),
+        typer.Option(
+            metavar="FILE.yaml", help="Do not search; evaluate again in the worlds of this file (from --output)."
+        ),
     ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -262,7 +264,7 @@ def falsify_command(
             }  # fmt: skip
             for option in (name for name, value in asked.items() if value is not None):
                 raise InvalidInput(
-                    f"{option} cannot be combined with --again, because the file of --again sets this; leave"
+                    f"{option} cannot be combined with --again, which takes the settings from its file; leave"
                     f" {option} out (only --agent may be given)"
                 )
             _drive_again(out, again, agent)
@@ -357,8 +359,9 @@ def _drive_again(out: Out, file: Path, agent: str | None) -> None:
     for spec in (*([named.agent] if agent is None else []), *([named.against] if named.against else [])):
         if (code := parse_spec(spec).file) is not None:
             raise InvalidInput(
-                f"{file}: the file names the agent {spec!r}, whose code is in {code[0]}. Code that only a file names"
-                " is not run; replace the agent with --agent, or change the key 'against' in the file"
+                f"{file}: the file names the agent {spec!r}, whose code is in {code[0]}; for safety, this"
+                " command does not run code that only a file names; give the agent with --agent, or change the key"
+                " 'against' in the file"
             )
     chosen = evaluation.load_runnable(named.scenario, training.read_settings(named.settings).scenario, drives="some")
     measured_by = Measure.of(named.measure, agent or named.agent, named.against, chosen, named.harm_count)

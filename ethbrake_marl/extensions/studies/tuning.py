@@ -346,8 +346,8 @@ class TuningPlan:
             with at(("set", key)):
                 if key.removeprefix("recipe.").partition(".")[0] in ("seed", "evaluation"):
                     raise InvalidInput(
-                        f"set.{key}: this key is not allowed under set; at the top of the file, the keys seed and"
-                        " measure set the seed and the evaluation"
+                        f"set.{key}: this key is not allowed under set; to choose the seed and the evaluation, write"
+                        " the keys seed and measure at the top of the file"
                     )
         asked = file.scenario, file.recipe, texts_of(file.settings)
         try:
@@ -430,7 +430,7 @@ class TuningPlan:
         try:
             self.training(values)
         except InvalidInput as error:
-            raise InvalidInput(f"search: {', '.join(texts_of(values))} is not possible: {error}") from None
+            raise InvalidInput(f"search: a trial with {', '.join(texts_of(values))} is not possible: {error}") from None
 
     def folder(self, path: Path) -> StudyFolder:
         """Return a ``StudyFolder`` that checks and locks the folder ``path``.

@@ -118,9 +118,9 @@ class Measure:
             worst = worst[tried.scores[worst] > 0.0]
         if not np.isfinite(tried.scores).any():
             raise InvalidInput(
-                f"scenario {self.scenario.name!r}: all {budget:,} tried worlds are invalid: an impact happens before"
-                " any agent may act, or the simulation fails; write 'early_impacts: keep' into the scenario, or give a"
-                " larger --budget"
+                f"scenario {self.scenario.name!r}: all {budget:,} tried worlds are invalid: in each of them an impact"
+                " happens before any agent may act, or the simulation fails; write 'early_impacts: keep' into the"
+                " scenario, or give a larger --budget"
             )
         above = np.flatnonzero(tried.scores > 0.0)
         sample, shown_worlds = drawn.sample(tried.points[worst])[0], []

@@ -103,13 +103,13 @@ SHIELDS: dict[str, Callable[[], object]] = {
     "agent 'e_v2x_bm:estimated+episode:estimated': e_v2x_bm:estimated already decides only on received": lambda: (
         make_agent("e_v2x_bm:estimated+episode:estimated", scenario=PERIODIC)
     ),
-    "shield: robust interior: total harm: cannot be certified; use robust corners": lambda: make_agent(
+    "shield: robust='interior': total harm: cannot be certified; use robust='corners'": lambda: make_agent(
         "coast+robust:interior:estimated", scenario=PERIODIC, harm_count="total"
     ),
-    "shield: robust interior: an obstacle ahead: cannot be certified": lambda: make_agent(
+    "shield: robust='interior': an obstacle ahead: cannot be certified": lambda: make_agent(
         "coast+robust:interior:estimated", scenario=PERIODIC.replace(obstacle_gap_m=60.0)
     ),
-    "shield: robust interior: 5 vehicles: cannot be certified; use robust corners, or first-impact harm of": lambda: (
+    "shield: robust='interior': 5 vehicles: cannot be certified; use robust='corners', or first-impact": lambda: (
         RobustShield(line(5), 2, uncertainty=parse_uncertainty("gaps_m=0.1"), robust="interior")
     ),
     "shield: mode step does not use uncertainty; use mode robust": lambda: ShieldOptions(
@@ -201,7 +201,7 @@ def test_interior__takes_no_brakes_that_began_to_build_up_before() -> None:
     slow = PAPER.replace(brake_rate_mps3=9)
     braking = replace(slow.sample(1, 3).worlds, command_mps2=np.full((1, 3), -1.0))
     shield = RobustShield(slow, 1, uncertainty=parse_uncertainty("gaps_m=0.1"), robust="interior")
-    with refused("shield: robust interior: a vehicle whose brakes began to build up before the alert"):
+    with refused("shield: robust='interior': a vehicle whose brakes began to build up before the alert"):
         shield.begin(braking, np.arange(1))
 
 
@@ -246,8 +246,8 @@ AGENTS: dict[str, Callable[[], object]] = {
     ":estimated: a vehicle of world 0 follows a braking profile, for which the result would not be exact;": lambda: (
         evaluated(make_agent("full_brake+step:estimated", scenario=PIECES), PIECES)
     ),
-    "shield: robust interior: vehicle_1 follows the script 'profile:0=3,1=5'; the script must be full_brake": lambda: (
-        evaluated(make_agent("full_brake+robust:interior", scenario=PIECES, uncertainty="latency_s=0.1"), PIECES)
+    "shield: robust='interior': vehicle_1 follows the script 'profile:0=3,1=5'; the script must be": lambda: evaluated(
+        make_agent("full_brake+robust:interior", scenario=PIECES, uncertainty="latency_s=0.1"), PIECES
     ),
 }
 

@@ -60,7 +60,7 @@ def test_dataset__replaces_nothing_unasked(name: str, make: Callable[[Path], Non
 
 def test_dataset__replaces_no_folder_that_is_none(empty_folder: Path) -> None:
     Path("a-v0").mkdir()
-    with refused("a-v0: force cannot replace this, because it is not a Minari dataset; give another name"):
+    with refused("a-v0: this is not a Minari dataset, so force (--force) does not replace it; give another name"):
         dataset("a-v0", force=True)
     with refused("unknown format 'csv'; known: minari, parquet", UnknownName):
         dataset(format="csv")

@@ -40,7 +40,7 @@ def test_policy_to_start_from__has_one_network(empty_folder: Path) -> None:
     several = {"networks": 3, "gate_hidden": (6,), "value_hidden": ()}
     several = make_policy(eb.ObservationSpec(), {"name": "paper-random"}, "vine", **several)
     several.save(Path("first"))
-    with refused("recipe 'vine': start: this policy is a mixture of 3 networks"):
+    with refused("recipe 'vine': start: the policy that this key names is a mixture of 3 networks"):
         train(TINY_EXPERTS.replace(start="vine@first"), PAPER, Path("run"))
 
 

@@ -53,14 +53,14 @@ PROOFS: dict[str, Callable[[], object]] = {
     "lower_bound: horizon_s = inf: the horizon must be finite and at least 0.5": lambda: lower_bound(
         THREE, horizon_s=float("inf")
     ),
-    "lower_bound: horizon_s = '8': the horizon must be a number of seconds": lambda: lower_bound(THREE, horizon_s="8"),
-    "lower_bound: time_step_s = 0.0: the time step must be at least 0.001 s, or None": lambda: lower_bound(
+    "lower_bound: horizon_s = '8': the horizon must be a number (time in s)": lambda: lower_bound(THREE, horizon_s="8"),
+    "lower_bound: time_step_s = 0.0: must be a finite number of at least 0.001": lambda: lower_bound(
         THREE, time_step_s=0.0
     ),
-    "lower_bound: time_step_s = True: the time step must be at least 0.001 s, or None": lambda: lower_bound(
+    "lower_bound: time_step_s = True: must be a finite number of at least 0.001": lambda: lower_bound(
         THREE, time_step_s=True
     ),
-    "lower_bound: time_step_s = nan: the time step must be at least 0.001 s, or None": lambda: lower_bound(
+    "lower_bound: time_step_s = nan: must be a finite number of at least 0.001": lambda: lower_bound(
         THREE, time_step_s=float("nan")
     ),
     "team_bound: vehicles = (): must have at least one vehicle and no vehicle twice": lambda: team_bound(TEAM, ()),
@@ -101,11 +101,11 @@ SEARCHES: dict[str, Callable[[], object]] = {
     "profiles: command -7.1 m/s2 is beyond a vehicle's capacity": lambda: problem().follow(
         problem().constant(np.array([[[-7.1]]]))
     ),
-    "profiles: ends, the steps at which the phases end, must not decrease along a row, and the": lambda: (
+    "profiles: ends (the steps at which phases end) must not decrease within a profile, and the": lambda: (
         problem().follow(Profiles(np.array([[9, 5, 75]]), np.zeros((1, 3, 1))))
     ),
     "t.npz: there is no such file": lambda: BestHarmTable.load(Path("t.npz")),
-    "in these worlds, vehicles follow other braking profiles than the scripts of": lambda: best_harm(
+    "the braking profiles in these worlds differ from the braking profiles in": lambda: best_harm(
         PAPER.replace(roles={"vehicle_1": "profile:0=3,1=5", "vehicle_2": "learner"}), PAPER.sample(2, 7).worlds
     ),
 }
@@ -123,7 +123,7 @@ def test_file__is_no_table(empty_folder: Path) -> None:
     with refused("t.npz: is not a table of best known harm: not a plain .npz archive", CorruptBundle):
         BestHarmTable.load(Path("t.npz"))
     Path("t.npz").write_bytes(packed({**good(), "first_harm": np.zeros(4)}))
-    with refused("array 'first_harm' has type and shape <f8 [4]; must be <f8 [3]", CorruptBundle):
+    with refused("array 'first_harm' has type <f8 and shape [4]; must have type <f8 and shape [3]", CorruptBundle):
         BestHarmTable.load(Path("t.npz"))
 
 

@@ -67,7 +67,7 @@ def test_text_beside_its_csv__is_skipped_because_it_is_the_same(tmp_path: Path) 
 
 @pytest.mark.parametrize("street", ["lankershim", "peachtree"])
 def test_rows_of_streets__are_said_to_be_all(street: str, tmp_path: Path) -> None:
-    right = r"all 3 rows are from lankershim or peachtree, but rows from streets with crossings are left out"
+    right = r"all 3 rows are from lankershim or peachtree, which have crossings; such rows are left out"
     with pytest.raises(InvalidInput, match=right):
         scenario_from_data("mine", write_files(tmp_path, {"a.csv": form_of_portal(street)}), "ngsim")
     some = form_of_portal("i-80") + form_of_portal(street)[1:]

@@ -56,13 +56,15 @@ def test_pair__is_no_chain_of_three_and_the_message_names_a_scenario_for_pairs(
     if found:
         assert len(rows_of(scenario_from_data("mine", folder, "openacc", based_on="realistic-pair"))) == 1
     else:
-        right = r"no 3 vehicles follow .*; the longest queue has 2 vehicles: .*, for instance realistic-pair with 2"
+        right = r"no lane in which 3 .*; the longest queue has 2 vehicles: .*, for instance realistic-pair with 2"
         with pytest.raises(InvalidInput, match=right):
             scenario_from_data("mine", folder, "openacc")
 
 
 def test_car_without_speed__has_no_link(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInput, match=r"no 3 vehicles follow each other in a lane at any moment that was read$"):
+    with pytest.raises(
+        InvalidInput, match=r"the moments that were read contain no lane in which 3 vehicles follow each other$"
+    ):
         scenario_from_data("mine", openacc(tmp_path, "Speed1,Speed2,Speed3,IVS1,IVS2", "20,,20,15,16"), "openacc")
 
 

@@ -81,7 +81,7 @@ def test_times_of_30_hertz__may_be_rounded(tmp_path: Path) -> None:
     assert rows_of(made_of(table(tmp_path, cars))) == [ROWS[0]] * 3
     with pytest.raises(
         InvalidInput,
-        match=r"every = 0.05 s: the time between two moments must be a multiple of 0.0333333 s, the time step of the",
+        match=r"every = 0.05 s: the time between the moments that are read must be a multiple of 0.0333333 s",
     ):
         made_of(table(tmp_path, cars), every_s=0.05)
 
@@ -146,7 +146,7 @@ WRONG = {
     "no number": (one_more("d", 1.0, "E1_0", 150.0, "5 m", 20.0), "line 17, column l: '5 m' is not a number"),
     "time": (
         one_more("d", 0.625, "E1_0", 150.0, 5, 20.0),
-        "every = 0.8 s: the time between two moments must be a multiple of 0.125 s",
+        "every = 0.8 s: the time between the moments that are read must be a multiple of 0.125 s",
     ),
 }
 
@@ -170,7 +170,7 @@ def test_wrong_table__is_refused_with_what_would_be_right(what: str, tmp_path: P
         (COLUMNS + ",colour=c", "with each key once"),
         (COLUMNS.replace("x", ""), "with each key once"),
         (COLUMNS.replace("=m", "=mph"), "columns: units = 'mph': must be one of m, ft, km/h"),
-        (COLUMNS.replace("=t,", "=t/0,"), "columns: time = .../0: the number after / must say"),
+        (COLUMNS.replace("=t,", "=t/0,"), "columns: time = .../0: the number after / must be"),
         (COLUMNS.replace("=who", "=id"), "a.csv: lacks columns that files of the table have: id"),
     ],
 )
@@ -178,7 +178,7 @@ def test_wrong_columns__are_refused(columns: str, right: str, tmp_path: Path) ->
     with pytest.raises(InvalidInput) as told:
         made_of(table(tmp_path), columns)
     assert right in str(told.value)
-    with pytest.raises(InvalidInput, match="the columns of highD are known; leave out --columns"):
+    with pytest.raises(InvalidInput, match="the columns of highD are fixed; leave out --columns"):
         scenario_from_data("mine", tmp_path, "highd", columns=COLUMNS)
 
 
@@ -237,6 +237,6 @@ def test_frames_of_video__keep_their_rate_and_names_of_columns_are_literal(tmp_p
     made = made_of(folder, columns, based_on="realistic-pair")
     assert rows_of(made) == ["15.0,20.0,20.0"] * 21
     with pytest.raises(
-        InvalidInput, match=r"every = 0\.05 s: the time between two moments must be a multiple of 0\.0333"
+        InvalidInput, match=r"every = 0\.05 s: the time between the moments that are read must be a multiple of 0\.0333"
     ):
         made_of(folder, columns, based_on="realistic-pair", every_s=0.05)

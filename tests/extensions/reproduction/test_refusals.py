@@ -91,7 +91,7 @@ def test_figure__that_is_more_than_lines_is_not_shown(
         draw_nothing(patch)
         results = reproduced(drawn(), {})
     Path("out/gaps/a-figure.svg").write_text(f'<svg xmlns="http://www.w3.org/2000/svg">{svg}</svg>')
-    with refused("out/gaps/a-figure.svg: the file is not an SVG figure as this package writes it; draw the figure"):
+    with refused("out/gaps/a-figure.svg: the file is not an SVG figure of this package; draw the figure"):
         render_page(Path("out"), results)
 
 

@@ -485,5 +485,5 @@ def test_evaluation__of_a_team_tells_the_proven_harm_where_contact_is_not_decide
         cells = next(csv.DictReader(lines))
     assert cells["avoidable"] == cells["unavoidable_reason"] == "" and float(cells["proven_harm"]) >= 0
     assert avoidable_section(found).title and worst_section(found, "coast", ()).title
-    with pytest.raises(InvalidInput, match="there is no proof in which worlds contact is avoidable"):
+    with pytest.raises(InvalidInput, match="the figure needs, for each world, a proof whether contact is avoidable"):
         harm_in_parts(found)

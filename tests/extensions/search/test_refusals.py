@@ -36,7 +36,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     "agent 'planner:1.5': after the colon, give the number of profiles to try at each decision": lambda: make_agent(
         "planner:1.5"
     ),
-    "best_harm: budget = 0: the number of candidates must be at least 1": lambda: make_agent(
+    "best_harm: budget = 0: the number of profiles to try must be at least 1": lambda: make_agent(
         "best_harm", most_candidates=0
     ),
     "search: candidates = 0: must be a whole number in 1..1000000": lambda: Searched(BRAKE, PAPER, candidates=0),

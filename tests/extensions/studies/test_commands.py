@@ -79,7 +79,7 @@ FALSIFIED = [
     ),
     (
         "study falsify --agent coast --budget 10 --scenario paper-scenario-1",
-        "scenario 'paper-scenario-1': has nothing random, so all its worlds are the same",
+        "scenario 'paper-scenario-1': no quantity is random, so all its worlds are the same",
     ),
     (
         "study falsify --agent ladder --measure harm --budget 8",

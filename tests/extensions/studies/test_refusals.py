@@ -45,7 +45,7 @@ TUNINGS: dict[str, Callable[[], object]] = {
     "t.yaml: search: missing; this key is required; docs/extensions/studies.md shows an example": lambda: plan(
         "scenario: paper-random\nrecipe: ppo\n"
     ),
-    "t.yaml, line 4: search: learning_rate.strat=0.0001 is not possible: recipe 'ppo': learning_rate": lambda: plan(
+    "t.yaml, line 4: search: a trial with learning_rate.strat=0.0001 is not possible: recipe 'ppo'": lambda: plan(
         search={"learning_rate.strat": RATE}
     ),
     "must be whole numbers, written without a decimal": lambda: plan(search={"n_epochs": {"low": 1.0, "high": 4.0}}),
@@ -69,7 +69,7 @@ TUNINGS: dict[str, Callable[[], object]] = {
     "t.yaml, line 4: search.gamma = {choices: [0.9, 0.9]}: the value 0.9 is listed twice": lambda: plan(
         search={"gamma": {"choices": [0.9, 0.9]}}
     ),
-    "t.yaml, line 4: search: network.policy=[0] is not possible: recipe 'ppo': network.policy[0] = 0:": lambda: plan(
+    "t.yaml, line 4: search: a trial with network.policy=[0] is not possible: recipe 'ppo': network": lambda: plan(
         search={"network.policy": {"choices": [[8], [0]]}}
     ),
     "t.yaml, line 4: search.seed: this key cannot be searched: a good seed is luck; give one seed for all": lambda: (
@@ -96,7 +96,7 @@ TUNINGS: dict[str, Callable[[], object]] = {
     "t.yaml, line 8: search.learning_rate.start: the file also sets learning_rate; delete one of": lambda: plan(
         search={"learning_rate.start": RATE, "learning_rate": {"choices": [1, 2]}}
     ),
-    "search: offset.largest=0.1080873589761303, offset.smallest=0.16819777065410824": lambda: plan(
+    "search: a trial with offset.largest=0.1080873589761303, offset.smallest=0.16819777065410824": lambda: plan(
         recipe="quick",
         search={"offset.smallest": {"low": 0.01, "high": 0.2}, "offset.largest": {"low": 0.1, "high": 0.5}},
     ),
@@ -113,7 +113,7 @@ TUNINGS: dict[str, Callable[[], object]] = {
     "t.yaml, line 6: recipe 'ppo': vf_coef = -0.5: must be greater than or equal to 0": lambda: plan(
         WRITTEN.replace("vf_coef: 0.5", "vf_coef: -0.5", 1)
     ),
-    "t.yaml, line 6: set.seed: this key is not allowed under set; at the top of the file": lambda: plan(
+    "t.yaml, line 6: set.seed: this key is not allowed under set; to choose the seed and": lambda: plan(
         WRITTEN.replace("vf_coef: 0.5", "seed: 3", 1)
     ),
 }
@@ -298,7 +298,7 @@ FALSIFICATIONS: dict[str, Callable[[], object]] = {
     "scenario 'cooperation-2-blocked': its v2x channel has delays and losses, which a table of worlds": lambda: ranges(
         load_scenario("cooperation-2-blocked")
     ),
-    "scenario 'paper-scenario-1': has nothing random, so all its worlds are the same": lambda: ranges(
+    "scenario 'paper-scenario-1': no quantity is random, so all its worlds are the same": lambda: ranges(
         load_scenario("paper-scenario-1")
     ),
     "--against coast: --measure harm uses no second agent; leave --against out": lambda: Measure.of(
