@@ -79,9 +79,9 @@ def tally_agents(
         contexts: data that each set of measures computed once for these worlds (``contexts_of``), by the set's name.
         baseline: name of the agent with which the other agents are compared, unless a set of measures names its own
             baseline.
-        objectives: objectives such as ``"social:45"`` (docs/cooperation.md). If this is a list (an empty list is
-            enough), the result also has the sums of the harm that each vehicle bears, and of the value of each
-            objective for each vehicle.
+        objectives: objectives such as ``"social:45"`` (docs/cooperation.md). If ``objectives`` is a list, even an empty
+            list, the result also has the sums of the harm that each vehicle bears, and of the value of each objective
+            for each vehicle.
         clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
 
     """
@@ -145,12 +145,13 @@ def estimate_all(
 def _estimate(
     measure: Measure, own: AgentTally, baseline: AgentTally | None, worlds: int, whole: str | None
 ) -> Estimate | None:
-    """Return the estimate of one measure; None if values are missing, or if a comparison has no baseline.
+    """Return the estimate of one measure of one agent; None if values that the estimate needs are missing.
 
     Args:
         measure: the measure.
         own: sums of the agent's measures.
-        baseline: sums of the measures of the agent to compare with; None if there is no such agent.
+        baseline: sums of the measures of the agent to compare with; None if this agent was not evaluated. A measure
+            that compares with it then has the estimate None.
         worlds: number of worlds in the evaluation. The result is None if the measure has no value in one of these
             worlds.
         whole: name of a true/false measure (``MeasureSet.whole``) that must be true in all worlds for a comparison with
@@ -174,7 +175,8 @@ def lower_bounds(tally: AgentTally, worlds: int) -> frozenset[str]:
     """Return the names of those measures of one agent whose means are only lower bounds of the true means.
 
     A set of measures may name a true/false measure (``MeasureSet.whole``) that says whether the set's values in a world
-    are complete. If this measure is false in some world, the means of all measures in the set are lower bounds.
+    are complete. If this true/false measure is false in some world, the means of all measures in the set are lower
+    bounds.
 
     Args:
         tally: sums of the agent's measures.

@@ -99,7 +99,7 @@ class Evaluation:
         """Join evaluations of consecutive chunks of worlds into one evaluation of all these worlds.
 
         Args:
-            parts: evaluations of the same agents, one per chunk, in the order of the worlds.
+            parts: evaluations of the same agents, one per chunk of worlds, in the order of the worlds.
 
         Raises ``PhysicsError`` if every world was left out because of an error.
 
@@ -121,7 +121,7 @@ class Evaluation:
         )
 
     def take(self, rows: Ints | Bools) -> Evaluation:
-        """Return the evaluation restricted to some of its worlds; its ``left_out`` is empty, and its ``rejected`` is 0.
+        """Return the evaluation restricted to some of its worlds; ``left_out`` becomes empty, and ``rejected`` 0.
 
         Args:
             rows: row numbers of the worlds to keep, or a mask [n] that is true for the worlds to keep.

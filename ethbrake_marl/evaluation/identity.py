@@ -104,7 +104,7 @@ def _arrays(value: Any) -> dict[str, np.ndarray]:
 def scenario_sha256(scenario: Scenario) -> str:
     """Return the SHA-256 (hexadecimal) of everything in a scenario that affects an episode, including default values.
 
-    The scenario's name, title, description and source do not affect the result.
+    The scenario's name, title, description and source do not affect the hash.
     """
     content = scenario.content(without=_WORDS)
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
@@ -135,17 +135,17 @@ def own_versions() -> dict[str, str]:
 def result_identity(
     kind: Kind, scenario: Scenario, sample: Sample | None, left_out: Collection[int] = ()
 ) -> dict[str, Any]:
-    """Return the entries of a JSON results file that identify the result.
+    """Return the entries that identify a result in a JSON results file.
 
     The entries are ``kind``, ``scenario_sha256``, ``worlds_sha256`` and ``versions``.
 
     Args:
         kind: kind of results, such as ``evaluate`` or ``shield``.
         scenario: scenario of the worlds.
-        sample: the worlds of the result; None if the file contains results of several samples. Without a sample,
-            ``worlds_sha256`` is omitted.
-        left_out: row numbers of the worlds in ``sample`` that were left out because of errors. The hash does not
-            include these worlds.
+        sample: the worlds of the result; None if the file contains results of several samples of worlds. If ``sample``
+            is None, the result has no ``worlds_sha256``.
+        left_out: row numbers of the worlds in ``sample`` that were left out because of errors. ``worlds_sha256`` does
+            not cover the worlds that were left out.
 
     """
     identity: dict[str, Any] = {

@@ -71,7 +71,8 @@ class _Follower(Tape):
     Args:
         worlds: the worlds at the alert.
         team: agents of the controlled vehicles.
-        engine: simulator that runs the episodes; its ``ruling`` says what the shield decided.
+        engine: simulator that runs the episodes; its attribute ``ruling`` says what the shield decided in the current
+            step.
 
     """
 
@@ -99,7 +100,7 @@ class _Follower(Tape):
             self._ruling = ruling
 
     def motions(self, episodes: Episodes) -> list[EpisodeMotion]:
-        """Return the recorded motion of each world after all episodes ended; ``episodes`` is their result."""
+        """Return the recorded motion of each world. ``episodes`` is the result of the finished episodes."""
         n, N = self.worlds.n, self.worlds.N
         impacts, pieces = self.episodes(), self._pieces()
         motions = []
@@ -124,9 +125,10 @@ class _Follower(Tape):
         return motions
 
     def _pieces(self) -> list[Floats]:
-        """Return the motion of each world as k stretches of time with constant jerks, [k, 1 + 4 N].
+        """Return the motion of each world: one row per stretch of time with constant jerks, [k, 1 + 4 N].
 
-        Each row is as in ``EpisodeMotion.pieces``. If an episode ends at the alert, its motion has a single row.
+        A row contains the same numbers as a row of ``EpisodeMotion.pieces``: time and state at the beginning of the
+        stretch. If an episode ends at the alert, its array has a single row.
         """
         parts: list[list[Floats]] = [[] for _ in range(self.worlds.n)]
         way_m = np.zeros(self.worlds.n)
@@ -148,8 +150,8 @@ class _Follower(Tape):
 def join_pieces(pieces: Floats, vehicles: int) -> Floats:
     """Return the same motion with fewer pieces; a piece is a stretch of time in which all jerks are constant.
 
-    A piece is dropped if the piece before it, continued to the same time, leads to the same state up to rounding. If
-    several pieces begin within the same 0.1 ms, only the last of these pieces is kept.
+    A piece is dropped if the previous piece, continued to the beginning of this piece, leads to the same state up to
+    rounding. If several pieces begin within the same 0.1 ms, only the last of these pieces is kept.
 
     Args:
         pieces: time and state at the beginning of each piece, [k, 1 + 4 N], as in ``EpisodeMotion``.
@@ -166,7 +168,7 @@ def join_pieces(pieces: Floats, vehicles: int) -> Floats:
 
 
 def state_at(piece: Floats, time_s: float, vehicles: int) -> Floats:
-    """Return the state [4 N] at one time within a piece, a stretch of time in which all jerks are constant.
+    """Return the state [4 N] at one time within a piece (a stretch of time in which all jerks are constant).
 
     The state is the position of Vehicle 1 (m), gaps (m), speeds (m/s), accelerations (m/s2) and jerks (m/s3).
 

@@ -33,8 +33,8 @@ def write_per_world(
 ) -> None:
     """Write a table with one row per agent and world as CSV or Parquet.
 
-    docs/evaluate.md lists the columns. The row of a left-out world contains only the agent, the world's number and, in
-    the column ``ended``, the reason. If writing fails, no incomplete file is left behind.
+    docs/evaluate.md lists the columns. The row of a world that was left out contains only the agent, the world's number
+    and, in the column ``ended``, the reason. If writing fails, no incomplete file is left behind.
 
     Args:
         path: file to write, with the ending ``.csv`` or ``.parquet``.
@@ -69,16 +69,16 @@ Harms = dict[str, dict[int, tuple[float, ...]]]  # agent -> world -> (first-impa
 
 
 def read_harms(path: Path, data: bytes) -> tuple[Harms, dict[int, str]]:
-    """Read a file of ``write_per_world``: the harms of each agent in each world, and each world's recording.
+    """Read a file that ``write_per_world`` wrote: the harms of each agent in each world, and each world's recording.
 
-    The result is two dictionaries. The second dictionary is empty if the file has no column ``recording``. Left-out
-    worlds are omitted.
+    Returns two dictionaries: agent -> world -> harms, and world -> recording. The dictionary of recordings is empty if
+    the file has no column ``recording``. Both dictionaries omit the worlds that were left out.
 
     Args:
         path: name of the file, whose ending decides the format. The file is not read, because ``data`` is its content.
         data: content of the file.
 
-    Raises ``InvalidInput`` if the file lacks a needed column or has an invalid value.
+    Raises ``InvalidInput`` if the file lacks a column that is needed here, or has an invalid value.
 
     """
     try:
@@ -186,7 +186,7 @@ class Result:
 
     @property
     def about(self) -> Mapping[str, Any]:
-        """JSON object of the first agent, to read entries that are equal for all agents, such as the hashes."""
+        """JSON object of the file's first agent, to read entries that are equal for all agents, such as the hashes."""
         return next(iter(self.rows.values()))
 
     def estimate(self, agent: str, harm: str) -> Estimate:
@@ -204,7 +204,8 @@ class Result:
     def harms(self) -> tuple[Harms, dict[int, str]]:
         """Read the file of ``--per-world`` that belongs to this results file, and return what ``read_harms`` returns.
 
-        Raises ``InvalidInput`` if there is no such file, or if the file was changed later.
+        Raises ``InvalidInput`` if this results file belongs to no file of ``--per-world``, or if the file of
+        ``--per-world`` is missing or was changed later.
         """
         beside = self.about.get("per_world")
         if not isinstance(beside, dict) or not isinstance(beside.get("file"), str):
@@ -221,7 +222,8 @@ class Result:
 def read_result(path: Path) -> Result:
     """Read and check a JSON results file of ``ethbrake evaluate``, ``ethbrake shield`` or ``ethbrake run``.
 
-    Raises ``InvalidInput`` for any other file, for kinds of results that cannot be compared, and for missing hashes.
+    Raises ``InvalidInput`` if ``path`` is not such a file, if its kind of results cannot be compared, or if it lacks a
+    hash.
     """
     try:
         content = parse_strict_json(read_plain(path, _LIMIT_BYTES))
@@ -273,7 +275,8 @@ def read_result(path: Path) -> Result:
 
 
 def recorded_value(row: Mapping[str, Any], key: str) -> str | None:
-    """Return the value of ``key`` in an agent's JSON object ``row``, or else in its ``parameters``, as text.
+    """Return the value of ``key`` in an agent's JSON object ``row`` or, if missing there, in its ``parameters``, as
+    text.
 
     Return None if neither the object nor its ``parameters`` have the key.
     """

@@ -166,14 +166,15 @@ class Moments:
 
     @property
     def share(self) -> Estimate:
-        """Mean p of values, each of which is 0 or 1, with Wilson's interval (``rate``).
+        """Mean p of values that are all 0 or 1, with Wilson's interval (``rate``).
 
         With G clusters, Wilson's interval is computed for an effective number of independent draws: the number of
         independent draws that would have the same standard error, ``1 + p (1 - p) / error ** 2``, but at most the
-        number of values. If all values are equal, this number is G. The number is then multiplied by ``(z / t) ** 2``,
-        with z and t the quantiles of the normal and the t distribution, because the standard error has G - 1 degrees of
-        freedom (Korn and Graubard 1998, "Confidence intervals for proportions with small expected number of positive
-        counts estimated from survey data", Survey Methodology 24). There is no interval for a single cluster.
+        number of values. If all values are equal, this effective number is G. The effective number is multiplied by
+        ``(z / t) ** 2``, where z and t are the quantiles of the normal and the t distribution, because the standard
+        error has G - 1 degrees of freedom (Korn and Graubard 1998, "Confidence intervals for proportions with small
+        expected number of positive counts estimated from survey data", Survey Methodology 24). If there is only one
+        cluster, there is no interval.
         """
         if not self.clusters:
             return rate(int(self.total), self.count)
@@ -188,11 +189,12 @@ class Moments:
     def ratio_error(self, others: Moments, products: Fraction) -> float:
         """Return the standard error of ``r = mean(values) / mean(others)``, paired by world, by the delta method.
 
-        The residuals ``values - r * others`` have mean 0, so the error is
-        ``std(residuals) / (sqrt(n) * abs(mean(others)))``. The square of the error is
+        The residuals ``values - r * others`` have mean 0, and so the standard error of r is
+        ``std(residuals) / (sqrt(n) * abs(mean(others)))``. The square of this standard error is
         ``n * (Qxx Sy^2 - 2 Sx Sy Qxy + Sx^2 Qyy) / ((n - 1) * Sy^4)``, where n is the number of values, x are the
-        values, y are the others, Sx and Sy are their sums, and Qxx, Qxy and Qyy are the sums of x x, x y and y y. With
-        clusters, n is the number of clusters, and x and y are the sums of values and others in each cluster.
+        ``values``, y are the ``others``, Sx and Sy are their sums, and Qxx, Qxy and Qyy are the sums of ``x^2``,
+        ``x y`` and ``y^2``. With clusters, n is the number of clusters, and x and y are the sums of ``values`` and
+        ``others`` in each cluster.
 
         Args:
             others: moments of ``others``, the values in the denominator, in the same worlds.
@@ -209,7 +211,7 @@ class Moments:
         return root(n * residuals / ((n - 1) * y**4))
 
     def decrease(self, baseline: Moments, products: Fraction) -> Estimate | None:
-        """Return ``1 - mean(values) / mean(baseline)`` with its interval; None if the baseline's mean is 0.
+        """Return ``1 - mean(values) / mean(baseline)`` with its interval; None if the mean of ``baseline`` is 0.
 
         Args:
             baseline: moments of the baseline's values, in the same worlds.
@@ -238,8 +240,8 @@ def of_amounts(estimate: Estimate, *, nothing: bool) -> Estimate:
 
     Args:
         estimate: mean with an interval that may extend below 0.
-        nothing: whether all values are 0. In this case the result has no interval: zeros show that larger values are
-            rare, but not how large such values can be.
+        nothing: whether all averaged values are 0. If they are, the result has no interval, because zeros show that
+            larger values are rare, but not how large such values can be.
 
     """
     if nothing or estimate.interval is None:
@@ -316,8 +318,8 @@ def paired_difference(values: Floats, baseline: Floats, clusters: Texts | None =
     """Return the mean of ``values - baseline`` with its t interval.
 
     Args:
-        values: numbers from which the baseline is subtracted, one per world, [n].
-        baseline: numbers to subtract, in the same worlds, [n].
+        values: numbers from which ``baseline`` is subtracted, one per world, [n].
+        baseline: numbers to subtract, one for each of the same worlds, [n].
         clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
 
     Raises ``InvalidInput`` if the lengths differ, or if an array is empty or not finite.
@@ -362,12 +364,12 @@ def relative_decrease(values: Floats, baseline: Floats, clusters: Texts | None =
     """Return ``1 - mean(values) / mean(baseline)`` with its interval by the delta method (``Moments.ratio_error``).
 
     Args:
-        values: numbers to compare with the baseline, one per world, [n].
-        baseline: numbers of the baseline, in the same worlds, [n].
+        values: numbers of the agent to compare with the baseline agent, such as its harms, one per world, [n].
+        baseline: numbers of the baseline agent, one for each of the same worlds, [n].
         clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
 
-    Returns None if the baseline's mean is 0. Raises ``InvalidInput`` if the lengths differ, or if an array is empty or
-    not finite.
+    The result is None if the mean of ``baseline`` is 0. Raises ``InvalidInput`` if the lengths differ, or if an array
+    is empty or not finite.
 
     """
     data, reference, products = _check_pair(values, baseline, clusters)
@@ -375,14 +377,14 @@ def relative_decrease(values: Floats, baseline: Floats, clusters: Texts | None =
 
 
 def check(values: ArrayLike, who: str = "statistics", each: str = "world") -> Floats:
-    """Check ``values``, and return them as an array of floats, [n].
+    """Check that ``values`` are one or more finite numbers, and return them as an array of floats, [n].
 
     Args:
-        values: the numbers.
+        values: the numbers to check.
         who: name of the calling function, for error messages.
         each: what each number belongs to (``world`` or ``seed``), for error messages.
 
-    Raises ``InvalidInput`` unless the array is one-dimensional, not empty and finite.
+    Raises ``InvalidInput`` if ``values`` is not one-dimensional, is empty, or contains a number that is not finite.
 
     """
     data = np.asarray(values, np.float64)

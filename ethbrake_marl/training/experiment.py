@@ -127,8 +127,8 @@ def run_experiment(
 
     Ctrl-C during the training stops the training after the current update, and the policy trained so far is evaluated.
     A second Ctrl-C, or Ctrl-C during the evaluation, raises ``KeyboardInterrupt``; the folder still contains the
-    policy. Some reports train further policies. Ctrl-C during this training stops it, and the report is written without
-    these policies (``ExperimentResult.interrupted``). ``run.json`` records how the run ended.
+    policy. Some reports train further policies. Ctrl-C while a report trains its policies stops their training, and the
+    report is written without these policies (``ExperimentResult.interrupted``). ``run.json`` records how the run ended.
 
     Args:
         scenario: scenario with at least one learner. Several learners are trained as a team, with the recipe's scheme.

@@ -29,8 +29,8 @@ def tensors_of(policy: BasePolicy, spec: NetworkSpec) -> dict[str, Float32s]:
 def sb3_names(spec: NetworkSpec) -> dict[str, str]:
     """Return the names of a network's tensors: name in a policy bundle -> name in Stable-Baselines3's policy.
 
-    ``spec`` describes the network. If ``spec.output`` is ``clip``, the network belongs to PPO, else to SAC.
-    Stable-Baselines3 also numbers the activations, so hidden layer k of a bundle has the number 2 k in
+    ``spec`` describes the network. If ``spec.output`` is ``clip``, the network belongs to PPO. If not, the network
+    belongs to SAC. Stable-Baselines3 also numbers the activations, so hidden layer k of a bundle has the number 2 k in
     Stable-Baselines3.
     """
     if spec.output == "clip":
