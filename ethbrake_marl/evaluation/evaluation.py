@@ -42,7 +42,7 @@ T = TypeVar("T")
 class Evaluation:
     """Outcomes of several agents that drove the same vehicles in the same worlds.
 
-    Entry k of every array belongs to the same world.
+    In all arrays, entry k belongs to the same world.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -254,7 +254,9 @@ class Evaluation:
         return Sheet(repr(self), ("Agent", share, Column("First-impact harm"), Column("Total harm")), rows, note).html()
 
     def complete(self) -> Evaluation:
-        """Return this evaluation if no world was left out; otherwise raise ``PhysicsError`` with these worlds."""
+        """Return this evaluation if no world was left out; if some were, raise ``PhysicsError``, which lists these
+        worlds.
+        """
         if self.left_out:
             raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in self.left_out})
         return self

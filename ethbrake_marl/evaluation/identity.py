@@ -1,4 +1,4 @@
-"""Identity of a result: hashes of its worlds, scenario and policies, and the software versions that computed it.
+"""Identity of a result: hashes of worlds, scenario and policies, and the software versions that computed the result.
 
 Two results can be compared if the hashes of their worlds and scenarios are equal. Different software versions are
 reported, but do not prevent a comparison.

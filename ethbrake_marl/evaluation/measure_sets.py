@@ -261,7 +261,7 @@ def contexts_of(evaluation: Any, *, long_list: bool = False) -> dict[str, Any]:
     Args:
         evaluation: the evaluation.
         long_list: whether ``evaluation`` is one chunk of a list of more than 100,000 worlds. Some sets do not apply to
-            such a long list.
+            more than 100,000 worlds.
 
     """
     silent = silent_in_long_lists() if long_list else {}

@@ -55,7 +55,7 @@ def follow_episodes(worlds: Worlds, agent: Driver, scenario: Scenario) -> list[E
         scenario: scenario of the worlds. The agent drives the learners of the scenario, and the scripts of the scenario
             drive the other vehicles.
 
-    Raises ``PhysicsError`` with the worlds that could not be simulated.
+    Raises ``PhysicsError``, which lists the worlds whose simulation failed.
 
     """
     team = Team.of(agent, scenario.learners)
@@ -66,7 +66,7 @@ def follow_episodes(worlds: Worlds, agent: Driver, scenario: Scenario) -> list[E
 
 
 class _Follower(Tape):
-    """Recorder of every step, and of the decisions at which a shield replaced the policy's action.
+    """Recorder of every time step of episodes, and of the decisions at which a shield replaced the policy's action.
 
     Args:
         worlds: the worlds at the alert.
@@ -84,7 +84,7 @@ class _Follower(Tape):
         self._engine, self._ruling = engine, engine.ruling
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Record one step.
+        """Record one time step.
 
         Args:
             before: the worlds at the beginning of the step.
@@ -154,7 +154,7 @@ def join_pieces(pieces: Floats, vehicles: int) -> Floats:
     rounding. If several pieces begin within the same 0.1 ms, only the last of these pieces is kept.
 
     Args:
-        pieces: time and state at the beginning of each piece, [k, 1 + 4 N], as in ``EpisodeMotion``.
+        pieces: motion to simplify: time and state at the beginning of each piece, [k, 1 + 4 N].
         vehicles: number of vehicles, N.
 
     """
@@ -173,7 +173,7 @@ def state_at(piece: Floats, time_s: float, vehicles: int) -> Floats:
     The state is the position of Vehicle 1 (m), gaps (m), speeds (m/s), accelerations (m/s2) and jerks (m/s3).
 
     Args:
-        piece: time and state at the beginning of the piece, [1 + 4 N].
+        piece: time and state at the beginning of the piece, [1 + 4 N], a row of ``EpisodeMotion.pieces``.
         time_s: time of the returned state, counted from the alert (s).
         vehicles: number of vehicles, N.
 

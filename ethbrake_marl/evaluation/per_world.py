@@ -159,7 +159,7 @@ def results_to_json(
             each agent's object; None: there are no groups.
         per_world: existing file with one row per agent and world, whose name and hash are added to each agent's object;
             None: there is no such file.
-        settings: settings of all agents by name, such as ``{"harm_count": "first"}``.
+        settings: settings that hold for all agents, by the setting's name, such as ``{"harm_count": "first"}``.
 
     """
     objects = [row.to_json() | {"agent_settings": dict(settings)} for row in rows]
@@ -222,8 +222,8 @@ class Result:
 def read_result(path: Path) -> Result:
     """Read and check a JSON results file of ``ethbrake evaluate``, ``ethbrake shield`` or ``ethbrake run``.
 
-    Raises ``InvalidInput`` if ``path`` is not such a file, if its kind of results cannot be compared, or if it lacks a
-    hash.
+    Raises ``InvalidInput`` if ``path`` is not such a results file, if its kind of results cannot be compared, or if it
+    lacks a hash.
     """
     try:
         content = parse_strict_json(read_plain(path, _LIMIT_BYTES))

@@ -84,8 +84,8 @@ def mean_over_seeds(
 
     Args:
         values: result of the training run with each seed in each world, [seeds, worlds].
-        baseline: results to subtract, in the same worlds, [seeds, worlds]; the number of seeds may differ from the
-            number in ``values``.
+        baseline: results to subtract, in the same worlds as ``values``, [seeds, worlds]; the number of seeds may differ
+            from the number in ``values``.
         clusters: name of the cluster (recording) of each world, [worlds]; None: all worlds are independent.
         seed: seed of the bootstrap's random numbers.
 
@@ -121,8 +121,8 @@ def share_over_seeds(
 
     Args:
         values: harms of the training runs to judge, [seeds, worlds] (m2/s2).
-        worst: harms of the agent whose share is 0 by definition, in the same worlds, [seeds, worlds].
-        best: harms of the agent whose share is 1 by definition, in the same worlds, [seeds, worlds].
+        worst: harms of the agent whose share is 0 by definition, in the same worlds as ``values``, [seeds, worlds].
+        best: harms of the agent whose share is 1 by definition, in the same worlds as ``values``, [seeds, worlds].
         clusters: name of the cluster (recording) of each world, [worlds]; None: all worlds are independent.
         seed: seed of the bootstrap's random numbers.
 
@@ -166,7 +166,7 @@ def _resampled(
 
     Args:
         value: the estimate, computed from the original data.
-        sides: results to resample, each an array [seeds, worlds] in the same worlds.
+        sides: results to resample: arrays [seeds, worlds], all for the same worlds.
         of: function that computes a statistic, one value per resample, from the mean of each of ``sides`` in each
             resample, [resamples, number of sides]. The ends of the interval are percentiles of this statistic.
         clusters: name of the cluster (recording) of each world, [worlds]; None: all worlds are independent.
@@ -189,7 +189,7 @@ def _resample_means(sides: Sequence[Floats], cluster: Ints, resamples: int, seed
     together, and a drawn cluster contributes all its worlds.
 
     Args:
-        sides: results to resample, each an array [seeds, worlds] in the same worlds.
+        sides: results to resample: arrays [seeds, worlds], all for the same worlds.
         cluster: number (from 0) of the cluster that each world belongs to, [worlds].
         resamples: number of bootstrap resamples.
         seed: seed of the bootstrap's random numbers.

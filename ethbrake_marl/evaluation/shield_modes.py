@@ -31,7 +31,7 @@ CHUNK = 500  # number of worlds simulated together, to limit memory; does not ch
 
 
 class VehicleRow(NamedTuple):
-    """Results of one vehicle of the line while the agent drives with a shield in step mode."""
+    """Results of one vehicle of the line in the worlds that the agent drove with a shield in step mode."""
 
     vehicle: str  # name of the vehicle, such as ``vehicle_2``
     replaced: float | None  # fraction of the vehicle's decisions that the shield replaced; None: it has no shield
@@ -150,8 +150,8 @@ def compare_modes(
         worlds: worlds at the alert.
         task: the scenario, the controlled vehicles, and the count of harm that the shield bounds.
         behind: whether ``agents`` already have shields. If ``behind`` is true, only agents with a shield in episode or
-            step mode are compared: their shields are removed, and their policies are used. If no agent has such a
-            shield, the result is empty.
+            step mode are compared: their shields are removed, and their policies are used. If no agent has a shield in
+            one of these modes, the result is empty.
         clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
         on_progress: function that is called with an agent's name and the number of worlds that the agent has driven so
             far.
@@ -200,7 +200,7 @@ def _compare(
 ) -> list[ModeRow]:
     """Return one row of results for each agent and mode; the arguments are the same as in ``compare_modes``.
 
-    Raises ``PhysicsError`` with the worlds whose simulation failed.
+    Raises ``PhysicsError``, which lists the worlds whose simulation failed.
     """
     rows = []
     for name, agent in agents.items():
@@ -246,7 +246,7 @@ def _row(
     Args:
         agent: name of the agent.
         mode: the shield's mode.
-        parts: results of the agent in this mode, one entry for each chunk of worlds.
+        parts: results of the agent in ``mode``, one entry for each chunk of worlds.
         harm: mode of the shield -> harm of the agent in every world (m2/s2), [n]. The returned row also contains the
             harm in ``mode`` minus the harm in episode mode, and minus the harm without a shield.
         task: the scenario, the controlled vehicles, and the count of harm that the shield bounds.

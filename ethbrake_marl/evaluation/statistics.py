@@ -126,7 +126,7 @@ class Moments:
         """Return the moments of the differences ``value - other``, one difference per world.
 
         Args:
-            other: moments of the values to subtract, in the same worlds.
+            other: moments of the values to subtract, in the same worlds as the values of this object.
             products: exact sum over all worlds of ``value * other`` (``exact_sum``).
 
         """
@@ -168,13 +168,12 @@ class Moments:
     def share(self) -> Estimate:
         """Mean p of values that are all 0 or 1, with Wilson's interval (``rate``).
 
-        With G clusters, Wilson's interval is computed for an effective number of independent draws: the number of
-        independent draws that would have the same standard error, ``1 + p (1 - p) / error ** 2``, but at most the
-        number of values. If all values are equal, this effective number is G. The effective number is multiplied by
-        ``(z / t) ** 2``, where z and t are the quantiles of the normal and the t distribution, because the standard
-        error has G - 1 degrees of freedom (Korn and Graubard 1998, "Confidence intervals for proportions with small
-        expected number of positive counts estimated from survey data", Survey Methodology 24). If there is only one
-        cluster, there is no interval.
+        With G clusters, Wilson's interval is computed for an effective number of independent draws, which would have
+        the same standard error: ``1 + p (1 - p) / error ** 2``, but at most the number of values. If all values are
+        equal, this effective number is G. The effective number is multiplied by ``(z / t) ** 2``, where z and t are the
+        quantiles of the normal and the t distribution, because the standard error has G - 1 degrees of freedom (Korn
+        and Graubard 1998, "Confidence intervals for proportions with small expected number of positive counts estimated
+        from survey data", Survey Methodology 24). If there is only one cluster, there is no interval.
         """
         if not self.clusters:
             return rate(int(self.total), self.count)
@@ -187,7 +186,7 @@ class Moments:
         return Estimate(p, wilson(p, draws * float(ndtri(_UPPER) / stdtrit(clusters - 1, _UPPER)) ** 2))
 
     def ratio_error(self, others: Moments, products: Fraction) -> float:
-        """Return the standard error of ``r = mean(values) / mean(others)``, paired by world, by the delta method.
+        """Return the standard error (delta method) of ``r = mean(values) / mean(others)``, with values paired by world.
 
         The residuals ``values - r * others`` have mean 0, and so the standard error of r is
         ``std(residuals) / (sqrt(n) * abs(mean(others)))``. The square of this standard error is
@@ -197,7 +196,7 @@ class Moments:
         ``others`` in each cluster.
 
         Args:
-            others: moments of ``others``, the values in the denominator, in the same worlds.
+            others: moments of the values in the denominator, which belong to the same worlds as ``values``.
             products: exact sum over all worlds of the product ``value * other``.
 
         """
@@ -214,7 +213,7 @@ class Moments:
         """Return ``1 - mean(values) / mean(baseline)`` with its interval; None if the mean of ``baseline`` is 0.
 
         Args:
-            baseline: moments of the baseline's values, in the same worlds.
+            baseline: moments of the baseline agent's values, which belong to the same worlds as ``values``.
             products: exact sum over all worlds of ``value * baseline``.
 
         """
@@ -240,7 +239,7 @@ def of_amounts(estimate: Estimate, *, nothing: bool) -> Estimate:
 
     Args:
         estimate: mean with an interval that may extend below 0.
-        nothing: whether all averaged values are 0. If they are, the result has no interval, because zeros show that
+        nothing: whether all averaged values are 0. If all are 0, the result has no interval, because zeros show that
             larger values are rare, but not how large such values can be.
 
     """
@@ -332,15 +331,15 @@ def paired_difference(values: Floats, baseline: Floats, clusters: Texts | None =
 def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> Estimate:
     """Return the difference ``value - baseline`` of two means over n and m independent worlds, with Welch's interval.
 
-    The standard errors s1 and s2 of the two means are computed from their t intervals: each is half of the interval's
-    width, divided by the quantile of the t distribution. The difference has the standard error
+    The standard errors s1 and s2 of the two means are computed from their t intervals: each standard error is half of
+    the interval's width, divided by the quantile of the t distribution. The difference has the standard error
     ``s = sqrt(s1^2 + s2^2)``, with ``s^4 / (s1^4 / (n - 1) + s2^4 / (m - 1))`` degrees of freedom. If one of the two
     means has no interval, the difference has no interval either.
 
     Args:
-        value: mean from which the baseline is subtracted, with its interval.
+        value: mean from which ``baseline`` is subtracted, with the interval of this mean.
         n: number of worlds of ``value`` or, with clusters, number of their clusters.
-        baseline: mean to subtract, with its interval.
+        baseline: mean to subtract, with the interval of this mean.
         m: number of worlds of ``baseline`` or, with clusters, number of their clusters.
 
     """

@@ -91,7 +91,7 @@ class Tally:
         """Return the mean value of each objective over the worlds, for every agent, vehicle and count of harm.
 
         Args:
-            objectives: objectives such as ``social:45``; the tally must have been computed with these objectives.
+            objectives: objectives such as ``social:45``; ``Tally.of`` must have been called with these objectives.
             vehicles: number of vehicles, N.
 
         """

@@ -98,7 +98,7 @@ def read_checkpoint(folder: Path) -> TrainingState:
 
 
 def _digest(arrays: BufferedReader, numbers: Mapping[str, Any]) -> str:
-    """Return the SHA-256 (hexadecimal) of a checkpoint: its open file of arrays, followed by its numbers as JSON."""
+    """Return the SHA-256 (hexadecimal) of a checkpoint: the open file ``arrays``, followed by ``numbers`` as JSON."""
     digest = hashlib.file_digest(arrays, "sha256")
     digest.update(json.dumps(numbers, sort_keys=True).encode())
     return digest.hexdigest()

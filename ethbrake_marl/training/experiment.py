@@ -256,7 +256,7 @@ def write_results(
 
 
 def results_csv(rows: Sequence[SummaryRow]) -> str:
-    """Return a results table as CSV text, with one line per agent.
+    """Return the results table ``rows`` as CSV text, with one line per agent.
 
     The columns ``x_low`` and ``x_high`` are the ends of the interval of column ``x``. A missing value is an empty
     field.
@@ -273,11 +273,11 @@ def results_csv(rows: Sequence[SummaryRow]) -> str:
 
 @contextmanager
 def _status(run: RunDirectory) -> Iterator[None]:
-    """Context manager for the evaluation of a run, which records the status of the run in ``run.json``.
+    """Context manager that records the status of a run in ``run.json`` while the run's policies are evaluated.
 
     The status is ``running`` during the evaluation. After an exception, the status is ``interrupted`` (Ctrl-C) or
-    ``failed``, and the error is recorded. The names of the new files are also recorded (``RunDirectory.WRITTEN``), so
-    that ``resume`` can delete these files.
+    ``failed``, and the error is recorded. The names of the files that the ``with`` block wrote are also recorded
+    (``RunDirectory.WRITTEN``), so that ``resume`` can delete these files.
     """
     _note(run, "running", "evaluation", None)
     before = {path.name for path in run.path.iterdir()}

@@ -200,7 +200,7 @@ class TrainingRecipe(FileModel):
         return 1
 
     def check_learners(self, learners: int) -> None:
-        """Raise ``InvalidInput`` if the recipe does not fit the number of learners. The base class accepts all."""
+        """Raise ``InvalidInput`` if the recipe does not fit the number of learners. The base class accepts any."""
 
     def begins(self, scenario: Scenario) -> str | None:
         """Return a description of the initial weights for a scenario, or None if the initial weights are random."""

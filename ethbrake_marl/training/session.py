@@ -161,8 +161,8 @@ def resume(
     """Continue a training run that was stopped or killed. The policies are exactly the same as without the stop.
 
     The training continues from the newest undamaged checkpoint, or from the beginning if there is no such checkpoint.
-    Log rows that were written after this checkpoint are dropped. Results and reports that ``ethbrake run`` wrote are
-    deleted, because they do not apply to the continued training.
+    Log rows that were written after this checkpoint are dropped. Earlier results and reports of ``ethbrake run`` are
+    deleted.
 
     Args:
         directory: the folder of the run.
@@ -222,7 +222,7 @@ def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[st
     Args:
         callback: callback from ``build``, which contains the model and measures the model's policies during the
             training.
-        state: checkpoint from which the training continues; None: the training begins from the start.
+        state: checkpoint from which the training continues; None: a new training begins.
         notes: messages for the user, passed to ``on_progress`` when the training begins.
 
     """
