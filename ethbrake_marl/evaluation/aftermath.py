@@ -53,8 +53,8 @@ class ShovedFront:
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
         """Add the distance that Vehicle 1 drives in one step.
 
-        This distance is computed as the decrease of Vehicle 1's gap to an obstacle. In a world without an obstacle, an
-        obstacle is placed so far ahead that Vehicle 1 cannot reach it in this step.
+        This distance is computed as the decrease of Vehicle 1's gap to an obstacle. For this computation, an obstacle
+        is put into worlds without an obstacle, so far ahead that Vehicle 1 cannot reach it in this step.
 
         Args:
             before: the worlds at the beginning of the step.

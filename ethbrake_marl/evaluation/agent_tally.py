@@ -72,7 +72,7 @@ def tally_agents(
     objectives: Sequence[str] | None = None,
     clusters: Texts | None = None,
 ) -> dict[str, AgentTally]:
-    """Return the sums of every agent's measures over the same worlds: name of the agent -> its sums.
+    """Return the sums of every agent's measures over the same worlds: name of the agent -> sums.
 
     Args:
         outcomes: outcome of each agent, by the agent's name.

@@ -41,7 +41,7 @@ class Conditions(dict[str, Any]):
 
     @classmethod
     def of(cls, worlds: Worlds) -> Conditions:
-        """Return every quantity of the worlds by key, such as ``{"gaps_m": [7.0, [5.0, 9.0]]}``.
+        """Return a dictionary: key of a quantity -> value in ``worlds``, such as ``{"gaps_m": [7.0, [5.0, 9.0]]}``.
 
         The value of a quantity of vehicles or pairs is a list with one entry per vehicle or pair, front to rear. A
         quantity of the whole world has a single entry. An entry is a number if the quantity is equal in all worlds. If

@@ -254,9 +254,7 @@ class Evaluation:
         return Sheet(repr(self), ("Agent", share, Column("First-impact harm"), Column("Total harm")), rows, note).html()
 
     def complete(self) -> Evaluation:
-        """Return this evaluation if no world was left out; if some were, raise ``PhysicsError``, which lists these
-        worlds.
-        """
+        """Return this evaluation if no world was left out. If not, raise ``PhysicsError`` with the left-out worlds."""
         if self.left_out:
             raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in self.left_out})
         return self

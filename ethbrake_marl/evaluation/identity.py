@@ -61,9 +61,10 @@ def _hash_at_once(worlds: Worlds, index: Ints) -> str:
 
 
 def hash_of_chunks(worlds: Worlds, index: Ints) -> int:
-    """Return a hash of worlds: the SHA-256 of each chunk of 2,500 worlds, added up modulo 2^256.
+    """Return a hash of worlds: the sum, modulo 2^256, of the SHA-256 of all chunks of 2,500 worlds.
 
-    The first chunk contains the worlds with numbers 0 to 2,499, the second 2,500 to 4,999, and so on.
+    The first chunk contains the worlds with numbers 0 to 2,499, the second chunk the worlds with numbers 2,500 to
+    4,999, and so on.
 
     Args:
         worlds: the n worlds at the alert.

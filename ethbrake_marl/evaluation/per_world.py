@@ -154,11 +154,11 @@ def results_to_json(
 
     Args:
         rows: rows of the results table, one per agent.
-        rescored: mean values of objectives (``Evaluation.rescore``), to be added to each agent's object.
+        rescored: mean values of objectives (``Evaluation.rescore``), to be added to each agent's JSON object.
         groups: name of a group of worlds -> results of the same agents in this group (``summarise_by``), to be added to
-            each agent's object; None: there are no groups.
-        per_world: existing file with one row per agent and world, whose name and hash are added to each agent's object;
-            None: there is no such file.
+            each agent's JSON object; None: there are no groups.
+        per_world: existing file with one row per agent and world, whose name and hash are added to each agent's JSON
+            object; None: there is no such file.
         settings: settings that hold for all agents, by the setting's name, such as ``{"harm_count": "first"}``.
 
     """

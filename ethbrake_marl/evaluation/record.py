@@ -108,8 +108,8 @@ def _samples(segments: Sequence[tuple[Worlds, Floats, Floats]], sample_s: float)
 
     Consecutive samples are at most ``sample_s`` seconds apart. The state at the end of a step is returned only once, as
     the first sample of the next step or, after the last step, as its last sample. A world does not contain positions,
-    so Vehicle 1's position is computed from its gap to an obstacle. In a world without an obstacle, an obstacle is
-    placed so far ahead that Vehicle 1 cannot reach it.
+    so Vehicle 1's position is computed from its gap to an obstacle. For this computation, an obstacle is put into a
+    world without an obstacle, so far ahead that Vehicle 1 cannot reach it.
 
     Args:
         segments: time steps of one episode, each as (world at the beginning of the step, commands [1, N] (m/s2), time

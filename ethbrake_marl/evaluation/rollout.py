@@ -223,7 +223,7 @@ def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
 def _roll_out(
     whole: Worlds, agent: Driver, vehicles: tuple[int, ...], scenario: Scenario, aftermath: bool, rows: Ints
 ) -> Outcome:
-    """Let copies of ``agent`` drive those worlds of ``whole`` whose row numbers are ``rows``.
+    """Let copies of ``agent`` drive some worlds of ``whole``, those with the row numbers ``rows``.
 
     ``vehicles``, ``scenario`` and ``aftermath`` are the same arguments as in ``drive_chunk``.
     """

@@ -338,9 +338,9 @@ def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> 
 
     Args:
         value: mean from which ``baseline`` is subtracted, with the interval of this mean.
-        n: number of worlds of ``value`` or, with clusters, number of their clusters.
+        n: number of worlds (with clusters: number of clusters) over which ``value`` is the mean.
         baseline: mean to subtract, with the interval of this mean.
-        m: number of worlds of ``baseline`` or, with clusters, number of their clusters.
+        m: number of worlds (with clusters: number of clusters) over which ``baseline`` is the mean.
 
     """
     difference = value.value - baseline.value

@@ -232,7 +232,7 @@ def summarise_sums(
     """Return the results table, one row per agent, computed from sums of the measures over all worlds.
 
     Args:
-        tallies: name of an agent -> sums of its measures.
+        tallies: name of an agent -> sums of the agent's measures over all worlds.
         conditions: scenario, number and quantities of the worlds (``Conditions.of_test``).
         contexts: name of a set of measures -> information that the set computed once for these worlds
             (``contexts_of``).
