@@ -34,7 +34,7 @@ def write_per_world(
     """Write a table with one row per agent and world as CSV or Parquet.
 
     docs/evaluate.md lists the columns. The row of a world that was left out contains only the agent, the world's number
-    and, in the column ``ended``, the reason. If writing fails, no incomplete file is left behind.
+    and, in the column ``ended``, the reason. If writing fails, there is no incomplete file.
 
     Args:
         path: file to write, with the ending ``.csv`` or ``.parquet``.
@@ -43,8 +43,8 @@ def write_per_world(
             columns, with the value of the objective for each vehicle.
         force: whether to replace an existing file.
 
-    Raises ``AlreadyExists`` if the file exists and ``force`` is false, ``InvalidInput`` for a missing folder or another
-    ending, ``MissingExtra`` for Parquet without pyarrow.
+    Raises ``AlreadyExists`` if the file exists and ``force`` is false, ``InvalidInput`` if the folder is missing or
+    ``path`` has another ending, and ``MissingExtra`` for Parquet if pyarrow is not installed.
 
     """
     ending = Path(path).suffix.lower()
@@ -286,7 +286,7 @@ def recorded_value(row: Mapping[str, Any], key: str) -> str | None:
 
 
 def _is_mean(mean: Any, interval: Any, draws: int) -> bool:
-    """Return whether ``mean`` is a valid mean harm, and ``interval`` is None or ``[low, high]`` around the mean.
+    """Return True if ``mean`` is a valid mean harm and ``interval`` is either None or ``[low, high]`` around it.
 
     If ``draws``, the number of independent worlds or recordings, is 1, ``interval`` must be None.
     """

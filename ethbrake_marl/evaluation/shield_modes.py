@@ -94,8 +94,8 @@ class ShieldModes(list[ModeRow]):
         """Return the content of a results file of ``ethbrake shield``: one object per agent and mode.
 
         Args:
-            sample: the worlds that were passed to ``compare_modes``.
-            task: the task that was passed to ``compare_modes``.
+            sample: the evaluated worlds, which were passed to ``compare_modes``.
+            task: scenario, controlled vehicles and count of harm that were passed to ``compare_modes``.
 
         """
         left_out = [world for world, _ in self[0].left_out]

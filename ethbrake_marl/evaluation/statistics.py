@@ -321,7 +321,7 @@ def paired_difference(values: Floats, baseline: Floats, clusters: Texts | None =
         baseline: numbers to subtract, one for each of the same worlds, [n].
         clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
 
-    Raises ``InvalidInput`` if the lengths differ, or if an array is empty or not finite.
+    Raises ``InvalidInput`` if the arrays have different lengths, or if an array is empty or not finite.
 
     """
     data, reference, products = _check_pair(values, baseline, clusters)
@@ -367,8 +367,8 @@ def relative_decrease(values: Floats, baseline: Floats, clusters: Texts | None =
         baseline: numbers of the baseline agent, one for each of the same worlds, [n].
         clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
 
-    The result is None if the mean of ``baseline`` is 0. Raises ``InvalidInput`` if the lengths differ, or if an array
-    is empty or not finite.
+    The result is None if the mean of ``baseline`` is 0. Raises ``InvalidInput`` if the arrays have different lengths,
+    or if an array is empty or not finite.
 
     """
     data, reference, products = _check_pair(values, baseline, clusters)

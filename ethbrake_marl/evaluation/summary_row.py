@@ -125,7 +125,7 @@ class SummaryRow:
         }
 
     def _estimates_of(self, of: MeasureSet) -> dict[str, Any]:
-        """Return the estimates of set ``of`` for JSON, such as ``{"total_harm": 37, "total_harm_interval": [30, 44]}``."""
+        """Return the estimates of a set for JSON, such as ``{"total_harm": 37, "total_harm_interval": [30, 44]}``."""
         there = {m.name: self.estimates[m.name] for m in of.measures if m.name in self.estimates}
         optional = {measure.name for measure in of.measures if not measure.always}
         return Estimate.side_by_side({name: each for name, each in there.items() if each or name not in optional})

@@ -75,7 +75,7 @@ class Course:
         }
 
     def restore(self, content: Mapping[str, Any]) -> None:
-        """Restore the values that ``to_json`` returned (everything except the policies) from ``content``."""
+        """Set everything in this object except the policies to the values in ``content``, a result of ``to_json``."""
         self.evaluations = [dict(entry) for entry in content["evaluations"]]
         self.best_harm = math.inf if content["best_harm"] is None else float(content["best_harm"])
         self.wall_before_s = float(content["wall_s"])
