@@ -89,7 +89,8 @@ class Conditions(dict[str, Any]):
             quantities: quantities of the worlds: the result of ``of`` or ``of_ranges``.
             recordings: number of recordings that the worlds come from; 0 if the worlds come from no recordings.
             rejected: number of drawn worlds that were rejected because of an early impact. The returned dictionary
-                contains ``rejected`` only if it is above 0 and the scenario takes its worlds from a table.
+                contains this number (as ``rejected_draws``) only if it is above 0 and the scenario takes its worlds
+                from a table.
 
         """
         scenario = task.scenario
@@ -123,7 +124,7 @@ class Conditions(dict[str, Any]):
     def by_recording(self) -> str:
         """Part of a caption that says how many recordings the worlds come from; "" if they do not come from recordings.
 
-        One text is ``; 95 % intervals by 55 recordings``. If all worlds come from one recording, the text says that
+        An example is ``; 95 % intervals by 55 recordings``. If all worlds come from one recording, the text says that
         there are no intervals.
         """
         number = self.get("recordings", 0)

@@ -174,7 +174,7 @@ def _restore_replay(memory: Any, place: Any, arrays: Arrays) -> None:
 
 
 def _try_step(optimizer: torch.optim.Optimizer) -> None:
-    """Take a step with a copy of ``optimizer``; torch raises an error if its state does not fit the weights."""
+    """Take a step with a copy of ``optimizer``; torch raises an error if the optimiser does not fit the weights."""
     tried = copy.deepcopy(optimizer)
     for group in tried.param_groups:
         for weights in group["params"]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 @contextmanager
 def own_random_state() -> Iterator[None]:
-    """Context manager after which the global random generators of Python, NumPy and torch are as before it.
+    """Context manager that restores the states of the global random generators (Python, NumPy, torch) at its end.
 
     Inside the ``with`` block, torch uses one thread. Our networks are so small that a second thread makes training 3 to
     15 times slower if another process uses the processor cores.

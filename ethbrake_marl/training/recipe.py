@@ -72,7 +72,8 @@ class Shape(FileModel):
 
         Args:
             observation_size: number of features of an observation.
-            more: fields of the returned ``NetworkSpec`` that should have other values than for such an actor.
+            more: fields of the returned ``NetworkSpec`` that get other values than by default, such as
+                ``output="tanh"``.
 
         """
         shape: Any = self  # subclasses declare the fields

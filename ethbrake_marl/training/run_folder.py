@@ -161,7 +161,7 @@ class RunDirectory:
         return list(csv.DictReader(self.progress.read_text("utf-8").splitlines()))
 
     def cpu_s(self) -> dict[int, float]:
-        """Return a dictionary: number of decisions before an evaluation -> processor time of learning up to it (s).
+        """Return a dictionary: number of decisions before an evaluation -> processor time of learning until then (s).
 
         Raises ``InvalidInput`` if ``run.json`` does not record the processor time.
         """
