@@ -201,7 +201,10 @@ class TrainingRecipe(FileModel):
         return 1
 
     def check_learners(self, learners: int) -> None:
-        """Raise ``InvalidInput`` if the recipe does not fit the number of learners. The base class accepts any."""
+        """Raise ``InvalidInput`` if the recipe does not fit the number of learners.
+
+        The base class accepts every number of learners.
+        """
 
     def begins(self, scenario: Scenario) -> str | None:
         """Return a description of the initial weights for a scenario, or None if the initial weights are random."""
