@@ -35,7 +35,7 @@ class ShovedFront:
 
     @classmethod
     def of(cls, worlds: Worlds, task: Task) -> ShovedFront | None:
-        """Return the measurement for ``worlds`` at the alert, or None if shoving is not defined for the task.
+        """Return the object that measures shoving in ``worlds``, or None if shoving is not defined for the task.
 
         Shoving is not defined if Vehicle 1 is controlled, if its script reacts to the state of the world, or if brake
         force builds up gradually.
@@ -53,8 +53,8 @@ class ShovedFront:
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
         """Add the distance that Vehicle 1 drives in one step.
 
-        Vehicle 1's distance is the decrease of its gap to an obstacle. In a world without an obstacle, an obstacle is
-        placed so far ahead that Vehicle 1 cannot reach it in this step.
+        This distance is computed as the decrease of Vehicle 1's gap to an obstacle. For this computation, an obstacle
+        is put into worlds without an obstacle, so far ahead that Vehicle 1 cannot reach it in this step.
 
         Args:
             before: the worlds at the beginning of the step.
@@ -80,9 +80,10 @@ class SampledHarm:
     """Compute the sampled harm of the episodes: the paper's sum of squared closing speeds over time samples.
 
     The commands that the agents gave in the exact physics are applied again in the paper's equations of motion with a
-    fixed step (``advance_sampled``). The agents make no new decisions. Every world is simulated up to the horizon. If
-    the episode of a world ended earlier in the exact physics, the last commands of its vehicles remain in force. Create
-    the object with ``of``, call ``see`` for each step, and get the harm from ``finish``.
+    fixed step (``advance_sampled``). The agents make no new decisions. Every world is simulated in the paper's
+    equations up to the horizon. If the episode of a world ended earlier in the exact physics, the last commands of its
+    vehicles remain in force. Create the object with ``of``, call ``see`` for each step, and get the harm from
+    ``finish``.
 
     Args:
         worlds: the n worlds at the alert; they are copied.
@@ -100,11 +101,12 @@ class SampledHarm:
 
     @classmethod
     def of(cls, worlds: Worlds, task: Task) -> SampledHarm | None:
-        """Return the measurement for ``worlds`` at the alert, or None if sampled harm is not defined for the task.
+        """Return the object that computes the sampled harm in ``worlds``, or None if sampled harm is not defined.
 
-        The samples are taken at Vehicle 2's decisions. Sampled harm is therefore defined only if Vehicle 2 is the only
-        controlled vehicle and no script reacts to the state of the world. With an obstacle, or with brake force that
-        builds up gradually, sampled harm is not defined, because the paper's equations cover neither.
+        The time samples of sampled harm are the times of Vehicle 2's decisions. Sampled harm is therefore defined only
+        if Vehicle 2 is the only controlled vehicle and no script reacts to the state of the world. With an obstacle, or
+        with brake force that builds up gradually, sampled harm is not defined, because the paper's equations describe
+        neither of these two.
         """
         obstacle = task.scenario.has_obstacle or worlds.obstacle_ahead.any()
         if task.vehicles != (VEHICLE_2,) or obstacle or worlds.vehicles.build_up.any():
@@ -121,7 +123,8 @@ class SampledHarm:
         Args:
             before: the worlds at the beginning of the step.
             command_mps2: commanded accelerations during the step (m/s2), [n, N].
-            until_s: time at which the step ends (s), [n]; in a world whose episode has ended, the end of the episode.
+            until_s: time since the alert at which the step ends (s), [n]; in a world whose episode has ended, the time
+                at which the episode ended.
 
         """
         running = until_s > before.time_s

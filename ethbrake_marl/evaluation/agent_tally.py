@@ -48,8 +48,8 @@ class AgentTally:
     def share(self, name: str, worlds: int) -> float | None:
         """Return the fraction (0 to 1) of the worlds in which the true/false measure ``name`` is true.
 
-        ``worlds`` is the number of worlds in the evaluation. The result is None if the measure has no value in one of
-        these worlds.
+        ``worlds`` is the number of worlds in the evaluation. The result is None if the measure lacks a value in at
+        least one of these worlds.
         """
         so, of = self.counts.get(name, (0, 0))
         return so / worlds if of == worlds else None
@@ -57,8 +57,8 @@ class AgentTally:
     def sums(self, name: str, worlds: int) -> Moments | None:
         """Return the sum and the sum of squares of the numeric measure ``name``, and the number of its values.
 
-        ``worlds`` is the number of worlds in the evaluation. The result is None if the measure has no value in one of
-        these worlds.
+        ``worlds`` is the number of worlds in the evaluation. The result is None if the measure lacks a value in at
+        least one of these worlds.
         """
         moments = self.moments.get(name)
         return moments if moments is not None and moments.count == worlds else None
@@ -72,16 +72,16 @@ def tally_agents(
     objectives: Sequence[str] | None = None,
     clusters: Texts | None = None,
 ) -> dict[str, AgentTally]:
-    """Return the sums of every agent's measures over the same worlds: name of the agent -> its sums.
+    """Return the sums of every agent's measures over the same worlds: name of the agent -> sums.
 
     Args:
         outcomes: outcome of each agent, by the agent's name.
         contexts: data that each set of measures computed once for these worlds (``contexts_of``), by the set's name.
         baseline: name of the agent with which the other agents are compared, unless a set of measures names its own
             baseline.
-        objectives: objectives such as ``"social:45"`` (docs/cooperation.md). If this is a list (an empty list is
-            enough), the result also has the sums of the harm that each vehicle bears, and of the value of each
-            objective for each vehicle.
+        objectives: objectives such as ``"social:45"`` (docs/cooperation.md). If ``objectives`` is a list, even an empty
+            list, the result also has the sums of the harm that each vehicle bears, and of the value of each objective
+            for each vehicle.
         clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
 
     """
@@ -123,8 +123,8 @@ def estimate_all(
     Args:
         tallies: sums of the measures of every agent, by the agent's name.
         agent: name of the agent whose measures are estimated.
-        worlds: number of worlds in the evaluation. The estimate of a measure is None if the measure has no value in one
-            of these worlds.
+        worlds: number of worlds in the evaluation. The estimate of a measure is None if the measure lacks a value in at
+            least one of these worlds.
         baseline: name of the agent with which ``agent`` is compared. If the baseline was not evaluated, all comparisons
             with it are None.
 
@@ -145,14 +145,15 @@ def estimate_all(
 def _estimate(
     measure: Measure, own: AgentTally, baseline: AgentTally | None, worlds: int, whole: str | None
 ) -> Estimate | None:
-    """Return the estimate of one measure; None if values are missing, or if a comparison has no baseline.
+    """Return the estimate of one measure of one agent; None if values that the estimate needs are missing.
 
     Args:
         measure: the measure.
-        own: sums of the agent's measures.
-        baseline: sums of the measures of the agent to compare with; None if there is no such agent.
-        worlds: number of worlds in the evaluation. The result is None if the measure has no value in one of these
-            worlds.
+        own: sums of the measures of the agent whose measure is estimated.
+        baseline: sums of the measures of the agent to compare with; None if the agent to compare with was not
+            evaluated, so that comparisons have no estimate.
+        worlds: number of worlds in the evaluation. The result is None if the measure lacks a value in at least one of
+            these worlds.
         whole: name of a true/false measure (``MeasureSet.whole``) that must be true in all worlds for a comparison with
             the baseline; None if there is no such condition.
 
@@ -171,10 +172,11 @@ def _estimate(
 
 
 def lower_bounds(tally: AgentTally, worlds: int) -> frozenset[str]:
-    """Return the names of those measures of one agent whose means are only lower bounds of the true means.
+    """Return the names of the measures whose means, for one agent, are only lower bounds of the true means.
 
     A set of measures may name a true/false measure (``MeasureSet.whole``) that says whether the set's values in a world
-    are complete. If this measure is false in some world, the means of all measures in the set are lower bounds.
+    are complete. If this true/false measure is false in some world, the means of all measures in the set are lower
+    bounds.
 
     Args:
         tally: sums of the agent's measures.

@@ -51,9 +51,9 @@ class Lineup:
         agents: names of the agents as on the command line, such as ``full_brake`` and ``ppo+step``.
         scenario: scenario whose learners the agents drive.
         harm_count: count of harm that agents minimise, each pair's first impact (``first``) or all impacts (``total``).
-        uncertainty: intervals around the reported quantities, for shields that need them, as a text such as
-            ``gaps_m=0.5``; None: no shield needs them.
-        measures: measures of the user to load, each a name or ``FILE:NAME`` (``load_measures``).
+        uncertainty: how far gaps, speeds and so on may differ from their stated values, for shields that need to know
+            this, as a text such as ``gaps_m=0.5``; None: no shield needs to know.
+        measures: names of the user's measures that every process loads (``load_measures``), some as ``FILE:NAME``.
         reported: names of all measures of the user whose values the evaluation reports.
         sets: names of the sets of measures that the main process has. Every worker process must also have these sets.
         same: hash of the policies, measures and software versions, which must be equal in every process
@@ -82,7 +82,7 @@ class Lineup:
         Args:
             agents: names of the agents as on the command line, such as ``full_brake`` and ``ppo+step``.
             scenario: scenario whose learners the agents drive.
-            how: values of ``harm_count``, ``uncertainty`` and ``measures``, which mean the same as in ``Lineup``.
+            how: further arguments of ``Lineup``: ``harm_count``, ``uncertainty`` and ``measures``.
 
         Raises the errors of ``make_lineup``.
 
@@ -131,7 +131,7 @@ class Lineup:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def _digests(self) -> list[str]:
-        """Return the SHA-256 of every Python file and weights file that an agent's or a measure's name contains."""
+        """Return the SHA-256 of every file of code or weights whose path is part of an agent's or a measure's name."""
         named = [part for spec in map(parse_spec, self.agents) if spec.file for part in (spec.file[0], spec.policy)]
         named += [name.rpartition(":")[0] for name in self.measures]
         return [file_sha256(Path(each)) for each in named if each is not None and Path(each).is_file()]
@@ -157,7 +157,7 @@ def evaluate_held(
 
     Args:
         lineup: the agents to evaluate.
-        sample: worlds in which the agents drive; all of them are kept in memory.
+        sample: worlds in which the agents drive; all these worlds are kept in memory.
         seed: seed of the worlds, which the result records; None for worlds that were not drawn from a seed.
         jobs: number of processes; None: one process, or with Ray one per core of the cluster.
         ray: address of a Ray cluster, or ``local`` for this machine; None: Ray is not used.
@@ -180,7 +180,7 @@ def _drive(lineup: Lineup, part: Sample, seed: int | None, first: int) -> Evalua
 
 
 def _only(outcome: Outcome, names: Sequence[str]) -> Outcome:
-    """Return the outcome without those measures of the user (``Outcome.metrics``) that ``names`` does not list."""
+    """Return the outcome with only those of the user's measures (``Outcome.metrics``) that ``names`` lists."""
     metrics = {c: each for c, each in outcome.metrics.items() if c in names or c.rpartition("_")[0] in names}
     return replace(outcome, metrics=metrics)
 
@@ -238,7 +238,7 @@ def summarise_tally(lineup: Lineup, tally: Tally, seed: int) -> SummaryTable:
 
     Args:
         lineup: the evaluated agents.
-        tally: sums over the worlds, from ``tally_list``.
+        tally: sums of each agent's measures, the result of ``tally_list``.
         seed: seed of the evaluation list.
 
     Raises ``PhysicsError`` if every world was left out because of an error.

@@ -35,16 +35,17 @@ _STAY = "\u00a0"  # a non-breaking space
 class Conditions(dict[str, Any]):
     """Dictionary that says how a result was obtained: scenario, seed, vehicles, scripts, and quantities of the worlds.
 
-    ``of`` and ``of_ranges`` return a dictionary with only the quantities; ``of_test`` returns all of these entries.
+    ``of`` and ``of_ranges`` return a dictionary with only the quantities of the worlds; ``of_test`` returns a
+    dictionary with all entries.
     """
 
     @classmethod
     def of(cls, worlds: Worlds) -> Conditions:
-        """Return every quantity of the worlds by key, such as ``{"gaps_m": [7.0, [5.0, 9.0]]}``.
+        """Return a dictionary: key of a quantity -> value in ``worlds``, such as ``{"gaps_m": [7.0, [5.0, 9.0]]}``.
 
         The value of a quantity of vehicles or pairs is a list with one entry per vehicle or pair, front to rear. A
-        quantity of the whole world has a single entry. An entry is a number if the quantity is equal in all worlds;
-        otherwise it is ``[smallest, largest]``.
+        quantity of the whole world has a single entry. An entry is a number if the quantity is equal in all worlds. If
+        not, the entry is ``[smallest, largest]``.
         """
         return cls.of_ranges({key: rule.of(worlds).T for key, rule in QUANTITY.of(worlds).items()})
 
@@ -85,10 +86,11 @@ class Conditions(dict[str, Any]):
             count: number of worlds.
             because: key of a set of measures (``MeasureSet.because_key``) -> reason why the set does not apply to these
                 worlds; None if the set applies.
-            quantities: quantities of the worlds, as ``of`` returns them.
+            quantities: quantities of the worlds: the result of ``of`` or ``of_ranges``.
             recordings: number of recordings that the worlds come from; 0 if the worlds come from no recordings.
-            rejected: number of drawn worlds that were rejected because of an early impact. The result contains this
-                number only if it is above 0 and the scenario takes its worlds from a table.
+            rejected: number of drawn worlds that were rejected because of an early impact. The returned dictionary
+                contains this number (as ``rejected_draws``) only if it is above 0 and the scenario takes its worlds
+                from a table.
 
         """
         scenario = task.scenario
@@ -120,9 +122,10 @@ class Conditions(dict[str, Any]):
 
     @property
     def by_recording(self) -> str:
-        """Part of a caption that says how many recordings the worlds come from; empty without recordings.
+        """Part of a caption that says how many recordings the worlds come from; "" if they do not come from recordings.
 
-        Example: ``; 95 % intervals by 55 recordings``. If all worlds come from one recording, there are no intervals.
+        An example is ``; 95 % intervals by 55 recordings``. If all worlds come from one recording, the text says that
+        there are no intervals.
         """
         number = self.get("recordings", 0)
         many = f"; 95 % intervals by {number:,} recordings" if number else ""
@@ -132,7 +135,7 @@ class Conditions(dict[str, Any]):
     def quantities(self) -> str:
         """All quantities in one line, with symbols and units, such as ``d = 7 m; v = (20, 18, 20) m/s``.
 
-        If all vehicles (or pairs) have the same value, the value is written only once.
+        If a quantity has the same value for all vehicles (or pairs), the value is written only once.
         """
         parts = []
         for key, (symbol, unit) in _SYMBOLS.items():

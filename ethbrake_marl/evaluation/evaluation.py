@@ -42,7 +42,7 @@ T = TypeVar("T")
 class Evaluation:
     """Outcomes of several agents that drove the same vehicles in the same worlds.
 
-    Entry k of every array belongs to the same world.
+    In all arrays, entry k belongs to the same world.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -99,7 +99,7 @@ class Evaluation:
         """Join evaluations of consecutive chunks of worlds into one evaluation of all these worlds.
 
         Args:
-            parts: evaluations of the same agents, one per chunk, in the order of the worlds.
+            parts: evaluations of the same agents, one per chunk of worlds, in the order of the worlds.
 
         Raises ``PhysicsError`` if every world was left out because of an error.
 
@@ -121,7 +121,7 @@ class Evaluation:
         )
 
     def take(self, rows: Ints | Bools) -> Evaluation:
-        """Return the evaluation restricted to some of its worlds; its ``left_out`` is empty, and its ``rejected`` is 0.
+        """Return the evaluation restricted to some of its worlds; ``left_out`` becomes empty, and ``rejected`` 0.
 
         Args:
             rows: row numbers of the worlds to keep, or a mask [n] that is true for the worlds to keep.
@@ -254,7 +254,7 @@ class Evaluation:
         return Sheet(repr(self), ("Agent", share, Column("First-impact harm"), Column("Total harm")), rows, note).html()
 
     def complete(self) -> Evaluation:
-        """Return this evaluation if no world was left out; otherwise raise ``PhysicsError`` with these worlds."""
+        """Return this evaluation if no world was left out. If not, raise ``PhysicsError`` with the left-out worlds."""
         if self.left_out:
             raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in self.left_out})
         return self

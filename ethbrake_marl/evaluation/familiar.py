@@ -23,14 +23,14 @@ _TRAINED = 2_000  # number of worlds drawn from the training scenario to find th
 def warn_unfamiliar(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenario, vehicles: Sequence[int]) -> None:
     """Warn (``Unfamiliar``) about each trained policy that is to drive in worlds unlike its training worlds.
 
-    The worlds are compared with worlds drawn from the training scenario, which the policy's manifest contains. If no
-    worlds of the training scenario can be drawn on this machine, there is no warning. Of the V2X channel, only the
+    A policy's manifest contains its training scenario; ``worlds`` are compared with worlds drawn from this scenario. If
+    no worlds of the training scenario can be drawn on this machine, there is no warning. Of the V2X channel, only the
     latencies and the contents of messages are compared.
 
     Args:
         agents: agents by name; agents without a trained policy are ignored.
         worlds: worlds at the alert in which the agents are to drive.
-        scenario: scenario of these worlds.
+        scenario: scenario of ``worlds``.
         vehicles: indices (0 = front) of the vehicles that each agent drives.
 
     """

@@ -1,4 +1,4 @@
-"""Identity of a result: hashes of its worlds, scenario and policies, and the software versions that computed it.
+"""Identity of a result: hashes of worlds, scenario and policies, and the software versions that computed the result.
 
 Two results can be compared if the hashes of their worlds and scenarios are equal. Different software versions are
 reported, but do not prevent a comparison.
@@ -61,9 +61,10 @@ def _hash_at_once(worlds: Worlds, index: Ints) -> str:
 
 
 def hash_of_chunks(worlds: Worlds, index: Ints) -> int:
-    """Return a hash of worlds: the SHA-256 of each chunk of 2,500 worlds, added up modulo 2^256.
+    """Return a hash of worlds: the sum, modulo 2^256, of the SHA-256 of all chunks of 2,500 worlds.
 
-    The first chunk contains the worlds with numbers 0 to 2,499, the second 2,500 to 4,999, and so on.
+    The first chunk contains the worlds with numbers 0 to 2,499, the second chunk the worlds with numbers 2,500 to
+    4,999, and so on.
 
     Args:
         worlds: the n worlds at the alert.
@@ -104,7 +105,7 @@ def _arrays(value: Any) -> dict[str, np.ndarray]:
 def scenario_sha256(scenario: Scenario) -> str:
     """Return the SHA-256 (hexadecimal) of everything in a scenario that affects an episode, including default values.
 
-    The scenario's name, title, description and source do not affect the result.
+    The scenario's name, title, description and source do not affect the hash.
     """
     content = scenario.content(without=_WORDS)
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
@@ -135,17 +136,17 @@ def own_versions() -> dict[str, str]:
 def result_identity(
     kind: Kind, scenario: Scenario, sample: Sample | None, left_out: Collection[int] = ()
 ) -> dict[str, Any]:
-    """Return the entries of a JSON results file that identify the result.
+    """Return the entries that identify a result in a JSON results file.
 
     The entries are ``kind``, ``scenario_sha256``, ``worlds_sha256`` and ``versions``.
 
     Args:
         kind: kind of results, such as ``evaluate`` or ``shield``.
         scenario: scenario of the worlds.
-        sample: the worlds of the result; None if the file contains results of several samples. Without a sample,
-            ``worlds_sha256`` is omitted.
-        left_out: row numbers of the worlds in ``sample`` that were left out because of errors. The hash does not
-            include these worlds.
+        sample: the worlds of the result; None if the file contains results of several samples of worlds. If ``sample``
+            is None, the result has no ``worlds_sha256``.
+        left_out: row numbers of the worlds in ``sample`` that were left out because of errors. ``worlds_sha256`` does
+            not cover the worlds that were left out.
 
     """
     identity: dict[str, Any] = {

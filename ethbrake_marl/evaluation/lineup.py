@@ -20,8 +20,8 @@ from ethbrake_marl.scenario.schema import Scenario
 def check_agents(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenario, *, warn: bool = False) -> None:
     """Let every agent decide once, so that an error in an agent is raised before a long evaluation.
 
-    An agent whose commands do not depend on the state (``state_free``) decides in all worlds, other agents only in the
-    first world.
+    An agent whose commands do not depend on the state (``state_free``) decides in all worlds. Other agents decide only
+    in the first world.
 
     Args:
         agents: agents or teams by name.
@@ -62,10 +62,11 @@ def make_lineup(
             the specs. The name of a group of agents, such as ``ladder``, is replaced by all agents of the group.
         scenario: scenario whose learners the agents drive.
         harm_count: count of harm that optimising agents minimise, ``first`` or ``total``.
-        uncertainty: intervals around the reported quantities, for shields that need them, as in ``make_agent``.
+        uncertainty: how far gaps, speeds and so on may differ from their stated values, for shields that need to know
+            this (such as ``gaps_m=0.5``; see ``make_agent``).
         alone: whether to refuse teams, because the caller needs agents that drive a single vehicle.
-        bare: whether to refuse agents with a shield, because the caller adds a shield. If the scenario has one learner,
-            teams are also refused.
+        bare: whether to refuse agents with a shield, because the caller adds a shield. If ``bare`` is true and the
+            scenario has one learner, teams are also refused.
 
     Raises ``InvalidInput`` for a repeated spec, for an uncertainty that is missing or unused, and for a team or shield
     that is refused. Also raises the errors of ``make_agent``.
@@ -99,7 +100,7 @@ def make_lineup(
 
 
 def make_agents(specs: Sequence[str], scenario: Scenario, *, harm_count: HarmCount = "first") -> dict[str, Agent]:
-    """Build one agent of a single vehicle for each text in ``specs``, and return a dictionary: text -> agent.
+    """Build an agent that drives a single vehicle for each text in ``specs``; return a dictionary: text -> agent.
 
     Args:
         specs: texts that name agents, such as ``full_brake``.

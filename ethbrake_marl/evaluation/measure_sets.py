@@ -113,7 +113,8 @@ class MeasureSet:
     def row(self, tally: Any, worlds: int, context: Any) -> dict[str, Any]:
         """Return fields that this set adds to an agent's object in the JSON results; by default none.
 
-        The fields must have the same keys in every evaluation, even if the set does not apply to it.
+        The returned dictionary must have the same keys in every evaluation, even if the set does not apply to the
+        evaluation.
 
         Args:
             tally: sums of the agent's measures (``AgentTally``).
@@ -233,7 +234,7 @@ def register_measure_set(name: str, measures: MeasureSet) -> None:
         measures: the set.
 
     Raises ``InvalidInput`` if ``measures`` is not a ``MeasureSet``, and ``AlreadyExists`` if another set has the same
-    name or a measure of the same name.
+    name, or if a measure of another set has the same name as a measure of this set.
 
     """
     if not isinstance(measures, MeasureSet):
@@ -254,13 +255,13 @@ MEASURE_SETS: Registry[MeasureSet] = Registry("set of measures", "measure_sets",
 def contexts_of(evaluation: Any, *, long_list: bool = False) -> dict[str, Any]:
     """Return the context (information about the worlds) of each installed set of measures, by the set's name.
 
-    The context is what ``MeasureSet.prepare`` returned. If the set does not apply to the evaluation, the context is
-    ``Silent``, with the reason. The context is computed once per evaluation.
+    A context is the result of ``MeasureSet.prepare``, which is called once per evaluation. If the set does not apply to
+    the evaluation, the context is ``Silent``, with the reason.
 
     Args:
         evaluation: the evaluation.
         long_list: whether ``evaluation`` is one chunk of a list of more than 100,000 worlds. Some sets do not apply to
-            such a long list.
+            more than 100,000 worlds.
 
     """
     silent = silent_in_long_lists() if long_list else {}
@@ -273,9 +274,9 @@ def silent_in_long_lists() -> dict[str, Silent]:
 
 
 def silent_because(contexts: Mapping[str, Any]) -> dict[str, str | None]:
-    """Return why each set of measures does not apply (None: it applies), by the set's ``because_key``.
+    """Return a dictionary: ``because_key`` of a set of measures -> why the set does not apply (None: it applies).
 
-    ``contexts`` is the result of ``contexts_of``. Sets without a ``because_key`` are omitted.
+    ``contexts`` is the result of ``contexts_of``. Sets whose ``because_key`` is None are omitted.
     """
     by_key = {key: contexts[name] for name, each in MEASURE_SETS.items() if (key := each.because_key) is not None}
     return {key: context.because if isinstance(context, Silent) else None for key, context in by_key.items()}

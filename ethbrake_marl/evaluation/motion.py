@@ -55,7 +55,7 @@ def follow_episodes(worlds: Worlds, agent: Driver, scenario: Scenario) -> list[E
         scenario: scenario of the worlds. The agent drives the learners of the scenario, and the scripts of the scenario
             drive the other vehicles.
 
-    Raises ``PhysicsError`` with the worlds that could not be simulated.
+    Raises ``PhysicsError``, which lists the worlds whose simulation failed.
 
     """
     team = Team.of(agent, scenario.learners)
@@ -66,12 +66,13 @@ def follow_episodes(worlds: Worlds, agent: Driver, scenario: Scenario) -> list[E
 
 
 class _Follower(Tape):
-    """Recorder of every step, and of the decisions at which a shield replaced the policy's action.
+    """Recorder of every time step of episodes, and of the decisions at which a shield replaced the policy's action.
 
     Args:
         worlds: the worlds at the alert.
         team: agents of the controlled vehicles.
-        engine: simulator that runs the episodes; its ``ruling`` says what the shield decided.
+        engine: simulator that runs the episodes; its attribute ``ruling`` says what the shield decided in the current
+            step.
 
     """
 
@@ -83,7 +84,7 @@ class _Follower(Tape):
         self._engine, self._ruling = engine, engine.ruling
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Record one step.
+        """Record one time step.
 
         Args:
             before: the worlds at the beginning of the step.
@@ -99,7 +100,7 @@ class _Follower(Tape):
             self._ruling = ruling
 
     def motions(self, episodes: Episodes) -> list[EpisodeMotion]:
-        """Return the recorded motion of each world after all episodes ended; ``episodes`` is their result."""
+        """Return the recorded motion of each world. ``episodes`` is the result of the finished episodes."""
         n, N = self.worlds.n, self.worlds.N
         impacts, pieces = self.episodes(), self._pieces()
         motions = []
@@ -124,9 +125,10 @@ class _Follower(Tape):
         return motions
 
     def _pieces(self) -> list[Floats]:
-        """Return the motion of each world as k stretches of time with constant jerks, [k, 1 + 4 N].
+        """Return the motion of each world: one row per stretch of time with constant jerks, [k, 1 + 4 N].
 
-        Each row is as in ``EpisodeMotion.pieces``. If an episode ends at the alert, its motion has a single row.
+        A row contains the same numbers as a row of ``EpisodeMotion.pieces``: time and state at the beginning of the
+        stretch. If an episode ends at the alert, its array has a single row.
         """
         parts: list[list[Floats]] = [[] for _ in range(self.worlds.n)]
         way_m = np.zeros(self.worlds.n)
@@ -148,11 +150,11 @@ class _Follower(Tape):
 def join_pieces(pieces: Floats, vehicles: int) -> Floats:
     """Return the same motion with fewer pieces; a piece is a stretch of time in which all jerks are constant.
 
-    A piece is dropped if the piece before it, continued to the same time, leads to the same state up to rounding. If
-    several pieces begin within the same 0.1 ms, only the last of these pieces is kept.
+    A piece is dropped if the previous piece, continued to the beginning of this piece, leads to the same state up to
+    rounding. If several pieces begin within the same 0.1 ms, only the last of these pieces is kept.
 
     Args:
-        pieces: time and state at the beginning of each piece, [k, 1 + 4 N], as in ``EpisodeMotion``.
+        pieces: motion to simplify: time and state at the beginning of each piece, [k, 1 + 4 N].
         vehicles: number of vehicles, N.
 
     """
@@ -166,12 +168,12 @@ def join_pieces(pieces: Floats, vehicles: int) -> Floats:
 
 
 def state_at(piece: Floats, time_s: float, vehicles: int) -> Floats:
-    """Return the state [4 N] at one time within a piece, a stretch of time in which all jerks are constant.
+    """Return the state [4 N] at one time within a piece (a stretch of time in which all jerks are constant).
 
     The state is the position of Vehicle 1 (m), gaps (m), speeds (m/s), accelerations (m/s2) and jerks (m/s3).
 
     Args:
-        piece: time and state at the beginning of the piece, [1 + 4 N].
+        piece: time and state at the beginning of the piece, [1 + 4 N], a row of ``EpisodeMotion.pieces``.
         time_s: time of the returned state, counted from the alert (s).
         vehicles: number of vehicles, N.
 

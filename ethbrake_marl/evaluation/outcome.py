@@ -123,7 +123,7 @@ class Outcome:
         return np.where(self.at_rest, "at_rest", "horizon")
 
     def borne(self, objectives: Sequence[Declared] = ()) -> dict[str, Floats]:
-        """Return the harm that each vehicle bears, and the vehicle's value under each objective (m2/s2).
+        """Return, for each vehicle, the harm that it bears and the value of each of ``objectives`` (m2/s2).
 
         The result is a dictionary: name of a column -> its values in the n worlds. For instance, the columns of Vehicle
         2 are ``first_impact_harm_2``, ``total_harm_2`` and, with ``objectives=["social:45"]``, ``social:45_first_2``
@@ -137,7 +137,7 @@ class Outcome:
         return {f"{name}_{i + 1}": each[:, i] for name, each in by_vehicle.items() for i in range(each.shape[1])}
 
     def columns(self) -> dict[str, Values | None]:
-        """Return the columns of a table with one row per world: name (docs/evaluate.md) -> values [n], or None."""
+        """Return the columns of a table with one row per world: name of a column -> values [n] (None: not measured)."""
         final, obstacle = self.final, {}
         if (ahead := final.obstacle_ahead).any():
             obstacle = {

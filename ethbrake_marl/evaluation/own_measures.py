@@ -51,8 +51,8 @@ def measure_columns(terms: Mapping[str, Any], episodes: EpisodeImpacts | None) -
 
     Args:
         terms: name of a measure that is computed at each step -> its sum over each episode, [n] or [n, N].
-        episodes: impacts of the episodes, from which all other measures are computed; None if there are no other
-            measures.
+        episodes: impacts of the episodes, from which the measures that are not in ``terms`` are computed; None if all
+            measures are in ``terms``.
 
     """
     columns: dict[str, Any] = {}

@@ -33,8 +33,8 @@ def write_per_world(
 ) -> None:
     """Write a table with one row per agent and world as CSV or Parquet.
 
-    docs/evaluate.md lists the columns. The row of a left-out world contains only the agent, the world's number and, in
-    the column ``ended``, the reason. If writing fails, no incomplete file is left behind.
+    docs/evaluate.md lists the columns. The row of a world that was left out contains only the agent, the world's number
+    and, in the column ``ended``, the reason. If writing fails, there is no incomplete file.
 
     Args:
         path: file to write, with the ending ``.csv`` or ``.parquet``.
@@ -43,8 +43,8 @@ def write_per_world(
             columns, with the value of the objective for each vehicle.
         force: whether to replace an existing file.
 
-    Raises ``AlreadyExists`` if the file exists and ``force`` is false, ``InvalidInput`` for a missing folder or another
-    ending, ``MissingExtra`` for Parquet without pyarrow.
+    Raises ``AlreadyExists`` if the file exists and ``force`` is false, ``InvalidInput`` if the folder is missing or
+    ``path`` has another ending, and ``MissingExtra`` for Parquet if pyarrow is not installed.
 
     """
     ending = Path(path).suffix.lower()
@@ -69,16 +69,16 @@ Harms = dict[str, dict[int, tuple[float, ...]]]  # agent -> world -> (first-impa
 
 
 def read_harms(path: Path, data: bytes) -> tuple[Harms, dict[int, str]]:
-    """Read a file of ``write_per_world``: the harms of each agent in each world, and each world's recording.
+    """Read a file that ``write_per_world`` wrote: the harms of each agent in each world, and each world's recording.
 
-    The result is two dictionaries. The second dictionary is empty if the file has no column ``recording``. Left-out
-    worlds are omitted.
+    Returns two dictionaries: agent -> world -> harms, and world -> recording. The dictionary of recordings is empty if
+    the file has no column ``recording``. Both dictionaries omit the worlds that were left out.
 
     Args:
         path: name of the file, whose ending decides the format. The file is not read, because ``data`` is its content.
         data: content of the file.
 
-    Raises ``InvalidInput`` if the file lacks a needed column or has an invalid value.
+    Raises ``InvalidInput`` if the file lacks a column that is needed here, or has an invalid value.
 
     """
     try:
@@ -154,12 +154,12 @@ def results_to_json(
 
     Args:
         rows: rows of the results table, one per agent.
-        rescored: mean values of objectives (``Evaluation.rescore``), to be added to each agent's object.
+        rescored: mean values of objectives (``Evaluation.rescore``), to be added to each agent's JSON object.
         groups: name of a group of worlds -> results of the same agents in this group (``summarise_by``), to be added to
-            each agent's object; None: there are no groups.
-        per_world: existing file with one row per agent and world, whose name and hash are added to each agent's object;
-            None: there is no such file.
-        settings: settings of all agents by name, such as ``{"harm_count": "first"}``.
+            each agent's JSON object; None: there are no groups.
+        per_world: existing file with one row per agent and world, whose name and hash are added to each agent's JSON
+            object; None: there is no such file.
+        settings: settings that hold for all agents, by the setting's name, such as ``{"harm_count": "first"}``.
 
     """
     objects = [row.to_json() | {"agent_settings": dict(settings)} for row in rows]
@@ -186,7 +186,7 @@ class Result:
 
     @property
     def about(self) -> Mapping[str, Any]:
-        """JSON object of the first agent, to read entries that are equal for all agents, such as the hashes."""
+        """JSON object of the file's first agent, to read entries that are equal for all agents, such as the hashes."""
         return next(iter(self.rows.values()))
 
     def estimate(self, agent: str, harm: str) -> Estimate:
@@ -204,7 +204,8 @@ class Result:
     def harms(self) -> tuple[Harms, dict[int, str]]:
         """Read the file of ``--per-world`` that belongs to this results file, and return what ``read_harms`` returns.
 
-        Raises ``InvalidInput`` if there is no such file, or if the file was changed later.
+        Raises ``InvalidInput`` if this results file belongs to no file of ``--per-world``, or if the file of
+        ``--per-world`` is missing or was changed later.
         """
         beside = self.about.get("per_world")
         if not isinstance(beside, dict) or not isinstance(beside.get("file"), str):
@@ -223,7 +224,8 @@ class Result:
 def read_result(path: Path) -> Result:
     """Read and check a JSON results file of ``ethbrake evaluate``, ``ethbrake shield`` or ``ethbrake run``.
 
-    Raises ``InvalidInput`` for any other file, for kinds of results that cannot be compared, and for missing hashes.
+    Raises ``InvalidInput`` if ``path`` is not such a results file, if its kind of results cannot be compared, or if it
+    lacks a hash.
     """
     try:
         content = parse_strict_json(read_plain(path, _LIMIT_BYTES))
@@ -275,7 +277,8 @@ def read_result(path: Path) -> Result:
 
 
 def recorded_value(row: Mapping[str, Any], key: str) -> str | None:
-    """Return the value of ``key`` in an agent's JSON object ``row``, or else in its ``parameters``, as text.
+    """Return the value of ``key`` in an agent's JSON object ``row`` or, if missing there, in its ``parameters``, as
+    text.
 
     Return None if neither the object nor its ``parameters`` have the key.
     """
@@ -285,7 +288,7 @@ def recorded_value(row: Mapping[str, Any], key: str) -> str | None:
 
 
 def _is_mean(mean: Any, interval: Any, draws: int) -> bool:
-    """Return whether ``mean`` is a valid mean harm, and ``interval`` is None or ``[low, high]`` around the mean.
+    """Return True if ``mean`` is a valid mean harm and ``interval`` is either None or ``[low, high]`` around it.
 
     If ``draws``, the number of independent worlds or recordings, is 1, ``interval`` must be None.
     """

@@ -1,7 +1,7 @@
 """Record of one episode at fine time resolution, for figures and viewers.
 
-The agent first drives the episode as in an evaluation. The state at each sample time is then computed from the state
-and the commands at the beginning of the time step that contains the sample time.
+The agent first drives the episode as in an evaluation. The state at each sample time is computed afterwards, from the
+state and the commands at the beginning of the time step that contains the sample time.
 """
 
 from __future__ import annotations
@@ -78,9 +78,11 @@ def record_episode(
         agent: agent or team that drives the controlled vehicles. The object that you pass does not change.
         scenario: scenario of the world, whose scripts drive the other vehicles.
         vehicle: the controlled vehicle, by name (``vehicle_2``) or index (0 = front); None: the scenario's learners.
-        sample_s: largest time between two samples (s). The state at each decision is always one of the samples.
+        sample_s: largest time between two consecutive samples (s). The state at each decision is always one of the
+            samples.
 
-    Raises ``InvalidInput`` if there is not exactly one world, or if ``sample_s`` is not above 0.
+    Raises ``InvalidInput`` if ``world`` does not contain exactly one world, or if ``sample_s`` is not finite and above
+    0.
 
     """
     if world.n != 1:
@@ -104,10 +106,10 @@ def record_episode(
 def _samples(segments: Sequence[tuple[Worlds, Floats, Floats]], sample_s: float) -> Iterator[tuple[Floats, ...]]:
     """Yield the samples of each step: time [k], gaps [k, P], speeds [k, N], positions [k, N], commands [k, N].
 
-    Consecutive samples are at most ``sample_s`` seconds apart. The state at the end of a step counts as the first
-    sample of the next step, except for the last step. A world does not contain positions, so Vehicle 1's position is
-    computed from its gap to an obstacle. In a world without an obstacle, an obstacle is placed so far ahead that
-    Vehicle 1 cannot reach it.
+    Consecutive samples are at most ``sample_s`` seconds apart. The state at the end of a step is returned only once, as
+    the first sample of the next step or, after the last step, as its last sample. A world does not contain positions,
+    so Vehicle 1's position is computed from its gap to an obstacle. For this computation, an obstacle is put into a
+    world without an obstacle, so far ahead that Vehicle 1 cannot reach it.
 
     Args:
         segments: time steps of one episode, each as (world at the beginning of the step, commands [1, N] (m/s2), time

@@ -1,4 +1,4 @@
-"""Mean values of several objectives for each agent: one row per agent, objective and count of harm."""
+"""Mean values of several objectives in an agent's results: one row per agent, objective and count of harm."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 
 @dataclass(frozen=True, slots=True)
 class Rescored:
-    """Mean value of one objective for each vehicle in the results of one agent. Smaller values are better."""
+    """For each vehicle, the mean value of one objective over the worlds of one agent. Smaller values are better."""
 
     agent: str  # name of the agent
     objective: str  # objective as in scenarios: ``total``, ``own``, ``social:45``
@@ -46,7 +46,7 @@ class Rescores(list[Rescored]):
         return "\n".join(self.sheet(harm_count).html() for harm_count in HARM_COUNTS)
 
     def sheet(self, harm_count: HarmCount) -> Sheet:
-        """Return the table for first-impact harm (``first``) or total harm (``total``).
+        """Return the table of objectives for one count of harm, first-impact (``first``) or total (``total``).
 
         The table has one row per agent and objective, and one column per vehicle.
         """

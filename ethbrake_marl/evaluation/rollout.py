@@ -1,7 +1,7 @@
 """Evaluate agents: draw a fixed list of worlds, let every agent drive each world once, and measure the results.
 
 The worlds are fixed in advance. If instead the episodes that finish first were evaluated, short episodes would be
-over-represented, and many of these are crashes.
+over-represented, and many short episodes are crashes.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def evaluate(
         episodes: number of worlds to draw; None: 10,000.
         seed: seed from which the worlds are drawn; None: 7. If ``worlds`` is passed, the seed is only recorded in the
             result.
-        chunk: number of worlds that are simulated together; None: 2,500. The results do not depend on ``chunk``.
+        chunk: number of worlds that are simulated together, which does not affect the results; None: 2,500.
         on_progress: function that is called after each chunk with an agent's name and the number of worlds that the
             agent has driven so far.
         aftermath: whether to also measure how far Vehicle 1 is shoved, the paper's sampled harm, and measures that the
@@ -124,7 +124,7 @@ def drive_chunk(
 ) -> Evaluation:
     """Let each agent drive all worlds of one chunk at once, from the alert to the end of their episodes.
 
-    If every simulation fails, the returned ``Evaluation`` contains no world.
+    If the simulation of every world fails, the returned ``Evaluation`` contains no world.
 
     Args:
         sample: the worlds of the chunk, at the alert.
@@ -160,7 +160,7 @@ def drive_chunk(
 
 
 def _check_request(worlds: object, agents: object, chunk: object) -> None:
-    """Raise ``InvalidInput`` if one of these arguments of ``evaluate`` has a wrong type or value."""
+    """Raise ``InvalidInput`` if one of the three arguments, which are passed to ``evaluate``, is wrong."""
     if not isinstance(worlds, Worlds | Sample):
         raise InvalidInput(
             f"evaluate: worlds = {worlds!r}: must be a Worlds or Sample object, for instance scenario.sample(100,"
@@ -182,9 +182,9 @@ def _check_request(worlds: object, agents: object, chunk: object) -> None:
 def controlled_vehicles(scenario: Scenario, vehicle: int | str | None, agents: Mapping[str, Driver]) -> tuple[int, ...]:
     """Return the indices (0 = front) of the vehicles that the agents are to control.
 
-    The result contains ``vehicle`` (name or index) or, if ``vehicle`` is None, all learners of the scenario. For a
-    scenario without learners, ``vehicle`` may be None only if all agents are teams. The result is then empty; otherwise
-    ``InvalidInput`` is raised.
+    The result contains ``vehicle`` (name or index) or, if ``vehicle`` is None, all learners of the scenario. If the
+    scenario has no learners and ``vehicle`` is None, all agents must be teams, and the result is empty. If some agent
+    is not a team, ``InvalidInput`` is raised.
     """
     if vehicle is not None or (not scenario.learners and any(not isinstance(a, Team) for a in agents.values())):
         return (controlled_vehicle(scenario, vehicle),)
@@ -223,7 +223,7 @@ def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
 def _roll_out(
     whole: Worlds, agent: Driver, vehicles: tuple[int, ...], scenario: Scenario, aftermath: bool, rows: Ints
 ) -> Outcome:
-    """Let copies of ``agent`` drive those worlds of ``whole`` whose row numbers are ``rows``.
+    """Let copies of ``agent`` drive some worlds of ``whole``, those with the row numbers ``rows``.
 
     ``vehicles``, ``scenario`` and ``aftermath`` are the same arguments as in ``drive_chunk``.
     """

@@ -1,8 +1,8 @@
 """Statistics over training runs with different seeds; the intervals say what to expect of another seed.
 
 There are usually few training runs, and a single bad run changes their mean a lot. The interquartile mean therefore
-omits the best and the worst quarter of the runs' results. Its error is estimated with a stratified bootstrap: seeds are
-resampled within each task (scenario), because seeds are random and tasks are not.
+omits the best and the worst quarter of the runs' results. The error of the interquartile mean is estimated with a
+stratified bootstrap: seeds are resampled within each task (scenario), because seeds are random and tasks are not.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ def interquartile_mean(tasks: Sequence[ArrayLike], *, resamples: int = RESAMPLES
     """Return the interquartile mean of the results of training runs, with a stratified bootstrap interval.
 
     Of all n results, the floor(n / 4) smallest and the floor(n / 4) largest are omitted. The ends of the interval are
-    percentiles of the resampled means. The interval is None if no task has results of two seeds.
+    percentiles of the interquartile means of the bootstrap resamples. The interval is None if every task has the result
+    of only one seed.
 
     Args:
         tasks: results of the training runs on each task (scenario), one number per seed.
@@ -83,8 +84,8 @@ def mean_over_seeds(
 
     Args:
         values: result of the training run with each seed in each world, [seeds, worlds].
-        baseline: results to subtract, in the same worlds, [seeds, worlds]; the number of seeds may differ from the
-            number in ``values``.
+        baseline: results to subtract, in the same worlds as ``values``, [seeds, worlds]; the number of seeds may differ
+            from the number in ``values``.
         clusters: name of the cluster (recording) of each world, [worlds]; None: all worlds are independent.
         seed: seed of the bootstrap's random numbers.
 
@@ -111,16 +112,17 @@ def mean_over_seeds(
 def share_over_seeds(
     values: ArrayLike, worst: ArrayLike, best: ArrayLike, *, clusters: Texts | None = None, seed: int = 0
 ) -> Estimate | None:
-    """Return the share of the possible reduction: 0 for values as bad as ``worst``, 1 for values as good as ``best``.
+    """Return the share of the possible reduction: 0 if the mean harm is that of ``worst``, 1 if it is that of ``best``.
 
     The share is ``(mean(worst) - mean(values)) / (mean(worst) - mean(best))``, with a bootstrap interval as in
-    ``mean_over_seeds``. Returns None unless ``mean(best) < mean(worst)``. Also returns None unless, in more than 95 %
-    of the resamples, ``mean(worst) - mean(best)`` is above 0.1 % of this difference in the original data.
+    ``mean_over_seeds``. The result is None if ``mean(best) >= mean(worst)``. The result is also None if too many
+    bootstrap resamples have almost no possible reduction: if, in 5 % of the resamples or more,
+    ``mean(worst) - mean(best)`` is at most 0.1 % of its value in the original data.
 
     Args:
         values: harms of the training runs to judge, [seeds, worlds] (m2/s2).
-        worst: harms of the agent whose share is 0 by definition, in the same worlds, [seeds, worlds].
-        best: harms of the agent whose share is 1 by definition, in the same worlds, [seeds, worlds].
+        worst: harms of the agent whose share is 0 by definition, in the same worlds as ``values``, [seeds, worlds].
+        best: harms of the agent whose share is 1 by definition, in the same worlds as ``values``, [seeds, worlds].
         clusters: name of the cluster (recording) of each world, [worlds]; None: all worlds are independent.
         seed: seed of the bootstrap's random numbers.
 
@@ -163,10 +165,10 @@ def _resampled(
     """Return ``value`` with a bootstrap interval, or without an interval if there is only one world or cluster.
 
     Args:
-        value: the estimate.
-        sides: results to resample, each an array [seeds, worlds] in the same worlds.
-        of: function that computes a statistic from the resampled means [resamples, sides]. The ends of the interval are
-            percentiles of this statistic.
+        value: the estimate, computed from the original data.
+        sides: results to resample: arrays [seeds, worlds], all for the same worlds.
+        of: function that computes a statistic, one value per resample, from the mean of each of ``sides`` in each
+            resample, [resamples, number of sides]. The ends of the interval are percentiles of this statistic.
         clusters: name of the cluster (recording) of each world, [worlds]; None: all worlds are independent.
         seed: seed of the bootstrap's random numbers.
 
@@ -181,16 +183,16 @@ def _resampled(
 
 
 def _resample_means(sides: Sequence[Floats], cluster: Ints, resamples: int, seed: int) -> Floats:
-    """Return the mean of each side (array of results) in each bootstrap resample, [resamples, sides].
+    """Return the mean of each of ``sides`` in each bootstrap resample, [resamples, number of sides].
 
-    Seeds are resampled separately for each of ``sides``. Clusters of worlds are resampled once for all of them, and a
-    drawn cluster contributes all its worlds.
+    Seeds are resampled separately for each of ``sides``. Clusters of worlds are resampled once for all ``sides``
+    together, and a drawn cluster contributes all its worlds.
 
     Args:
-        sides: results to resample, each an array [seeds, worlds] in the same worlds.
-        cluster: number of each world's cluster, from 0, [worlds].
+        sides: results to resample: arrays [seeds, worlds], all for the same worlds.
+        cluster: number (from 0) of the cluster that each world belongs to, [worlds].
         resamples: number of bootstrap resamples.
-        seed: seed of the random numbers.
+        seed: seed of the bootstrap's random numbers.
 
     """
     worlds, number = len(cluster), int(cluster.max()) + 1

@@ -31,7 +31,7 @@ CHUNK = 500  # number of worlds simulated together, to limit memory; does not ch
 
 
 class VehicleRow(NamedTuple):
-    """Results of one vehicle of the line while the agent drives with a shield in step mode."""
+    """Results of one vehicle of the line in the worlds that the agent drove with a shield in step mode."""
 
     vehicle: str  # name of the vehicle, such as ``vehicle_2``
     replaced: float | None  # fraction of the vehicle's decisions that the shield replaced; None: it has no shield
@@ -94,8 +94,8 @@ class ShieldModes(list[ModeRow]):
         """Return the content of a results file of ``ethbrake shield``: one object per agent and mode.
 
         Args:
-            sample: the worlds that were passed to ``compare_modes``.
-            task: the task that was passed to ``compare_modes``.
+            sample: the evaluated worlds, which were passed to ``compare_modes``.
+            task: scenario, controlled vehicles and count of harm that were passed to ``compare_modes``.
 
         """
         left_out = [world for world, _ in self[0].left_out]
@@ -136,26 +136,27 @@ def compare_modes(
     clusters: Texts | None = None,
     on_progress: Callable[[str, int], None] | None = None,
 ) -> ShieldModes:
-    """Compare every agent in the same worlds: without a shield, with one in episode mode, and with one in step mode.
+    """Compare every agent in the same worlds: without a shield, and with a shield in episode mode and in step mode.
 
     Two variants of step mode are also compared. In ``step-alert`` the shield simulates the policy's rollout only at the
-    alert. In ``step-cap`` the shield limits each vehicle's harm (``cap="baseline"``). ``step-cap`` is for teams only,
-    which have no episode mode. For each decision that step mode replaced, the episode is simulated again; from this
-    decision on, the policy drives without a shield. If the simulation of a world fails with one agent, the world is
-    left out for all agents, and every row lists it in ``left_out``.
+    alert. In ``step-cap`` the shield limits each vehicle's harm (``cap="baseline"``). ``step-cap`` is compared for
+    teams only; episode mode is not available for teams. To judge each decision in which step mode replaced the policy's
+    action, the episode is simulated again, and from this decision on the policy drives without a shield. If the
+    simulation of a world fails with one agent, the world is left out for all agents, and every row lists it in
+    ``left_out``.
 
     Args:
         agents: agents or teams by name, without a shield. The objects that you pass do not change.
         worlds: worlds at the alert.
         task: the scenario, the controlled vehicles, and the count of harm that the shield bounds.
-        behind: whether ``agents`` already have shields. If they have, the policies of agents with a shield in episode
-            or step mode are compared, and all other agents are ignored. If no agent has such a shield, the result is
-            empty.
+        behind: whether ``agents`` already have shields. If ``behind`` is true, only agents with a shield in episode or
+            step mode are compared: their shields are removed, and their policies are used. If no agent has a shield in
+            one of these modes, the result is empty.
         clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
         on_progress: function that is called with an agent's name and the number of worlds that the agent has driven so
             far.
 
-    Raises ``InvalidInput`` if a shield refuses the scenario, ``PhysicsError`` if every world is left out.
+    Raises ``InvalidInput`` if a shield refuses the scenario, and ``PhysicsError`` if every world is left out.
 
     """
     if behind:
@@ -180,7 +181,9 @@ def compare_modes(
 
 
 class _Part(NamedTuple):
-    """Results of one chunk of worlds in one mode of the shield. Only step mode has ``shielded`` and ``verdicts``."""
+    """Results of an agent in some worlds in one mode; only step mode and its variants have ``shielded`` and
+    ``verdicts``.
+    """
 
     harm: Floats  # [n] harm of the line in each world (m2/s2)
     moving: int  # number of worlds in which a vehicle still moves at the horizon
@@ -195,9 +198,9 @@ def _compare(
     clusters: Texts | None,
     on_progress: Callable[[str, int], None] | None,
 ) -> list[ModeRow]:
-    """Return the result rows of all agents and modes; the arguments are the same as in ``compare_modes``.
+    """Return one row of results for each agent and mode; the arguments are the same as in ``compare_modes``.
 
-    Raises ``PhysicsError`` with the worlds whose simulation failed.
+    Raises ``PhysicsError``, which lists the worlds whose simulation failed.
     """
     rows = []
     for name, agent in agents.items():
@@ -214,7 +217,7 @@ def _compare(
 
 
 def _measured(worlds: Worlds, agent: Driver, task: Task) -> dict[Mode, _Part]:
-    """Let an agent or team drive one chunk of worlds in every mode of the shield, and return the results by mode."""
+    """Let an agent or team drive ``worlds`` once in every mode of the shield; return a dictionary: mode -> results."""
     several, parts = len(task.vehicles) > 1, {}
     alone: dict[Mode, Team] = {"none": Team.of(agent, task.vehicles)}
     if not several:
@@ -243,9 +246,9 @@ def _row(
     Args:
         agent: name of the agent.
         mode: the shield's mode.
-        parts: results of the agent in this mode, one entry for each chunk of worlds.
+        parts: results of the agent in ``mode``, one entry for each chunk of worlds.
         harm: mode of the shield -> harm of the agent in every world (m2/s2), [n]. The returned row also contains the
-            differences from the harm in other modes.
+            harm in ``mode`` minus the harm in episode mode, and minus the harm without a shield.
         task: the scenario, the controlled vehicles, and the count of harm that the shield bounds.
         clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
 

@@ -126,7 +126,7 @@ class Moments:
         """Return the moments of the differences ``value - other``, one difference per world.
 
         Args:
-            other: moments of the values to subtract, in the same worlds.
+            other: moments of the values to subtract, in the same worlds as the values of this object.
             products: exact sum over all worlds of ``value * other`` (``exact_sum``).
 
         """
@@ -166,14 +166,14 @@ class Moments:
 
     @property
     def share(self) -> Estimate:
-        """Mean p of values, each of which is 0 or 1, with Wilson's interval (``rate``).
+        """Mean p of values that are all 0 or 1, with Wilson's interval (``rate``).
 
-        With G clusters, Wilson's interval is computed for an effective number of independent draws: the number of
-        independent draws that would have the same standard error, ``1 + p (1 - p) / error ** 2``, but at most the
-        number of values. If all values are equal, this number is G. The number is then multiplied by ``(z / t) ** 2``,
-        with z and t the quantiles of the normal and the t distribution, because the standard error has G - 1 degrees of
-        freedom (Korn and Graubard 1998, "Confidence intervals for proportions with small expected number of positive
-        counts estimated from survey data", Survey Methodology 24). There is no interval for a single cluster.
+        With G clusters, Wilson's interval is computed for an effective number of independent draws, which would have
+        the same standard error: ``1 + p (1 - p) / error ** 2``, but at most the number of values. If all values are
+        equal, this effective number is G. The effective number is multiplied by ``(z / t) ** 2``, where z and t are the
+        quantiles of the normal and the t distribution, because the standard error has G - 1 degrees of freedom (Korn
+        and Graubard 1998, "Confidence intervals for proportions with small expected number of positive counts estimated
+        from survey data", Survey Methodology 24). If there is only one cluster, there is no interval.
         """
         if not self.clusters:
             return rate(int(self.total), self.count)
@@ -186,16 +186,17 @@ class Moments:
         return Estimate(p, wilson(p, draws * float(ndtri(_UPPER) / stdtrit(clusters - 1, _UPPER)) ** 2))
 
     def ratio_error(self, others: Moments, products: Fraction) -> float:
-        """Return the standard error of ``r = mean(values) / mean(others)``, paired by world, by the delta method.
+        """Return the standard error (delta method) of ``r = mean(values) / mean(others)``, with values paired by world.
 
-        The residuals ``values - r * others`` have mean 0, so the error is
-        ``std(residuals) / (sqrt(n) * abs(mean(others)))``. The square of the error is
+        The residuals ``values - r * others`` have mean 0, and so the standard error of r is
+        ``std(residuals) / (sqrt(n) * abs(mean(others)))``. The square of this standard error is
         ``n * (Qxx Sy^2 - 2 Sx Sy Qxy + Sx^2 Qyy) / ((n - 1) * Sy^4)``, where n is the number of values, x are the
-        values, y are the others, Sx and Sy are their sums, and Qxx, Qxy and Qyy are the sums of x x, x y and y y. With
-        clusters, n is the number of clusters, and x and y are the sums of values and others in each cluster.
+        ``values``, y are the ``others``, Sx and Sy are their sums, and Qxx, Qxy and Qyy are the sums of ``x^2``,
+        ``x y`` and ``y^2``. With clusters, n is the number of clusters, and x and y are the sums of ``values`` and
+        ``others`` in each cluster.
 
         Args:
-            others: moments of ``others``, the values in the denominator, in the same worlds.
+            others: moments of the values in the denominator, which belong to the same worlds as ``values``.
             products: exact sum over all worlds of the product ``value * other``.
 
         """
@@ -209,10 +210,10 @@ class Moments:
         return root(n * residuals / ((n - 1) * y**4))
 
     def decrease(self, baseline: Moments, products: Fraction) -> Estimate | None:
-        """Return ``1 - mean(values) / mean(baseline)`` with its interval; None if the baseline's mean is 0.
+        """Return ``1 - mean(values) / mean(baseline)`` with its interval; None if the mean of ``baseline`` is 0.
 
         Args:
-            baseline: moments of the baseline's values, in the same worlds.
+            baseline: moments of the baseline agent's values, which belong to the same worlds as ``values``.
             products: exact sum over all worlds of ``value * baseline``.
 
         """
@@ -238,8 +239,8 @@ def of_amounts(estimate: Estimate, *, nothing: bool) -> Estimate:
 
     Args:
         estimate: mean with an interval that may extend below 0.
-        nothing: whether all values are 0. In this case the result has no interval: zeros show that larger values are
-            rare, but not how large such values can be.
+        nothing: whether all averaged values are 0. If all are 0, the result has no interval, because zeros show that
+            larger values are rare, but not how large such values can be.
 
     """
     if nothing or estimate.interval is None:
@@ -316,11 +317,11 @@ def paired_difference(values: Floats, baseline: Floats, clusters: Texts | None =
     """Return the mean of ``values - baseline`` with its t interval.
 
     Args:
-        values: numbers from which the baseline is subtracted, one per world, [n].
-        baseline: numbers to subtract, in the same worlds, [n].
+        values: numbers from which ``baseline`` is subtracted, one per world, [n].
+        baseline: numbers to subtract, one for each of the same worlds, [n].
         clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
 
-    Raises ``InvalidInput`` if the lengths differ, or if an array is empty or not finite.
+    Raises ``InvalidInput`` if the arrays have different lengths, or if an array is empty or not finite.
 
     """
     data, reference, products = _check_pair(values, baseline, clusters)
@@ -330,16 +331,16 @@ def paired_difference(values: Floats, baseline: Floats, clusters: Texts | None =
 def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> Estimate:
     """Return the difference ``value - baseline`` of two means over n and m independent worlds, with Welch's interval.
 
-    The standard errors s1 and s2 of the two means are computed from their t intervals: each is half of the interval's
-    width, divided by the quantile of the t distribution. The difference has the standard error
+    The standard errors s1 and s2 of the two means are computed from their t intervals: each standard error is half of
+    the interval's width, divided by the quantile of the t distribution. The difference has the standard error
     ``s = sqrt(s1^2 + s2^2)``, with ``s^4 / (s1^4 / (n - 1) + s2^4 / (m - 1))`` degrees of freedom. If one of the two
     means has no interval, the difference has no interval either.
 
     Args:
-        value: mean from which the baseline is subtracted, with its interval.
-        n: number of worlds of ``value`` or, with clusters, number of their clusters.
-        baseline: mean to subtract, with its interval.
-        m: number of worlds of ``baseline`` or, with clusters, number of their clusters.
+        value: mean from which ``baseline`` is subtracted, with the interval of this mean.
+        n: number of worlds (with clusters: number of clusters) over which ``value`` is the mean.
+        baseline: mean to subtract, with the interval of this mean.
+        m: number of worlds (with clusters: number of clusters) over which ``baseline`` is the mean.
 
     """
     difference = value.value - baseline.value
@@ -362,12 +363,12 @@ def relative_decrease(values: Floats, baseline: Floats, clusters: Texts | None =
     """Return ``1 - mean(values) / mean(baseline)`` with its interval by the delta method (``Moments.ratio_error``).
 
     Args:
-        values: numbers to compare with the baseline, one per world, [n].
-        baseline: numbers of the baseline, in the same worlds, [n].
+        values: numbers of the agent to compare with the baseline agent, such as its harms, one per world, [n].
+        baseline: numbers of the baseline agent, one for each of the same worlds, [n].
         clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
 
-    Returns None if the baseline's mean is 0. Raises ``InvalidInput`` if the lengths differ, or if an array is empty or
-    not finite.
+    The result is None if the mean of ``baseline`` is 0. Raises ``InvalidInput`` if the arrays have different lengths,
+    or if an array is empty or not finite.
 
     """
     data, reference, products = _check_pair(values, baseline, clusters)
@@ -375,14 +376,14 @@ def relative_decrease(values: Floats, baseline: Floats, clusters: Texts | None =
 
 
 def check(values: ArrayLike, who: str = "statistics", each: str = "world") -> Floats:
-    """Check ``values``, and return them as an array of floats, [n].
+    """Check that ``values`` are one or more finite numbers, and return them as an array of floats, [n].
 
     Args:
-        values: the numbers.
+        values: the numbers to check.
         who: name of the calling function, for error messages.
         each: what each number belongs to (``world`` or ``seed``), for error messages.
 
-    Raises ``InvalidInput`` unless the array is one-dimensional, not empty and finite.
+    Raises ``InvalidInput`` if ``values`` is not one-dimensional, is empty, or contains a number that is not finite.
 
     """
     data = np.asarray(values, np.float64)

@@ -50,7 +50,7 @@ class SummaryTable(list[SummaryRow]):
 
     Args:
         rows: one row of results for each agent.
-        beside: rows from another source, to print below the agents; None: there are no such rows.
+        beside: rows from another source, to print below the rows of the agents; None: there are no such rows.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -99,7 +99,8 @@ class SummaryTable(list[SummaryRow]):
         """Return the table with all columns: agent, its knowledge, and every measure that has a heading.
 
         The columns of measures that the user registered come last. Means that are lower bounds of the true means
-        (``SummaryRow.bounds``) are marked ``≥``. Rows from other sources stand below the agents.
+        (``SummaryRow.bounds``) are marked ``≥``. Rows from other sources (``beside``) stand below the rows of the
+        agents.
         """
         columns = [each.column() for each in measures() if each.heading]
         columns += [Column(heading_of(name), COLUMN + name) for name in (self[0].metrics if self else ())]
@@ -231,7 +232,7 @@ def summarise_sums(
     """Return the results table, one row per agent, computed from sums of the measures over all worlds.
 
     Args:
-        tallies: name of an agent -> sums of its measures.
+        tallies: name of an agent -> sums of the agent's measures over all worlds.
         conditions: scenario, number and quantities of the worlds (``Conditions.of_test``).
         contexts: name of a set of measures -> information that the set computed once for these worlds
             (``contexts_of``).

@@ -86,7 +86,7 @@ class SummaryRow:
 
     @property
     def exploits(self) -> Exploits:
-        """Behaviour of the agent that harm does not count: shoving Vehicle 1, and moving at the horizon."""
+        """The agent's exploits, which harm does not count: shoving Vehicle 1, and still moving at the horizon."""
         shoved = self.estimates["vehicle_1_shoved_m"]
         return Exploits(None if shoved is None else shoved.value, self.horizon_ends / self.episodes)
 

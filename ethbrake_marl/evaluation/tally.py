@@ -1,4 +1,7 @@
-"""Sums of all agents' measures over a chunk of worlds. Sums of chunks can be added in any order."""
+"""For each agent, the sums of its measures over some of the worlds.
+
+Sums over different worlds can be added in any order.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,7 @@ Range = tuple[float, float]  # smallest and largest value
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """Sums of all agents' measures over some of the worlds. ``tally + other`` covers the worlds of both."""
+    """For each agent, the sums of its measures over some worlds. ``tally + other`` covers the worlds of both."""
 
     worlds: int = 0  # number of worlds, without left-out worlds
     hidden: int = 0  # number of worlds in which the V2X channel hides something from a controlled vehicle
@@ -37,12 +40,12 @@ class Tally:
 
     @classmethod
     def of(cls, part: Evaluation, objectives: Sequence[str] | None = None, *, long_list: bool = True) -> Tally:
-        """Return the sums of all agents' measures over the worlds of an evaluation.
+        """Return, for each agent, the sums of its measures over the worlds of an evaluation.
 
         Args:
-            part: evaluation of the agents in a chunk of worlds.
-            objectives: objectives such as ``"social:45"`` (docs/cooperation.md). If this is a list (an empty list is
-                enough), the result also has the sums of the harm that each vehicle bears, and of the value of each
+            part: evaluation of the agents in some consecutive worlds of the evaluation list.
+            objectives: objectives such as ``"social:45"`` (docs/cooperation.md). If ``objectives`` is a list, even an
+                empty list, the result also has the sums of the harm that each vehicle bears, and of the value of each
                 objective for each vehicle.
             long_list: whether to omit the sets of measures that do not apply to more than 100,000 worlds.
 
@@ -88,7 +91,7 @@ class Tally:
         """Return the mean value of each objective over the worlds, for every agent, vehicle and count of harm.
 
         Args:
-            objectives: objectives such as ``social:45``; the tally must have been computed with these objectives.
+            objectives: objectives such as ``social:45``; ``Tally.of`` must have been called with these objectives.
             vehicles: number of vehicles, N.
 
         """

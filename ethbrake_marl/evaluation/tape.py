@@ -26,12 +26,13 @@ class Tape:
         self._rows: list[ImpactRows] = []
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Record one step.
+        """Record one time step.
 
         Args:
             before: the worlds at the beginning of the step.
             command_mps2: commanded accelerations during the step (m/s2), [n, N].
-            until_s: time at which the step ends (s), [n]; in a world whose episode has ended, the end of the episode.
+            until_s: time since the alert at which the step ends (s), [n]; in a world whose episode has ended, the time
+                at which the episode ended.
 
         """
         moving = until_s > before.time_s
@@ -41,5 +42,5 @@ class Tape:
             self.steps.append((before, command_mps2, until_s))
 
     def episodes(self) -> EpisodeImpacts:
-        """Return all impacts so far, ordered by world and time, together with the worlds at the alert."""
+        """Return all recorded impacts, ordered by world and time, together with the worlds at the alert."""
         return EpisodeImpacts.of(self.worlds.take(np.arange(self.worlds.n)), self._rows)

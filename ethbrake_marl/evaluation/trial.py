@@ -34,8 +34,8 @@ def load_runnable(
     Args:
         name_or_path: name of a scenario, or path of its YAML file.
         settings: settings ``KEY=VALUE`` that override values of the file.
-        drives: number of learners that the scenario must have: exactly one (``one``), at least one (``some``), or any
-            number (``nobody``).
+        drives: how many learners the scenario must have: ``one`` (exactly one), ``some`` (at least one) or ``nobody``
+            (any number, because no agent is to drive).
 
     Raises ``InvalidInput`` if a script does not work (the message names file, line, vehicle and script), or if the
     number of learners does not fit ``drives``.
@@ -74,12 +74,12 @@ def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
     """Simulate ``worlds`` of a scenario, and count the worlds in which something unusual happens.
 
     Learners brake fully; the other vehicles follow their scripts. To save time, scripts that search for good commands
-    try only a few commands. The result has these keys:
+    try only a few commands. The result is a dictionary with these keys:
 
     - ``early_impacts``: number of worlds with an impact before a learner may act;
     - ``moving_at_horizon``: number of worlds in which a vehicle still moves at the horizon;
     - ``vehicle_1_late``: number of worlds in which Vehicle 1 has a latency;
-    - ``commands_out_of_range``: name of a vehicle -> row of a world in which its script commanded more than the
+    - ``commands_out_of_range``: name of a vehicle -> row number of a world in which its script commanded more than the
       vehicle's capacity -> error message;
     - ``not_state_free``: name of a vehicle -> its script, for scripts that react to the state of the world;
     - ``refused_by``: name of an agent, shield or setting that refuses scripts that react to the state of the world ->

@@ -41,8 +41,8 @@ def drawn_alike(worlds: Worlds, scenario: Scenario) -> dict[str, dict[str, Float
     The vehicles (or pairs) for which the scenario declares the same smallest and largest value form a group. The result
     maps the key of a quantity to a dictionary: name of a group -> values [n, number of vehicles or pairs]. An example
     is ``{"gaps_m": {"": values}, "mass_t": {"vehicle_2": values}}``. The name of a group lists its vehicles; it is ""
-    if the group contains all vehicles (or pairs) of the line. Values of a quantity come only from worlds that have this
-    quantity.
+    if the group contains all vehicles (or pairs) of the line. Worlds that lack a quantity (for instance the gap to an
+    obstacle) are omitted from its values.
     """
     of_quantities: dict[str, dict[str, Floats]] = {}
     for key, rule in QUANTITY.of(worlds).items():

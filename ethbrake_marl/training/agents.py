@@ -26,8 +26,8 @@ def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
         settings: the text that names the agent (spec), the path of its policy, and the scenario. The spec is the name
             of a shipped policy (``universal``), or contains the path of a run or a policy bundle (``ppo@PATH``).
 
-    Raises ``InvalidInput`` if another algorithm than the spec names trained the policy. Also raises the errors of
-    loading a policy.
+    Raises ``InvalidInput`` if the spec names another algorithm than the algorithm that trained the policy. Also raises
+    the errors of ``load_policy`` and ``load_team``.
 
     """
     spec, path = settings.spec, settings.policy

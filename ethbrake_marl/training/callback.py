@@ -55,8 +55,8 @@ class Watchers(NamedTuple):
 class RunCallback(BaseCallback):
     """Callback that measures policies, logs and writes checkpoints between two updates, and stops the run on request.
 
-    The callback works (``_between_updates``) before the first rollout, after each update, and at the end of the
-    training. To stop the training, the callback writes a checkpoint and raises ``StopRequested``.
+    The callback calls ``_between_updates`` before the first rollout, after each update, and at the end of the training.
+    To stop the training, the callback writes a checkpoint and raises ``StopRequested``.
 
     Args:
         run: folder of the run.
@@ -117,7 +117,8 @@ class RunCallback(BaseCallback):
             self._write_checkpoint()
 
     def _take_policies(self) -> None:
-        """Copy the current weights as policies into ``course``, unless it already has the weights of this update.
+        """Copy the current weights as policies into ``course``, unless ``course`` already has the weights of this
+        update.
 
         Raises ``TrainingDiverged`` if a weight is not finite.
         """

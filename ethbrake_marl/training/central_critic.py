@@ -28,11 +28,11 @@ class CentralCriticPolicy(ActorCriticPolicy):
 
 
 class _OwnPartForTheActor(MlpExtractor):
-    """Hidden layers of an actor that sees the first entries of an observation row, and of a critic that sees all.
+    """Hidden layers of an actor, which sees the first entries of an observation row, and of a critic, which sees all.
 
     Args:
-        own: number of entries of an observation row that the actor sees.
-        whole: number of all entries of an observation row.
+        own: number of entries at the beginning of an observation row that the actor sees.
+        whole: number of all entries of an observation row, which the critic sees.
         net_arch: sizes of the layers, as in Stable-Baselines3's ``ActorCriticPolicy``.
         activation_fn: activation function, as in Stable-Baselines3's ``ActorCriticPolicy``.
 

@@ -98,7 +98,7 @@ def read_checkpoint(folder: Path) -> TrainingState:
 
 
 def _digest(arrays: BufferedReader, numbers: Mapping[str, Any]) -> str:
-    """Return the SHA-256 (hexadecimal) of a checkpoint: its open file of arrays, followed by its numbers as JSON."""
+    """Return the SHA-256 (hexadecimal) of a checkpoint: the open file ``arrays``, followed by ``numbers`` as JSON."""
     digest = hashlib.file_digest(arrays, "sha256")
     digest.update(json.dumps(numbers, sort_keys=True).encode())
     return digest.hexdigest()
@@ -113,8 +113,8 @@ def checkpoint_folders(folder: Path) -> list[Path]:
 def newest_usable(folder: Path) -> tuple[TrainingState | None, list[str]]:
     """Read the newest undamaged checkpoint inside ``folder``, and delete newer checkpoints, which are damaged.
 
-    Returns the state (None if there is no undamaged checkpoint), and an error message for each damaged checkpoint.
-    Raises ``InvalidInput`` for a checkpoint of another format, which is not deleted.
+    Returns the state of the training run (None if there is no undamaged checkpoint), and an error message for each
+    damaged checkpoint. Raises ``InvalidInput`` for a checkpoint of another format, which is not deleted.
     """
     reasons: list[str] = []
     for path in checkpoint_folders(folder):

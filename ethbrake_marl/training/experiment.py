@@ -127,8 +127,8 @@ def run_experiment(
 
     Ctrl-C during the training stops the training after the current update, and the policy trained so far is evaluated.
     A second Ctrl-C, or Ctrl-C during the evaluation, raises ``KeyboardInterrupt``; the folder still contains the
-    policy. Some reports train further policies. Ctrl-C during this training stops it, and the report is written without
-    these policies (``ExperimentResult.interrupted``). ``run.json`` records how the run ended.
+    policy. Some reports train further policies. Ctrl-C while a report trains its policies stops their training, and the
+    report is written without these policies (``ExperimentResult.interrupted``). ``run.json`` records how the run ended.
 
     Args:
         scenario: scenario with at least one learner. Several learners are trained as a team, with the recipe's scheme.
@@ -256,7 +256,7 @@ def write_results(
 
 
 def results_csv(rows: Sequence[SummaryRow]) -> str:
-    """Return a results table as CSV text, with one line per agent.
+    """Return the results table ``rows`` as CSV text, with one line per agent.
 
     The columns ``x_low`` and ``x_high`` are the ends of the interval of column ``x``. A missing value is an empty
     field.
@@ -273,11 +273,11 @@ def results_csv(rows: Sequence[SummaryRow]) -> str:
 
 @contextmanager
 def _status(run: RunDirectory) -> Iterator[None]:
-    """Context manager for the evaluation of a run, which records the status of the run in ``run.json``.
+    """Context manager that records the status of a run in ``run.json`` while the run's policies are evaluated.
 
     The status is ``running`` during the evaluation. After an exception, the status is ``interrupted`` (Ctrl-C) or
-    ``failed``, and the error is recorded. The names of the new files are also recorded (``RunDirectory.WRITTEN``), so
-    that ``resume`` can delete these files.
+    ``failed``, and the error is recorded. The names of the files that the ``with`` block wrote are also recorded
+    (``RunDirectory.WRITTEN``), so that ``resume`` can delete these files.
     """
     _note(run, "running", "evaluation", None)
     before = {path.name for path in run.path.iterdir()}

@@ -41,7 +41,7 @@ def refuse_gradients(model: BaseAlgorithm, algorithm: Algorithm) -> None:
 
 
 def weights_are_finite(model: BaseAlgorithm, algorithm: Algorithm) -> bool:
-    """Return whether every weight of the model is finite, and the model's exploration noise is finite and positive.
+    """Return True if all weights of the model are finite and its exploration noise is finite and above 0.
 
     Args:
         model: the model.

@@ -90,7 +90,8 @@ def measure_team(training: Training, worlds: Worlds, team: Team) -> dict[str, fl
 def drive_list(worlds: Worlds, team: Team, scenario: Scenario) -> Iterator[Episodes]:
     """Let a team drive worlds from the alert, and yield the results of each chunk of 2,500 worlds.
 
-    Worlds whose simulation fails are left out. Raises ``PhysicsError`` if every world is left out.
+    The results do not contain worlds whose simulation fails. Raises ``PhysicsError`` if the simulation of every world
+    fails.
     """
     scripts = [script.name for script in script_agents(scenario, except_for=team.drivers).values()]
     failed: dict[int, str] = {}

@@ -1,8 +1,8 @@
 """Independent learners: one PPO per learner, with its own network and optimiser; all learners drive in the same worlds.
 
-The last entry of an observation row is the number of its learner (``make_sb3_vec_env(..., appended="number")``).
-Rollouts are collected for all learners together. Each learner then learns from the observation rows that have its
-number, with Stable-Baselines3's ``PPO.train``.
+The last entry of an observation row is the number of the learner that observes the row
+(``make_sb3_vec_env(..., appended="number")``). Rollouts are collected for all learners together. From these rollouts,
+each learner learns from the observation rows that have the learner's number, with Stable-Baselines3's ``PPO.train``.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class SeparatePolicies(BasePolicy):
         lr_schedule: learning rate as a function of the fraction of the training that remains.
         use_sde: whether to use state-dependent exploration.
         columns: for each learner, front to rear, the columns of an observation row that the learner observes.
-        network: other keyword arguments of ``ActorCriticPolicy``.
+        network: further keyword arguments of Stable-Baselines3's ``ActorCriticPolicy``, for each learner's policy.
 
     """
 
@@ -105,15 +105,15 @@ class IndependentPPO(PPO):
     """PPO with a separate policy for each learner; all learners drive in the same worlds.
 
     If ``turns`` is None, all learners learn in every update. If ``turns`` is a number, only one learner learns at a
-    time, and the other learners take their mean actions. The learner changes from turn to turn, and all turns have
-    about the same number of updates. The columns of the log have names such as ``vehicle_2/loss``.
+    time, and the other learners take their mean actions. The learner that learns changes from turn to turn, and all
+    turns have about the same number of updates. The columns of the log have names such as ``vehicle_2/loss``.
 
     Args:
         env: vectorised environment in which the last entry of an observation row is the number of the learner.
         names: names of the learners, front to rear.
         turns: number of turns of each learner during the training; None: all learners learn in every update.
         columns: for each learner, front to rear, the columns of an observation row that the learner observes.
-        settings: other keyword arguments of ``PPO``.
+        settings: further keyword arguments of Stable-Baselines3's ``PPO``.
 
     """
 
@@ -132,7 +132,7 @@ class IndependentPPO(PPO):
     ) -> bool:
         """Collect rollouts as PPO does; only learners that learn in the next update explore.
 
-        The arguments are the same as in the method of Stable-Baselines3's ``PPO``. Returns False if the callback
+        The arguments are the same as in Stable-Baselines3's ``PPO.collect_rollouts``. Returns False if the callback
         stopped the training.
         """
         everyone = range(len(self.names))

@@ -111,7 +111,7 @@ def _restore_weights(model: Model, algorithm: Algorithm, rates: Mapping[str, flo
 def _captured_rows(model: Model) -> Arrays:
     """Return the latest observation of every learner, and the returns and lengths of the latest episodes.
 
-    Stable-Baselines3 needs these arrays to continue the rollouts and to log mean returns.
+    Stable-Baselines3 needs the observations to continue the rollouts, and the returns and lengths to log their means.
     """
     observations: Any = model._last_obs
     episodes = list(model.ep_info_buffer or ())
@@ -135,7 +135,7 @@ def _restore_rows(model: Model, arrays: Arrays) -> None:
 
 
 def _captured_log(model: Model) -> dict[str, list[Any]]:
-    """Return the values recorded for the next row of the log: name of a column -> [value, count, excluded formats]."""
+    """Return what the logger has for the next row: name of a column -> [value, count, formats that omit the column]."""
     log, pending = model.logger, {}
     for name, value in log.name_to_value.items():
         number = value.item() if isinstance(value, np.generic | torch.Tensor) else value
@@ -158,7 +158,7 @@ def _restore_replay(memory: Any, place: Any, arrays: Arrays) -> None:
         place: captured pair (position of the buffer's next entry, whether the buffer is full).
         arrays: captured arrays by name; the names of the buffer's arrays begin with ``replay.``.
 
-    Raises ``ValueError`` if the position is invalid, or if an array does not fit the buffer.
+    Raises ``ValueError`` if the position in ``place`` is invalid, or if an array does not fit the buffer.
 
     """
     position, full = place
@@ -174,7 +174,7 @@ def _restore_replay(memory: Any, place: Any, arrays: Arrays) -> None:
 
 
 def _try_step(optimizer: torch.optim.Optimizer) -> None:
-    """Take a step with a copy of ``optimizer``; torch raises an error if the state does not fit the weights."""
+    """Take a step with a copy of ``optimizer``; torch raises an error if the optimiser does not fit the weights."""
     tried = copy.deepcopy(optimizer)
     for group in tried.param_groups:
         for weights in group["params"]:
@@ -188,7 +188,7 @@ def check_counter(name: str, value: object, kind: type) -> None:
     Args:
         name: name of the counter, for the error message.
         value: the counter's value.
-        kind: required type. If this type is ``int``, the value must be from 0 to 2^53 - 1.
+        kind: required type of ``value``. If ``kind`` is ``int``, the value must be from 0 to 2^53 - 1.
 
     """
     if type(value) is not kind or (kind is int and not 0 <= value < 1 << 53):  # type: ignore[operator]  # an int
@@ -197,7 +197,7 @@ def check_counter(name: str, value: object, kind: type) -> None:
 
 
 def _like(model: NDArray[Any], arrays: Arrays, name: str) -> NDArray[Any]:
-    """Return ``arrays[name]``; raise ``ValueError`` unless it is finite, with shape and type of the array ``model``."""
+    """Return ``arrays[name]``; raise ``ValueError`` if it is not finite, or if shape or type differ from ``model``."""
     array = arrays[name]
     if (array.shape, array.dtype) != (model.shape, model.dtype) or not np.isfinite(array).all():
         raise ValueError(f"{name}: must be finite numbers of type {model.dtype} and shape {model.shape}")

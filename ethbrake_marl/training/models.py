@@ -22,7 +22,7 @@ Model = BaseAlgorithm  # a model of Stable-Baselines3
 
 
 class Learner(NamedTuple):
-    """A model that learns, with its learning algorithm, and the recipe and scenario of the training."""
+    """A model that learns, the learning algorithm of the model, and the recipe and scenario of the training."""
 
     training: Training  # recipe and scenario
     algorithm: Algorithm  # algorithm of the model, which reads its policies, optimisers and other learned tensors

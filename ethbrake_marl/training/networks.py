@@ -29,7 +29,7 @@ def tensors_of(policy: BasePolicy, spec: NetworkSpec) -> dict[str, Float32s]:
 def sb3_names(spec: NetworkSpec) -> dict[str, str]:
     """Return the names of a network's tensors: name in a policy bundle -> name in Stable-Baselines3's policy.
 
-    ``spec`` describes the network. If ``spec.output`` is ``clip``, the network belongs to PPO, else to SAC.
+    ``spec`` describes the network. The network belongs to PPO if ``spec.output`` is ``clip``, and to SAC if not.
     Stable-Baselines3 also numbers the activations, so hidden layer k of a bundle has the number 2 k in
     Stable-Baselines3.
     """
@@ -52,8 +52,8 @@ def tensors_of_layers(name: str, layers: nn.Sequential) -> dict[str, Float32s]:
     """Return a copy of a perceptron's weights: name of a tensor in a policy bundle -> its values.
 
     Args:
-        name: name of the network in the bundle, such as ``policy`` or ``gate``. The names of all tensors begin with
-            this name.
+        name: name of the network in the bundle, such as ``policy`` or ``gate``. The names of all returned tensors begin
+            with ``name``.
         layers: linear layers, possibly with activations between them. The last linear layer is the output.
 
     """

@@ -58,7 +58,7 @@ class Ppo(Algorithm):
         return tuple(model.policy.policies) if isinstance(model, IndependentPPO) else (model.policy,)
 
     def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:
-        """Return the optimiser under the name ``policy``; for independent learners, return one per vehicle's name."""
+        """Return the optimiser as ``policy``, or the optimisers of independent learners by the vehicle's name."""
         if isinstance(model, IndependentPPO):
             return dict(zip(model.names, (member.optimizer for member in model.policy.policies), strict=True))
         return {"policy": model.policy.optimizer}

@@ -22,7 +22,7 @@ class Course:
 
     The best policy is the policy with the smallest mean of the learners' objectives on the fixed list of worlds. If all
     learners have the harm of the line as objective, the best policy is the policy with the least harm of the line
-    (``harm_count`` says which impacts count). Without evaluations there is no best policy.
+    (``harm_count`` says which impacts count). Before the first evaluation there is no best policy.
     """
 
     harm_count: HarmCount = "first"  # count of harm by which the best policy is chosen
@@ -65,7 +65,7 @@ class Course:
             self.best, self.best_harm = policy, metrics[name]
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of this object except the policies as plain data for JSON, for ``restore``."""
+        """Return everything in this object except the policies, as plain data for JSON, which ``restore`` reads."""
         return {
             "evaluations": self.evaluations,
             "best_harm": None if math.isinf(self.best_harm) else self.best_harm,
@@ -75,7 +75,7 @@ class Course:
         }
 
     def restore(self, content: Mapping[str, Any]) -> None:
-        """Restore the values that ``to_json`` returned (everything except the policies) from ``content``."""
+        """Set everything in this object except the policies to the values in ``content``, a result of ``to_json``."""
         self.evaluations = [dict(entry) for entry in content["evaluations"]]
         self.best_harm = math.inf if content["best_harm"] is None else float(content["best_harm"])
         self.wall_before_s = float(content["wall_s"])

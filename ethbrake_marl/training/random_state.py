@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 @contextmanager
 def own_random_state() -> Iterator[None]:
-    """Context manager that restores the global random generators of Python, NumPy and torch at its end.
+    """Context manager that restores the states of the global random generators (Python, NumPy, torch) at its end.
 
     Inside the ``with`` block, torch uses one thread. Our networks are so small that a second thread makes training 3 to
     15 times slower if another process uses the processor cores.
@@ -53,8 +53,9 @@ def restore_generators(numbers: Mapping[str, Any], arrays: Mapping[str, NDArray[
     """Set the global random generators to the states that ``capture_generators`` returned.
 
     Args:
-        numbers: first dictionary that ``capture_generators`` returned.
-        arrays: second dictionary that ``capture_generators`` returned; other arrays in it are ignored.
+        numbers: plain data that ``capture_generators`` returned (the first of the two dictionaries).
+        arrays: dictionary that contains the arrays that ``capture_generators`` returned; other arrays in it are
+            ignored.
 
     """
     position, has_gauss, cached = numbers["numpy"]

@@ -72,7 +72,8 @@ class Shape(FileModel):
 
         Args:
             observation_size: number of features of an observation.
-            more: fields of ``NetworkSpec`` whose values differ from those of such an actor.
+            more: fields of the returned ``NetworkSpec`` that get other values than by default, such as
+                ``output="tanh"``.
 
         """
         shape: Any = self  # subclasses declare the fields
@@ -200,7 +201,10 @@ class TrainingRecipe(FileModel):
         return 1
 
     def check_learners(self, learners: int) -> None:
-        """Raise ``InvalidInput`` if the recipe does not fit the number of learners. By default, every number fits."""
+        """Raise ``InvalidInput`` if the recipe does not fit the number of learners.
+
+        The base class accepts every number of learners.
+        """
 
     def begins(self, scenario: Scenario) -> str | None:
         """Return a description of the initial weights for a scenario, or None if the initial weights are random."""
@@ -368,7 +372,7 @@ class TrainingRecipe(FileModel):
 
 
 def key_meanings(recipe: type[TrainingRecipe]) -> dict[str, str]:
-    """Return the description of every key that recipes of this class have, by key.
+    """Return a dictionary: key of the recipes of class ``recipe`` -> description of the key.
 
     If a class declares a key without a description, the description in its base class is used.
     """

@@ -95,7 +95,8 @@ class SquashedShape(Shape):
 class SacRecipe(TrainingRecipe):
     """Recipe of SAC, which learns from a replay buffer.
 
-    An update adds ``steps_per_update`` decisions of every learner to the buffer, and learns from decisions in it.
+    An update adds ``steps_per_update`` decisions of every learner to the buffer, and learns from decisions that it
+    draws from the buffer.
     """
 
     algorithm: Literal["sac"]

@@ -141,8 +141,8 @@ class RunDirectory:
     def chosen_by(cls, evaluations: Sequence[Mapping[str, Any]], harm_count: HarmCount, prefix: str = "") -> str:
         """Return the name of the metric that is smallest for the best policy.
 
-        The metric is ``objective`` if every evaluation has an entry ``objective``, otherwise the harm of the line
-        (``first_impact_harm`` or ``total_harm``, as ``harm_count`` says).
+        The metric is ``objective`` if every evaluation has an entry ``objective``. If not, the metric is the harm of
+        the line (``first_impact_harm`` or ``total_harm``, as ``harm_count`` says).
 
         Args:
             evaluations: evaluations of a training run (``TrainResult.evaluations``), or rows of ``progress.csv``.
@@ -161,7 +161,7 @@ class RunDirectory:
         return list(csv.DictReader(self.progress.read_text("utf-8").splitlines()))
 
     def cpu_s(self) -> dict[int, float]:
-        """Return the processor time of learning (s) up to each evaluation, by the number of decisions so far.
+        """Return a dictionary: number of decisions before an evaluation -> processor time of learning until then (s).
 
         Raises ``InvalidInput`` if ``run.json`` does not record the processor time.
         """

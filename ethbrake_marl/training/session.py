@@ -161,14 +161,14 @@ def resume(
     """Continue a training run that was stopped or killed. The policies are exactly the same as without the stop.
 
     The training continues from the newest undamaged checkpoint, or from the beginning if there is no such checkpoint.
-    Log rows that were written after this checkpoint are dropped. Results and reports that ``ethbrake run`` wrote about
-    the earlier policy are deleted.
+    Log rows that were written after this checkpoint are dropped. Earlier results and reports of ``ethbrake run`` are
+    deleted.
 
     Args:
         directory: the folder of the run.
         measure: the same argument as in ``train``.
-        stop_at: the same argument as in ``train``. Evaluations that were made before the stop are not passed to it
-            again.
+        stop_at: the same argument as in ``train``. Evaluations that were made before the stop are not passed to
+            ``stop_at`` again.
         on_progress: the same argument as in ``train``.
         other_versions: whether to accept a checkpoint that other versions of packages wrote. The resulting policies may
             then differ from the policies of an uninterrupted training.
@@ -196,7 +196,7 @@ def build(
     """Context manager that builds environment and model of a training run, and yields the callback to pass to
     ``learn``.
 
-    Inside the ``with`` block, Ctrl-C stops the training after the current update. At the end of the block, the
+    Inside the ``with`` block, Ctrl-C stops the training after the current update. At the end of the ``with`` block, the
     environment is closed, and the global random generators are restored.
 
     Args:
@@ -222,7 +222,7 @@ def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[st
     Args:
         callback: callback from ``build``, which contains the model and measures the model's policies during the
             training.
-        state: checkpoint from which the training continues; None: the training begins from the start.
+        state: checkpoint from which the training continues; None: a new training begins.
         notes: messages for the user, passed to ``on_progress`` when the training begins.
 
     """
@@ -273,7 +273,7 @@ def save(callback: RunCallback, status: RunStatus, reason: str | None) -> None:
     The checkpoints of a finished run are deleted.
 
     Args:
-        callback: callback of the training, which contains these policies.
+        callback: callback of the training run, which contains the best and the last policy.
         status: how the run ended.
         reason: why the run was interrupted or failed; None: there is no reason to record.
 
@@ -316,7 +316,7 @@ def _newest_checkpoint(
     """Return the newest undamaged checkpoint (or None), and error messages about damaged newer checkpoints.
 
     Raises ``InvalidInput`` if the checkpoint belongs to another training, or if other versions of packages wrote it
-    (unless ``other_versions``).
+    (unless ``other_versions`` is true).
     """
     remove_unfinished(run.path)
     if run.checkpoints.is_dir():

@@ -57,8 +57,8 @@ def read_settings(
 
     Args:
         texts: settings ``KEY=VALUE`` as the user wrote them; None: there are no settings.
-        recipes: recipes that the command uses; their keys may be set.
-        of_agents: names of agents' settings that the command allows, such as ``harm_count``.
+        recipes: recipes that the command uses; ``texts`` may set keys of these recipes.
+        of_agents: names of the settings of agents that the command allows, such as ``harm_count``.
 
     Raises ``UnknownName`` for an unknown key, and ``InvalidInput`` for an ambiguous key or an invalid value.
 

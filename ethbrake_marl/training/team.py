@@ -1,4 +1,4 @@
-"""Load the learners of a run as a team; ``team.json`` says which policy drives which vehicle."""
+"""Load the policies of a run as a team; ``team.json`` in the run's folder says which policy drives which vehicle."""
 
 from __future__ import annotations
 
@@ -93,8 +93,8 @@ def load_team(
         folder: folder of the run.
         scenario: scenario to drive in, or its name or path.
         name: name of the team.
-        vehicles: indices (0 = front) of the vehicles to drive; None: the scenario's learners. Other learners of the run
-            are omitted.
+        vehicles: indices (0 = front) of the vehicles to drive; None: the scenario's learners. The team omits other
+            learners of the run.
 
     Raises ``InvalidInput`` if the folder has no ``team.json``, if the team is for a line of another length, or if the
     team has no policy for one of the vehicles. Raises ``CorruptBundle`` if ``team.json`` is damaged.

@@ -94,7 +94,7 @@ class Training:
 
     @staticmethod
     def identity_of(content: Mapping[str, Any]) -> str:
-        """Return the SHA-256 of ``content``, a result of ``content()``, in hexadecimal digits."""
+        """Return the SHA-256 of ``content``, a result of the method ``content``, in hexadecimal digits."""
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def config(self, settings: Sequence[str] = ()) -> dict[str, Any]:
