@@ -65,12 +65,12 @@ def drive_before_braking(
     """Return how long a vehicle can drive before it must brake fully to stay behind the leader.
 
     While it drives, the vehicle has the constant acceleration ``u >= 0``. The leader is the vehicle in front; it brakes
-    from now on. Requires ``spare_gap >= 0``.
+    from now on. The function requires ``spare_gap >= 0``: full braking from now on avoids an overlap with the leader.
 
     The results are the duration of the drive (s), the time at which the gap becomes 0 (s), and whether both vehicles
     still move at that time. If both vehicles still move when the gap becomes 0, then ``a_f > a_l`` and both have the
-    same speed. If not, the follower comes to rest behind the leader, which is already at rest. The duration and the
-    time are infinite if the follower never moves.
+    same speed. If they do not both move at that time, the follower comes to rest behind the leader, which is already at
+    rest. The duration and the time are infinite if the follower never moves.
 
     Args:
         gap: gap to the leader, m.
@@ -107,7 +107,7 @@ def largest_behind(
 ) -> tuple[float, float, bool]:
     """Return how long a vehicle with a speed limit can drive before it must brake fully to stay behind the leader.
 
-    The leader is the vehicle in front; it brakes from now on. The second and third result are the time at which the gap
+    The leader is the vehicle in front; it brakes from now on. The function also returns the time at which the gap
     becomes 0 (s), and whether both vehicles still move at that time.
 
     Args:
@@ -354,11 +354,13 @@ class Avoidability:
     stays behind the front vehicle. ``margin_m`` is the smallest gap between the largest trajectory and the rear
     vehicle. If the controlled vehicle has no rear vehicle, ``margin_m`` is the part of the gap to the front vehicle
     that remains under full braking. ``margin_m`` is negative if contact is unavoidable. If the reason is *front*,
-    ``margin_m`` is minus the missing gap; if the reason is *early*, minus the overlap before the vehicle may act.
+    ``margin_m`` is minus the missing gap; if the reason is *early*, ``margin_m`` is minus the overlap before the
+    vehicle may act.
 
     ``switch_s`` and ``command_mps2`` are times and commands that show how to avoid contact: in a simulation they cause
     no impact. Each command applies from its time (s after the alert) until the time of the next command. An infinite
-    time means that the command never applies. Both arrays are NaN in worlds where contact is unavoidable.
+    time means that the command never applies. ``switch_s`` and ``command_mps2`` are NaN in worlds where contact is
+    unavoidable.
     """
 
     # [n] 0: contact is avoidable. 1, early: a pair has contact before the controlled vehicle may act. 2, front: even
@@ -370,7 +372,7 @@ class Avoidability:
 
     @property
     def avoidable(self) -> Bools:
-        """Worlds in which some commands avoid all contact, and so every impact: boolean mask, [n]."""
+        """Boolean mask [n]: True for worlds in which some commands avoid all contact, and therefore every impact."""
         return np.asarray(self.reason == 0, np.bool_)
 
     @property
@@ -394,7 +396,7 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
             ``Scenario.roles``. The only script allowed is full_brake. If ``scripts`` is None, all vehicles that are not
             controlled brake fully.
 
-    Raises ``InvalidInput`` for any other line and any other script. The function also raises ``InvalidInput`` if the
+    Raises ``InvalidInput`` for lines and scripts that are not allowed. The function also raises ``InvalidInput`` if the
     front vehicle may brake only after the controlled vehicle may act, if a vehicle moves backward, or if vehicle_1
     could reach an obstacle (``obstacle_gap_m``) before any contact.
 

@@ -27,8 +27,8 @@ _GUARD = 2.0**-46  # largest relative rounding error of positions; closing speed
 
 @compiled(apart=True)
 def gentlest_front(at: Floats, time: float) -> tuple[float, float]:
-    """Return the smallest closing speed (m/s) of a contact with the front vehicle at ``time``, and the duration of the
-    drive before it (s).
+    """Return the smallest closing speed (m/s) of a contact with the front vehicle at ``time``, and how long (s) the
+    controlled vehicle drives before it brakes.
 
     The controlled vehicle reaches the place of the contact at ``time`` with the smallest possible speed if it drives
     first and then brakes.
@@ -102,8 +102,8 @@ def braking_to_rear(at: Floats, time: float, further: float) -> float:
 
 @compiled(apart=True)
 def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
-    """Return the smallest closing speed (m/s) of a contact with the rear vehicle at ``time``, and the duration of the
-    braking before it (s).
+    """Return the smallest closing speed (m/s) of a contact with the rear vehicle at ``time``, and how long (s) the
+    controlled vehicle brakes before it drives.
 
     The controlled vehicle reaches the place of the contact at ``time`` with the largest possible speed if it brakes
     first and then drives. The duration of the braking is returned as infinite if the vehicle reaches its speed limit by
@@ -124,7 +124,7 @@ def gentlest(kind: int, at: Floats, time: float) -> tuple[float, float]:
     """Return the smallest closing speed (m/s) of a first contact at ``time``, and how long (s) the controlled vehicle
     drives or brakes first.
 
-    With brake build-up this duration is returned as 0.
+    With brake build-up, the duration of this driving or braking is returned as 0.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake

@@ -41,8 +41,8 @@ def all_three(at: Floats) -> tuple[float, float, float, float]:
     (m/s2).
 
     Masses are in units of the controlled vehicle's mass. The third result is the largest deceleration of the centre of
-    mass before the rear vehicle brakes. The fourth result is the additional deceleration of this centre of mass by the
-    rear vehicle's brakes.
+    mass before the rear vehicle brakes. The fourth result is the additional deceleration of this centre of mass that
+    the rear vehicle's brakes cause.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -114,7 +114,7 @@ def slowest(at: Floats, early: float, late: float, faster: float) -> tuple[float
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         faster: speed of the vehicle minus speed of the front vehicle after the first contact, m/s.
 
     """
@@ -164,7 +164,7 @@ def stopped_there(
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         hard: largest closing speed that the first contact may have, m/s.
         beyond: squared speed at which the front vehicle hits the obstacle, m2/s2.
         struck: time at which the front vehicle hits the obstacle, s.
@@ -211,7 +211,7 @@ def behind_leader(
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         soft: smallest closing speed that the first contact may have, m/s.
         hard: largest closing speed that the first contact may have, m/s.
         beyond: largest squared speed at which the front vehicle hits the obstacle, m2/s2.
@@ -295,7 +295,7 @@ def after_at_obstacle(
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         soft: smallest closing speed that the first contact may have, m/s.
         hard: largest closing speed that the first contact may have, m/s.
         follows: known lower bound on the harm of the rear pair, m2/s2.
@@ -339,7 +339,7 @@ def beyond_rear(
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         closing: largest closing speed that the first contact may have, m/s.
         least: lower bound on the result that is known already, m2/s2; the result is at least ``least``.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
@@ -367,11 +367,11 @@ def after_rear(
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         closing: largest closing speed that the first contact may have, m/s.
         end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
-        lack: smallest possible difference between the command up to ``end`` and the best command after the contact,
-            m/s2.
+        lack: smallest possible difference between the command that applies until ``end`` and the best command after the
+            first contact, m/s2.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
@@ -404,7 +404,8 @@ def after(
     kind: int, at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats,
     other: Floats,
 ) -> float:  # fmt: skip
-    """Return the smallest harm (m2/s2) at the other pair (and at an obstacle) after a first contact with one neighbour.
+    """Return the smallest harm (m2/s2) with the second neighbour (and at an obstacle) after a first contact with the
+    other.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
@@ -412,11 +413,11 @@ def after(
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         closing: largest closing speed that the first contact may have, m/s.
         end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
-        lack: smallest possible difference between the command up to ``end`` and the best command after the contact,
-            m/s2.
+        lack: smallest possible difference between the command that applies until ``end`` and the best command after the
+            first contact, m/s2.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan`` (with brake build-up from
             ``empty_legs``); overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.

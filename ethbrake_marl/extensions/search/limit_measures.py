@@ -196,7 +196,7 @@ def _unavoidable(row: SummaryRow) -> str:
 def _best(row: SummaryRow, first: float, total: float) -> str:
     """Return a sentence with the best known harm, the proven bound, and the difference between them.
 
-    ``first`` and ``total`` are the means of the best known harm under the two counts, m2/s2.
+    ``first`` is the mean best known first-impact harm, and ``total`` is the mean best known total harm, m2/s2.
     """
     least = 0.0 if row["proven_harm"] is None else row["proven_harm"].value
     gaps = [

@@ -42,7 +42,8 @@ class BestHarm:
     unknown. ``begin`` raises ``InvalidInput`` if the command of another vehicle's script is not fixed at the alert.
 
     Args:
-        recall: function that returns the stored profile of each world, and a mask of the worlds that have one.
+        recall: function that returns the stored profile of each world, and a mask: True for worlds that have a stored
+            profile.
         scenario: scenario of the worlds; the agent minimises the scenario's objective. None: the agent minimises the
             harm of the line, and does not search a second time.
         harm_count: harm count to minimise, ``first`` or ``total``.
@@ -80,7 +81,8 @@ class BestHarm:
         Args:
             argument: number of profiles that a search simulates, as text; None: ``PROFILE_BUDGET``.
             settings: scenario, harm count to minimise and other settings of agents.
-            recall: function that returns the stored profile of each world, and a mask of the worlds that have one.
+            recall: function that returns the stored profile of each world, and a mask: True for worlds that have a
+                stored profile.
 
         """
         budget = PROFILE_BUDGET if argument is None else budget_of(argument)
@@ -101,7 +103,7 @@ class BestHarm:
         Args:
             alert: the worlds at the alert, [n].
             vehicle: index of the controlled vehicle.
-            scripts: scripts of the other vehicles, by index.
+            scripts: maps the index of each other vehicle to its script.
 
         """
         others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)
