@@ -136,15 +136,16 @@ def largest_behind(
 def lowest_while_coasting(gap: float, v_f: float, v_r: float, a_r: float, onset_r: float, until: float) -> float:
     """Return the smallest gap (m), until the time ``until``, between a coasting vehicle and the vehicle behind it.
 
-    The gap is a convex function of time, so it is smallest when both speeds are equal, or at one end of the interval.
+    The gap is a convex function of time. Therefore it is smallest when both vehicles have the same speed, or at the
+    start or end of the coasting.
 
     Args:
-        gap: gap now, m.
+        gap: present gap between the two vehicles, m.
         v_f: speed of the coasting vehicle, m/s.
         v_r: speed of the vehicle behind, m/s.
         a_r: braking capacity of the vehicle behind, m/s2.
         onset_r: time from which on the vehicle behind brakes, s.
-        until: end of the coasting, s.
+        until: time until which the vehicle in front coasts, s.
 
     """
     w = v_r - v_f
@@ -172,7 +173,7 @@ def leader_at_onset(
     a concave function of time: if it is not negative at ``start``, it was not negative before.
 
     Args:
-        gap: gap now, m.
+        gap: present gap between the two vehicles, m.
         v_l: speed of the leader (front vehicle), m/s.
         a_l: braking capacity of the leader, m/s2.
         onset_l: time from which on the leader brakes, s.
@@ -377,7 +378,7 @@ class Avoidability:
 
     @property
     def reason_name(self) -> NDArray[np.str_]:
-        """Name of the reason in each world, [n]: "" if contact is avoidable, else "early", "front" or "rear"."""
+        """Reason why contact is unavoidable, [n]: "early", "front" or "rear"; "" if contact is avoidable."""
         return np.array(REASONS)[self.reason]
 
 

@@ -196,7 +196,7 @@ def drop_first(heap: Floats, count: int) -> int:
 
     Args:
         heap: binary heap with one row for each cell (range of first contacts); changed in place.
-        count: number of cells before the removal.
+        count: number of cells (ranges of first contacts) on the heap before the removal.
 
     """
     count -= 1
@@ -228,7 +228,7 @@ def divide(
             build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         floor: known lower bound on the harm of the other pair (the pair that does not have the first contact), m2/s2.
-        count: number of cells on the heap.
+        count: number of cells (ranges of first contacts) on the heap.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan`` (with brake build-up from
             ``empty_legs``); overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.

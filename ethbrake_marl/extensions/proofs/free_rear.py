@@ -171,7 +171,7 @@ def put_behind(
         search: four numbers that the search needs, [SEARCH]. ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of the
             function ``gained``. ``FLOOR`` is the lower bound on the harm of the front pair alone (m2/s2). ``BEST`` is
             the smallest harm that the search has reached so far (m2/s2).
-        count: number of cells on the heap.
+        count: number of cells (ranges of first contacts) on the heap.
         moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
@@ -243,7 +243,7 @@ def divide_behind(
             function ``gained``. ``FLOOR`` is the lower bound on the harm of the front pair alone (m2/s2). ``BEST`` is
             the smallest harm that the search has reached so far (m2/s2). The function lowers ``BEST`` if it reaches a
             smaller harm.
-        count: number of cells on the heap.
+        count: number of cells (ranges of first contacts) on the heap.
         moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.

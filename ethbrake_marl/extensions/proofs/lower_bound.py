@@ -106,8 +106,8 @@ def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, o
 
     The function finds this time by bisection: the later the first contact, the nearer is the other neighbour. For a
     later contact with the front vehicle the controlled vehicle drives for a shorter time, so the rear vehicle comes
-    nearer. For a later contact with the rear vehicle the controlled vehicle brakes for a shorter time, so it comes
-    nearer to the front vehicle.
+    nearer. For a later contact with the rear vehicle the controlled vehicle brakes for a shorter time, so the
+    controlled vehicle comes nearer to the front vehicle.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST``.
@@ -288,8 +288,9 @@ def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
     """Return a time (s) after which no first contact with the rear vehicle is possible.
 
     Until its first contact, the rear vehicle passes neither the front vehicle nor the controlled vehicle. Suppose that
-    the rear vehicle brakes harder than the controlled vehicle, by b (m/s2). Then t seconds before the contact the rear
-    vehicle was faster than the controlled vehicle by at least ``b t`` (m/s), if it already braked at that time.
+    the rear vehicle brakes harder than the controlled vehicle, by b (m/s2). In this case, t seconds before the contact,
+    the rear vehicle was faster than the controlled vehicle by at least ``b t`` (m/s), if the rear vehicle already
+    braked at that time.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.

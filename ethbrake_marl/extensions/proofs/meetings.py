@@ -86,7 +86,7 @@ def braking_to_rear(at: Floats, time: float, further: float) -> float:
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         time: time of the contact, in s from the moment at which the controlled vehicle may act.
-        further: distance by which the rear vehicle is farther ahead than under full braking, m.
+        further: distance by which the rear vehicle is farther ahead than if it braked fully, m.
 
     """
     place = follower(at, time)[1] - at[LINE.GAP_R] + further

@@ -105,7 +105,8 @@ def least_beyond(
 
 @compiled(apart=True)
 def slowest(at: Floats, early: float, late: float, faster: float) -> tuple[float, float, float]:
-    """Return the smallest position (m) and speed (m/s) at ``late`` of a vehicle that brakes after its first contact.
+    """Return the smallest possible position (m) and the smallest possible speed (m/s), at ``late``, of a vehicle that
+    brakes after its first contact.
 
     The third result is the deceleration of the vehicle (m/s2): the largest braking capacity of all three vehicles, so
     that no command and no push brings the vehicle further behind.
@@ -134,7 +135,7 @@ def last_drive(room: float, speed: float, brakes: float, drive: float, time: flo
 
     Args:
         room: distance that the vehicle must travel, m.
-        speed: speed now, m/s.
+        speed: present speed of the vehicle, m/s.
         brakes: deceleration while the vehicle brakes, m/s2.
         drive: acceleration while the vehicle drives, m/s2.
         time: total time of braking and driving, s.

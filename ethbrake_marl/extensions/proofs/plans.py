@@ -80,7 +80,7 @@ def fill_drive_then_brake(plan: Floats, v: float, u: float, limit: float, drive:
 
     Args:
         plan: [2, PIECES] array into which the function writes the motion.
-        v: speed now, m/s.
+        v: present speed of the vehicle, m/s.
         u: driving acceleration, m/s2.
         limit: speed limit, m/s.
         drive: how long the vehicle drives before it brakes, s.
@@ -97,7 +97,7 @@ def fill_brake_then_drive(plan: Floats, v: float, u: float, limit: float, brake:
 
     Args:
         plan: [2, PIECES] array into which the function writes the motion.
-        v: speed now, m/s.
+        v: present speed of the vehicle, m/s.
         u: driving acceleration, m/s2.
         limit: speed limit, m/s.
         brake: how long the vehicle brakes before it drives, s.
@@ -146,7 +146,7 @@ def walk(
     closing speed 0. Both speeds must be at least 0.
 
     Args:
-        gap: gap now, m.
+        gap: present gap between the two vehicles, m.
         v_front: speed of the front vehicle, m/s.
         front: motion of the front vehicle, [2, PIECES]: ends (s) and accelerations (m/s2) of its intervals of constant
             acceleration.

@@ -457,7 +457,8 @@ def rounding(worlds: Worlds, vehicle: int | Ints, way_m: Floats | float = 0.0) -
     A squared closing speed is ``D = w^2 + 2 b g``, with closing speed w, closing acceleration b and gap g. Let ``V`` be
     the largest speed in the line, ``G`` the sum of its gaps (plus ``way_m``), ``A`` the largest closing acceleration
     and ``a`` the weakest brakes. The term ``w^2`` of D is at most ``V^2``. No gap grows beyond ``G + V^2 / (2 a)``
-    (plus ``V a / r`` if brakes build up at rate r). So all terms of D stay below ``S = V^2 (1 + A / a) + 2 A G``.
+    (plus ``V a / r`` if brakes build up at rate r). Therefore all terms of D stay below ``S = V^2 (1 + A / a) + 2 A
+    G``.
 
     In a segment of motion, the computation rounds each speed twice and each gap five times. In a round of impacts,
     rounding changes each speed by up to 8 eps of the largest speed. Rounding in one segment, or in one round of

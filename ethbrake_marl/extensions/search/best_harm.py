@@ -74,7 +74,8 @@ def best_harm(
         budget: number of profiles that are simulated in each world for each harm count.
         seed: seed of the random search.
         threads: number of threads; None: one for each core.
-        known: table for the same controlled vehicles; the search starts from its profiles. None: no table.
+        known: table of best known harm for the same controlled vehicles; the search starts from the profiles in this
+            table. None: no table.
         objective: objective to minimise, as under a scenario's key ``objective``. If the objective is not ``total``,
             the table contains the objective's values instead of the harm of the line, and its header names the
             objective.
@@ -150,7 +151,7 @@ def search_list(
         budget: number of profiles that are simulated in each world for each harm count.
         seed: seed of the random search.
         threads: number of threads; None: one for each core.
-        known: table of best known harm; the search starts from its profiles. None: no table.
+        known: table of best known harm; the search starts from the profiles in this table. None: no table.
         chunks: folder in which the table of each finished chunk (``CHUNK`` worlds of the list) is stored as a file. A
             later call with the same arguments reads these files; a call with other arguments overwrites them. If
             ``chunks`` is None, no files are read or written.
@@ -385,7 +386,7 @@ def joined(parts: list[Profiles], n: int) -> Profiles:
 
 
 def driven_profiles(agent: Driver, worlds: Worlds, task: Task, last_step: Ints) -> Profiles:
-    """Let ``agent`` drive the worlds, and return its commands as profiles [n].
+    """Let ``agent`` drive the n worlds, and return its commands as one profile for each world, [n].
 
     Neighbouring steps with equal commands become one phase (interval of constant command).
 

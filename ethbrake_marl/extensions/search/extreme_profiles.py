@@ -98,7 +98,8 @@ def try_changes(
 
     Args:
         world: world to simulate, with the bounds of the commands and a random stream.
-        kind: which vehicle the controlled vehicle meets: ``FRONT_FIRST`` the one ahead, ``REAR_FIRST`` the one behind.
+        kind: ``FRONT_FIRST`` if the controlled vehicle meets the vehicle ahead, ``REAR_FIRST`` if it meets the vehicle
+            behind.
         at: state of the world at the first decision, [WIDTH], in the order of the columns ``proofs.line.LINE``.
         start: state of the simulation at the first decision, [S].
         low: earliest time at which the command first changes, s.

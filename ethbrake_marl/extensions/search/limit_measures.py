@@ -120,7 +120,7 @@ class LimitMeasures(MeasureSet):
         return regrets
 
     def row(self, tally: AgentTally, worlds: int, context: Regrets | Silent) -> dict[str, Any]:
-        """Return additional values for an agent in the summary, by name.
+        """Return additional values for the summary of an agent, as a dictionary from the name to the value.
 
         ``known_best_share`` is the share of the worlds for which a best known harm existed before the evaluation.
         ``below_best_known`` is the number of worlds in which the agent does less than this earlier best known harm.

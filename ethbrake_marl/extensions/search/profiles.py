@@ -427,7 +427,7 @@ def select_stepwise(
         seed_commands: commands of the starting profiles, [Q, K, C] m/s2.
         states: [K + 1, S] state of the world at the start of each phase; row 0: state at the first decision;
             overwritten.
-        field: profiles that the search improves; the first one is overwritten.
+        field: profiles that the search improves; the first profile is overwritten.
 
     """
     world.episode.clock[CLOCK.STEPWISE] = 1.0

@@ -44,8 +44,8 @@ class BestHarm:
     Args:
         recall: function that returns the stored profile of each world, and a mask: True for worlds that have a stored
             profile.
-        scenario: scenario of the worlds; the agent minimises the scenario's objective. None: the agent minimises the
-            harm of the line, and does not search a second time.
+        scenario: scenario of the worlds; the agent minimises the scenario's objective. If ``scenario`` is None, the
+            agent minimises the harm of the line, and does not search a second time.
         harm_count: harm count to minimise, ``first`` or ``total``.
         horizon_s: end of the episode, s.
         budget: number of profiles that each search simulates in a world without a stored profile.

@@ -143,7 +143,7 @@ def _refine_world(world: SearchWorld, mine: Plan, other: Plan, room: Plan, budge
 
 @compiled(apart=True)
 def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[float, int]:
-    """Simulate the commands of ``plan`` from step ``begin`` on, and write the later states into ``plan``.
+    """Simulate the commands of ``plan`` from step ``begin`` on, and write the state after each step into ``plan``.
 
     Returns the harm (m2/s2) and the number of steps of the episode; -1 steps if the simulation fails.
 
