@@ -40,8 +40,8 @@ REASON, MARGIN, SPARE, DRIVE, TOUCH, FOLLOW, RESULT_WIDTH = range(7)  # columns 
 @compiled
 def spare_gap(gap: float, v_l: float, a_l: float, v_f: float, a_f: float) -> float:
     """Return the smallest gap (m) if the follower and the front vehicle both brake fully from now on. A negative result
-    means that the two vehicles make contact. If the follower comes to rest last, the smallest gap is the gap at rest;
-    otherwise the gap is smallest when both speeds are equal.
+    means that the two vehicles make contact. If the follower comes to rest last, the smallest gap is the gap at rest.
+    If the follower does not come to rest last, the gap is smallest when both speeds are equal.
 
     Args:
         gap: gap between the two vehicles, m.
@@ -136,8 +136,8 @@ def largest_behind(
 def lowest_while_coasting(gap: float, v_f: float, v_r: float, a_r: float, onset_r: float, until: float) -> float:
     """Return the smallest gap (m), until the time ``until``, between a coasting vehicle and the vehicle behind it.
 
-    The gap is a convex function of time. Therefore it is smallest when both vehicles have the same speed, or at the
-    start or end of the coasting.
+    The gap is a convex function of time. Therefore the gap is smallest when both vehicles have the same speed, or at
+    the start or end of the coasting.
 
     Args:
         gap: present gap between the two vehicles, m.
@@ -190,10 +190,10 @@ def decide_front(gap: Floats, speed: Floats, onset: Floats, braking: Floats, i: 
     """Return whether full braking may keep vehicle ``i`` behind the front vehicle; False if contact is certain.
 
     Args:
-        gap: [P] gaps, m.
-        speed: [N] speeds, m/s.
+        gap: [P] gap of each pair, m.
+        speed: [N] speed of each vehicle, m/s.
         onset: [N] time from which on each vehicle may act, s.
-        braking: [N] braking capacities, m/s2.
+        braking: [N] braking capacity of each vehicle, m/s2.
         i: index of the controlled vehicle, at least 1.
         out: [RESULT_WIDTH] verdict, into which the function writes the columns REASON (a code), MARGIN (m) and SPARE
             (m).
@@ -223,12 +223,12 @@ def plan_behind(
     Vehicle i drives as hard as it can, then brakes fully, then follows the vehicle in front at the distance ``keep``.
 
     Args:
-        gap: [P] gaps, m.
-        speed: [N] speeds, m/s.
+        gap: [P] gap of each pair, m.
+        speed: [N] speed of each vehicle, m/s.
         onset: [N] time from which on each vehicle may act, s.
-        braking: [N] braking capacities, m/s2.
-        driving: [N] driving capacities, m/s2.
-        limit: [N] speed limits, m/s.
+        braking: [N] braking capacity of each vehicle, m/s2.
+        driving: [N] driving capacity of each vehicle, m/s2.
+        limit: [N] speed limit of each vehicle, m/s.
         i: index of the controlled vehicle.
         keep: distance to keep to the vehicle in front, m.
         plan: [2, PIECES] array into which the function writes the ends (s) and the accelerations (m/s2) of the
@@ -253,10 +253,10 @@ def meets_rear_early(gap: Floats, speed: Floats, onset: Floats, braking: Floats,
     """Return whether the vehicle behind vehicle ``i`` has contact with it before vehicle ``i`` may act.
 
     Args:
-        gap: [P] gaps, m.
-        speed: [N] speeds, m/s.
+        gap: [P] gap of each pair, m.
+        speed: [N] speed of each vehicle, m/s.
         onset: [N] time from which on each vehicle may act, s.
-        braking: [N] braking capacities, m/s2.
+        braking: [N] braking capacity of each vehicle, m/s2.
         i: index of the controlled vehicle.
         out: [RESULT_WIDTH] verdict; if there is contact, the function writes the columns REASON (a code) and MARGIN
             (m).
@@ -284,12 +284,12 @@ def decide_world(
     vehicle ``i`` may act.
 
     Args:
-        gap: [P] gaps, m.
-        speed: [N] speeds, m/s.
+        gap: [P] gap of each pair, m.
+        speed: [N] speed of each vehicle, m/s.
         onset: [N] time from which on each vehicle may act, s.
-        braking: [N] braking capacities, m/s2.
-        driving: [N] driving capacities, m/s2.
-        limit: [N] speed limits, m/s.
+        braking: [N] braking capacity of each vehicle, m/s2.
+        driving: [N] driving capacity of each vehicle, m/s2.
+        limit: [N] speed limit of each vehicle, m/s.
         i: index of the controlled vehicle.
         plan: working memory for the motion of vehicle ``i``, [2, PIECES]; overwritten.
         rear: working memory for the motion of the rear vehicle, [2, PIECES]; overwritten.
@@ -329,12 +329,12 @@ def decide_worlds(
     """Decide for each of ``n`` worlds whether vehicle ``i`` can avoid contact, and write the verdicts to ``out``.
 
     Args:
-        gaps: [n, P] gaps, m.
-        speeds: [n, N] speeds, m/s.
+        gaps: [n, P] gap of each pair, m.
+        speeds: [n, N] speed of each vehicle, m/s.
         onset: [n, N] time from which on each vehicle may act, s.
-        braking: [n, N] braking capacities, m/s2.
-        driving: [n, N] driving capacities, m/s2.
-        limit: [n, N] speed limits, m/s.
+        braking: [n, N] braking capacity of each vehicle, m/s2.
+        driving: [n, N] driving capacity of each vehicle, m/s2.
+        limit: [n, N] speed limit of each vehicle, m/s.
         i: index of the controlled vehicle.
         out: [n, RESULT_WIDTH] array into which the function writes the verdicts; ``decide_world`` explains the columns.
 

@@ -34,9 +34,9 @@ _TRIED = 8  # number of first contacts evaluated before the search
 def gentlest_between(kind: int, at: Floats, early: float, late: float) -> float:
     """Return the smallest closing speed (m/s) of first contacts between the times ``early`` and ``late``.
 
-    The smallest closing speed never rises with the time of the contact, with one exception. If the leader (front
-    vehicle) brakes harder than the controlled vehicle, the smallest closing speed may rise by at most the difference of
-    the two braking capacities in each second.
+    The later the contact, the smaller (or equal) is the smallest closing speed, with one exception. If the leader
+    (front vehicle) brakes harder than the controlled vehicle, the smallest closing speed may rise by at most the
+    difference of the two braking capacities in each second.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake

@@ -1,4 +1,4 @@
-"""Bound the speed of a vehicle relative to the centre of mass of its pair, after the pair's first contact.
+"""Compute an upper bound on the speed of a vehicle relative to the centre of mass of its pair after a first contact.
 
 A *flight* is a period in which the controlled vehicle and the neighbour of its first contact are not in contact.
 ``share`` is the mass of the *partner* (the neighbour of the first contact), divided by the total mass of the partner

@@ -1,4 +1,4 @@
-"""Bound the harm of the controlled vehicle with its second neighbour, after the first contact with the other neighbour.
+"""Compute lower bounds on the harm with the second neighbour after a first contact with the other neighbour.
 
 The time and the closing speed of the first contact determine the state of all three vehicles at that time. After the
 first contact, the extreme command (full drive or full braking) is best for the centre of mass of the two vehicles in
@@ -67,7 +67,8 @@ def least_closing(
         other_turn: time at which the rate of change of the closing speed increases by ``other_bend``, s.
         other_bend: increase of the rate of change of the closing speed at the time ``other_turn``, m/s2; may be
             negative.
-        share: mass of the first neighbour, as a share of the mass of this neighbour and the controlled vehicle, 0 to 1.
+        share: mass of the first neighbour, divided by the total mass of this neighbour and the controlled vehicle, 0 to
+            1.
         press: acceleration, m/s2, of the controlled vehicle and the neighbour of its first contact towards each other,
             under the extreme command (full drive or full braking).
         reach: largest amount by which a command other than the extreme command can lower the acceleration ``press``,

@@ -201,8 +201,8 @@ def put_behind(
 def try_behind(
     at: Floats, time: float, near: float, far: float, search: Floats, moved: Floats, plan: Floats, other: Floats
 ) -> None:
-    """Lower ``search[BEST]`` to the harm of the gentlest first contact with the rear vehicle at ``time``, if this harm
-    is smaller.
+    """Lower ``search[BEST]`` to the harm of the gentlest first contact (smallest closing speed) with the rear vehicle
+    at ``time``, if this harm is smaller.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.

@@ -1,4 +1,4 @@
-"""Bound the harm of the first three vehicles: Vehicle 1 is scripted, Vehicle 2 controlled, Vehicle 3 may do anything.
+"""Lower bound on the harm of three vehicles: Vehicle 1 is scripted, Vehicle 2 controlled, Vehicle 3 may do anything.
 
 For first contacts with the leader, the module uses ``lower_bound.front_first``, the bound for one controlled vehicle.
 This bound assumes that the rear vehicle brakes fully. The bound also holds for a rear vehicle that may do anything,

@@ -83,8 +83,8 @@ def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
 
 @compiled(apart=True)
 def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
-    """Return whether the gentlest first contact with one neighbour at ``time`` comes before any contact with the other
-    neighbour.
+    """Return whether the gentlest first contact (smallest closing speed) with one neighbour at ``time`` comes before
+    any contact with the other neighbour.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST``.

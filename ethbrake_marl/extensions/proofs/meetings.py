@@ -2,8 +2,8 @@
 time.
 
 Times are measured from the moment at which the controlled vehicle (f) may act. The front vehicle (leader, l) already
-brakes at time 0. The rear vehicle (r) coasts until its onset and then brakes. All speeds and gaps are at least 0.
-docs/internals/proofs/lower-bound.md has the proofs.
+brakes at time 0. The rear vehicle (r) coasts until its latency has elapsed, and then brakes. All speeds and gaps are at
+least 0. docs/internals/proofs/lower-bound.md has the proofs.
 """
 
 from __future__ import annotations
@@ -57,7 +57,8 @@ def gentlest_front(at: Floats, time: float) -> tuple[float, float]:
 
 @compiled
 def braked_then_driven(at: Floats, brake: float, time: float) -> tuple[float, float]:
-    """Return distance (m) and speed (m/s) of the controlled vehicle at ``time`` if it brakes first and then drives.
+    """Return travelled distance (m) and speed (m/s) of the controlled vehicle at ``time`` if it brakes first and then
+    drives.
 
     A vehicle that brakes to rest waits there until it drives.
 

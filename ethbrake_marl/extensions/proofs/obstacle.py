@@ -1,8 +1,8 @@
-"""Bound the harm that must follow a first contact if an obstacle is ahead of the leader (the front vehicle).
+"""Compute lower bounds on the harm that must follow a first contact if an obstacle is ahead of the front vehicle.
 
-``beyond`` is the squared speed (m2/s2) at which the leader hits the obstacle. This speed limits how far ahead the
-leader can be at any time. Position 0 is the place of the controlled vehicle at the moment at which it may act. Masses
-are in units of the controlled vehicle's mass. docs/internals/proofs/lower-bound-obstacle.md has the proofs.
+``beyond`` is the squared speed (m2/s2) at which the leader (front vehicle) hits the obstacle. This speed limits how far
+ahead the leader can be at any time. Position 0 is the place of the controlled vehicle at the moment at which it may
+act. Masses are in units of the controlled vehicle's mass. docs/internals/proofs/lower-bound-obstacle.md has the proofs.
 """
 
 from __future__ import annotations
@@ -406,7 +406,7 @@ def after(
     other: Floats,
 ) -> float:  # fmt: skip
     """Return the smallest harm (m2/s2) with the second neighbour (and at an obstacle) after a first contact with the
-    other.
+    other neighbour.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake

@@ -308,7 +308,8 @@ def after_ramped(
 
 @compiled(apart=True)
 def is_first_ramped(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
-    """Return whether a first contact at ``time`` or later is possible before the other neighbour arrives.
+    """Return whether a first contact with one neighbour at ``time`` or later is possible before the other neighbour
+    arrives.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
@@ -400,9 +401,9 @@ def at_onset_of(
 ) -> tuple[Worlds, Floats, Floats, Bools]:
     """Simulate worlds until the first of ``vehicles`` may act.
 
-    Returns the worlds at the moment when the first vehicle may act, the time of this moment ([n], s), the harm before
-    this moment ([n], m2/s2), and a boolean mask of pairs, [n, P]. The mask is True for pairs whose next impact counts
-    and whose vehicles move forward.
+    Returns the worlds at the moment when the first of ``vehicles`` may act, the time of this moment ([n], s), the harm
+    before this moment ([n], m2/s2), and a boolean mask of pairs, [n, P]. The mask is True for pairs whose next impact
+    counts and whose vehicles move forward.
 
     Args:
         where: name of the calling function, with which error messages begin.
@@ -464,8 +465,8 @@ def rounding(worlds: Worlds, vehicle: int | Ints, way_m: Floats | float = 0.0) -
     rounding changes each speed by up to 8 eps of the largest speed. Rounding in one segment, or in one round of
     impacts, changes the squared closing speed D by at most 8 eps S (eps = 2^-52). These errors add up and do not
     multiply, because the proofs compare a motion only with the formulas for this same motion. ``BOUND_EPS`` allows for
-    500 segments and rounds of impacts. 500 is enough: an episode of 8 s has 80 steps, and the computation of the bound
-    itself rounds a few hundred times.
+    500 segments and rounds of impacts. This number is enough: an episode of 8 s has 80 steps, and the computation of
+    the bound itself rounds a few hundred times.
 
     If controlled vehicles may drive, the largest speed V is at least the largest of their speed limits, and the largest
     closing acceleration A includes the largest of their driving capacities.

@@ -45,7 +45,7 @@ def put_leg(plan: Floats, k: int, end: float, force: float, jerk: float) -> None
 
 @compiled
 def fill_build_up(plan: Floats, since: float, force: float, wanted: float, rate: float) -> None:
-    """Write a plan: ``force`` until ``since`` (s), then a change at ``rate`` (m/s3) to ``wanted``.
+    """Write a plan: the force is ``force`` until ``since`` (s), and then changes to ``wanted`` at ``rate`` (m/s3).
 
     Forces are accelerations in m/s2. The rate may be infinite. ``plan`` [3, LEGS] is overwritten.
     """
@@ -109,7 +109,7 @@ def leg_at(plan: Floats, now: float, v: float, limit: float) -> tuple[float, flo
             constant jerk.
         now: present time, s.
         v: present speed, m/s.
-        limit: speed limit, m/s.
+        limit: speed limit of the vehicle, m/s.
 
     """
     k = 0
@@ -150,13 +150,13 @@ def speed_after(v: float, u: float, jerk: float, step: float, reached: float) ->
 
 @compiled(apart=True)
 def travel(plan: Floats, v: float, limit: float, until: float) -> tuple[float, float]:
-    """Return speed (m/s) and distance (m) at ``until`` (s) of a vehicle that follows ``plan``.
+    """Return speed (m/s) and travelled distance (m), at ``until`` (s), of a vehicle that follows ``plan``.
 
     Args:
         plan: [3, LEGS] motion of the vehicle: end (s), initial acceleration (m/s2) and jerk (m/s3) of each interval of
             constant jerk.
         v: speed at the start, m/s.
-        limit: speed limit, m/s.
+        limit: speed limit of the vehicle, m/s.
         until: end of the motion, s.
 
     """

@@ -420,7 +420,7 @@ def fold_episodes(
         table: table to improve.
         scenario: scenario of the worlds.
         worlds: worlds at t = 0; worlds with best known harm 0 are skipped.
-        name: name of the agent, for the header.
+        name: name of the agent, which the table's header mentions.
         agents: for each harm count, an agent that minimises this count. Every episode is compared with the table under
             both harm counts.
 

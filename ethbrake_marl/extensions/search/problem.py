@@ -60,8 +60,8 @@ def search_profiles(problem: ProfileProblem, given: Profiles, *, budget: int, se
 
     A profile has at most ``MOST_PHASES`` phases of constant command. The best profile is never worse than any profile
     of ``given``. The harm is the quantity that ``problem`` minimises. Raises ``InvalidInput`` for ``budget`` or
-    ``threads`` below 1 or a negative seed, and ``PhysicsError`` with the worlds in which the physics could simulate no
-    profile.
+    ``threads`` below 1 or a negative seed, and ``PhysicsError``, which names the worlds in which the physics could
+    simulate no profile.
 
     Args:
         problem: n worlds, with the commands of the other vehicles and the harm to minimise.

@@ -415,7 +415,8 @@ def divide(world: SearchWorld, field: Population) -> None:
 def select_stepwise(
     world: SearchWorld, seed_ends: Ints, seed_commands: Floats, states: Floats, field: Population
 ) -> None:
-    """Switch to stepwise simulation, and write the profile with the least harm to the first place of ``field``.
+    """Switch ``world`` to stepwise simulation, and write the profile with the least harm to the first place of
+    ``field``.
 
     The function compares the harm of the profiles of ``field`` and of the starting profiles. Stepwise simulation
     computes one decision after the other, with the same rounding errors as the engine. The rounding errors matter if

@@ -58,8 +58,8 @@ def refine(problem: ProfileProblem, commands_mps2: Floats, *, budget: int, seed:
     The result is never worse than the given commands. The harm is the quantity that ``problem`` minimises, and equals
     the harm that the engine computes. The result for a world does not depend on the other worlds. Raises
     ``InvalidInput`` if several vehicles are controlled, if the commands have a wrong shape or exceed a capacity, or if
-    ``budget`` is below 1. Raises ``PhysicsError`` with the worlds in which the physics cannot simulate the given
-    commands.
+    ``budget`` is below 1. Raises ``PhysicsError``, which names the worlds in which the physics cannot simulate the
+    given commands.
 
     Args:
         problem: n worlds with one controlled vehicle, the commands of the other vehicles, and the harm to minimise.

@@ -47,7 +47,8 @@ class Regrets:
         return outcome.ledger.world_harm(harm_count) - self.best(harm_count)
 
     def below(self, outcome: Outcome) -> Bools:
-        """Return True for worlds in which an agent does less harm than the best harm known before the evaluation, [n].
+        """Return a mask [n]: True for worlds in which an agent does less harm than the best harm known before the
+        evaluation.
 
         The agent's harm must be smaller by more than ``TOLERANCE``, under at least one of the two harm counts.
         """

@@ -230,7 +230,7 @@ def _rows(harm_count: HarmCount) -> list[ArrayRow]:
 
 
 class _Header(BaseModel):
-    """Header of a table file: entries that are checked when the file is read. Further entries are allowed."""
+    """Header of a table file: entries that are checked when the file is read. The header may have other entries."""
 
     model_config = ConfigDict(strict=True, extra="allow")
 
