@@ -28,7 +28,7 @@ PROFILE_BUDGET = 20_000  # candidates in a world that is in no table
 START = "universal"  # policy whose episode a search also starts from
 
 Recall = Callable[[ProfileProblem, HarmCount], tuple[Profiles, Bools]]
-"""Function that returns the stored profiles [n] of a problem and a mask [n]: True for worlds that have a stored profile."""
+"""Function that returns the stored profiles [n] of a problem and a mask [n]: True for worlds that have a profile."""
 
 
 class BestHarm:
