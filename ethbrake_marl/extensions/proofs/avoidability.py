@@ -40,8 +40,8 @@ REASON, MARGIN, SPARE, DRIVE, TOUCH, FOLLOW, RESULT_WIDTH = range(7)  # columns 
 @compiled
 def spare_gap(gap: float, v_l: float, a_l: float, v_f: float, a_f: float) -> float:
     """Return the smallest gap (m) if the follower and the front vehicle both brake fully from now on. A negative result
-    means that the two vehicles make contact. If the follower comes to rest last, the smallest gap is the gap at rest;
-    otherwise the gap is smallest when both speeds are equal.
+    means that the two vehicles make contact. If the follower comes to rest last, the smallest gap is the gap at rest.
+    If the follower does not come to rest last, the gap is smallest when both speeds are equal.
 
     Args:
         gap: gap between the two vehicles, m.
@@ -65,12 +65,12 @@ def drive_before_braking(
     """Return how long a vehicle can drive before it must brake fully to stay behind the leader.
 
     While it drives, the vehicle has the constant acceleration ``u >= 0``. The leader is the vehicle in front; it brakes
-    from now on. Requires ``spare_gap >= 0``.
+    from now on. The function requires ``spare_gap >= 0``: full braking from now on avoids an overlap with the leader.
 
     The results are the duration of the drive (s), the time at which the gap becomes 0 (s), and whether both vehicles
     still move at that time. If both vehicles still move when the gap becomes 0, then ``a_f > a_l`` and both have the
-    same speed. If not, the follower comes to rest behind the leader, which is already at rest. The duration and the
-    time are infinite if the follower never moves.
+    same speed. If they do not both move at that time, the follower comes to rest behind the leader, which is already at
+    rest. The duration and the time are infinite if the follower never moves.
 
     Args:
         gap: gap to the leader, m.
@@ -107,7 +107,7 @@ def largest_behind(
 ) -> tuple[float, float, bool]:
     """Return how long a vehicle with a speed limit can drive before it must brake fully to stay behind the leader.
 
-    The leader is the vehicle in front; it brakes from now on. The second and third result are the time at which the gap
+    The leader is the vehicle in front; it brakes from now on. The function also returns the time at which the gap
     becomes 0 (s), and whether both vehicles still move at that time.
 
     Args:
@@ -136,15 +136,16 @@ def largest_behind(
 def lowest_while_coasting(gap: float, v_f: float, v_r: float, a_r: float, onset_r: float, until: float) -> float:
     """Return the smallest gap (m), until the time ``until``, between a coasting vehicle and the vehicle behind it.
 
-    The gap is a convex function of time, so it is smallest when both speeds are equal, or at one end of the interval.
+    The gap is a convex function of time. Therefore the gap is smallest when both vehicles have the same speed, or at
+    the start or end of the coasting.
 
     Args:
-        gap: gap now, m.
+        gap: present gap between the two vehicles, m.
         v_f: speed of the coasting vehicle, m/s.
         v_r: speed of the vehicle behind, m/s.
         a_r: braking capacity of the vehicle behind, m/s2.
         onset_r: time from which on the vehicle behind brakes, s.
-        until: end of the coasting, s.
+        until: time until which the vehicle in front coasts, s.
 
     """
     w = v_r - v_f
@@ -172,7 +173,7 @@ def leader_at_onset(
     a concave function of time: if it is not negative at ``start``, it was not negative before.
 
     Args:
-        gap: gap now, m.
+        gap: present gap between the two vehicles, m.
         v_l: speed of the leader (front vehicle), m/s.
         a_l: braking capacity of the leader, m/s2.
         onset_l: time from which on the leader brakes, s.
@@ -189,10 +190,10 @@ def decide_front(gap: Floats, speed: Floats, onset: Floats, braking: Floats, i: 
     """Return whether full braking may keep vehicle ``i`` behind the front vehicle; False if contact is certain.
 
     Args:
-        gap: [P] gaps, m.
-        speed: [N] speeds, m/s.
+        gap: [P] gap of each pair, m.
+        speed: [N] speed of each vehicle, m/s.
         onset: [N] time from which on each vehicle may act, s.
-        braking: [N] braking capacities, m/s2.
+        braking: [N] braking capacity of each vehicle, m/s2.
         i: index of the controlled vehicle, at least 1.
         out: [RESULT_WIDTH] verdict, into which the function writes the columns REASON (a code), MARGIN (m) and SPARE
             (m).
@@ -222,12 +223,12 @@ def plan_behind(
     Vehicle i drives as hard as it can, then brakes fully, then follows the vehicle in front at the distance ``keep``.
 
     Args:
-        gap: [P] gaps, m.
-        speed: [N] speeds, m/s.
+        gap: [P] gap of each pair, m.
+        speed: [N] speed of each vehicle, m/s.
         onset: [N] time from which on each vehicle may act, s.
-        braking: [N] braking capacities, m/s2.
-        driving: [N] driving capacities, m/s2.
-        limit: [N] speed limits, m/s.
+        braking: [N] braking capacity of each vehicle, m/s2.
+        driving: [N] driving capacity of each vehicle, m/s2.
+        limit: [N] speed limit of each vehicle, m/s.
         i: index of the controlled vehicle.
         keep: distance to keep to the vehicle in front, m.
         plan: [2, PIECES] array into which the function writes the ends (s) and the accelerations (m/s2) of the
@@ -252,10 +253,10 @@ def meets_rear_early(gap: Floats, speed: Floats, onset: Floats, braking: Floats,
     """Return whether the vehicle behind vehicle ``i`` has contact with it before vehicle ``i`` may act.
 
     Args:
-        gap: [P] gaps, m.
-        speed: [N] speeds, m/s.
+        gap: [P] gap of each pair, m.
+        speed: [N] speed of each vehicle, m/s.
         onset: [N] time from which on each vehicle may act, s.
-        braking: [N] braking capacities, m/s2.
+        braking: [N] braking capacity of each vehicle, m/s2.
         i: index of the controlled vehicle.
         out: [RESULT_WIDTH] verdict; if there is contact, the function writes the columns REASON (a code) and MARGIN
             (m).
@@ -283,12 +284,12 @@ def decide_world(
     vehicle ``i`` may act.
 
     Args:
-        gap: [P] gaps, m.
-        speed: [N] speeds, m/s.
+        gap: [P] gap of each pair, m.
+        speed: [N] speed of each vehicle, m/s.
         onset: [N] time from which on each vehicle may act, s.
-        braking: [N] braking capacities, m/s2.
-        driving: [N] driving capacities, m/s2.
-        limit: [N] speed limits, m/s.
+        braking: [N] braking capacity of each vehicle, m/s2.
+        driving: [N] driving capacity of each vehicle, m/s2.
+        limit: [N] speed limit of each vehicle, m/s.
         i: index of the controlled vehicle.
         plan: working memory for the motion of vehicle ``i``, [2, PIECES]; overwritten.
         rear: working memory for the motion of the rear vehicle, [2, PIECES]; overwritten.
@@ -328,12 +329,12 @@ def decide_worlds(
     """Decide for each of ``n`` worlds whether vehicle ``i`` can avoid contact, and write the verdicts to ``out``.
 
     Args:
-        gaps: [n, P] gaps, m.
-        speeds: [n, N] speeds, m/s.
+        gaps: [n, P] gap of each pair, m.
+        speeds: [n, N] speed of each vehicle, m/s.
         onset: [n, N] time from which on each vehicle may act, s.
-        braking: [n, N] braking capacities, m/s2.
-        driving: [n, N] driving capacities, m/s2.
-        limit: [n, N] speed limits, m/s.
+        braking: [n, N] braking capacity of each vehicle, m/s2.
+        driving: [n, N] driving capacity of each vehicle, m/s2.
+        limit: [n, N] speed limit of each vehicle, m/s.
         i: index of the controlled vehicle.
         out: [n, RESULT_WIDTH] array into which the function writes the verdicts; ``decide_world`` explains the columns.
 
@@ -354,11 +355,13 @@ class Avoidability:
     stays behind the front vehicle. ``margin_m`` is the smallest gap between the largest trajectory and the rear
     vehicle. If the controlled vehicle has no rear vehicle, ``margin_m`` is the part of the gap to the front vehicle
     that remains under full braking. ``margin_m`` is negative if contact is unavoidable. If the reason is *front*,
-    ``margin_m`` is minus the missing gap; if the reason is *early*, minus the overlap before the vehicle may act.
+    ``margin_m`` is minus the missing gap; if the reason is *early*, ``margin_m`` is minus the overlap before the
+    vehicle may act.
 
     ``switch_s`` and ``command_mps2`` are times and commands that show how to avoid contact: in a simulation they cause
     no impact. Each command applies from its time (s after the alert) until the time of the next command. An infinite
-    time means that the command never applies. Both arrays are NaN in worlds where contact is unavoidable.
+    time means that the command never applies. ``switch_s`` and ``command_mps2`` are NaN in worlds where contact is
+    unavoidable.
     """
 
     # [n] 0: contact is avoidable. 1, early: a pair has contact before the controlled vehicle may act. 2, front: even
@@ -370,12 +373,12 @@ class Avoidability:
 
     @property
     def avoidable(self) -> Bools:
-        """Worlds in which some commands avoid all contact, and so every impact: boolean mask, [n]."""
+        """Boolean mask [n]: True for worlds in which some commands avoid all contact, and therefore every impact."""
         return np.asarray(self.reason == 0, np.bool_)
 
     @property
     def reason_name(self) -> NDArray[np.str_]:
-        """Name of the reason in each world, [n]: "" if contact is avoidable, else "early", "front" or "rear"."""
+        """Reason why contact is unavoidable, [n]: "early", "front" or "rear"; "" if contact is avoidable."""
         return np.array(REASONS)[self.reason]
 
 
@@ -394,7 +397,7 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
             ``Scenario.roles``. The only script allowed is full_brake. If ``scripts`` is None, all vehicles that are not
             controlled brake fully.
 
-    Raises ``InvalidInput`` for any other line and any other script. The function also raises ``InvalidInput`` if the
+    Raises ``InvalidInput`` for lines and scripts that are not allowed. The function also raises ``InvalidInput`` if the
     front vehicle may brake only after the controlled vehicle may act, if a vehicle moves backward, or if vehicle_1
     could reach an obstacle (``obstacle_gap_m``) before any contact.
 

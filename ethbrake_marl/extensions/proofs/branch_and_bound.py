@@ -1,9 +1,9 @@
 """Find the smallest harm over all first contacts with one neighbour, by branch and bound.
 
 A first contact has a time and a closing speed. The harm of a first contact is its squared closing speed plus the harm
-that must follow (``obstacle.after``). A *cell* is a range of times and a range of closing speeds. The search halves
-cells until the smallest bound of any cell is close to the smallest harm that the search has reached.
-docs/internals/proofs/lower-bound.md has the proof.
+that must follow (``obstacle.after``). A *cell* is a set of first contacts: a range of times and a range of closing
+speeds. The search halves cells until the smallest bound of any cell is close to the smallest harm that the search has
+reached. docs/internals/proofs/lower-bound.md has the proof.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ _TRIED = 8  # number of first contacts evaluated before the search
 def gentlest_between(kind: int, at: Floats, early: float, late: float) -> float:
     """Return the smallest closing speed (m/s) of first contacts between the times ``early`` and ``late``.
 
-    The smallest closing speed never rises with the time of the contact, with one exception. If the leader (front
-    vehicle) brakes harder than the controlled vehicle, the smallest closing speed may rise by at most the difference of
-    the two braking capacities in each second.
+    The later the contact, the smaller (or equal) is the smallest closing speed, with one exception. If the leader
+    (front vehicle) brakes harder than the controlled vehicle, the smallest closing speed may rise by at most the
+    difference of the two braking capacities in each second.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
@@ -44,7 +44,7 @@ def gentlest_between(kind: int, at: Floats, early: float, late: float) -> float:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
 
     """
     if kind >= RAMPED_FRONT:
@@ -59,12 +59,13 @@ def gentlest_between(kind: int, at: Floats, early: float, late: float) -> float:
 def decision_around(at: Floats, early: float, late: float) -> tuple[float, float]:
     """Return start and end (s) of the decision step that contains both ``early`` and ``late``.
 
-    Both results are ``late`` if there are no decision steps, or if the two times lie in different steps.
+    The function returns ``late`` as start and as end if there are no decision steps, or if ``early`` and ``late`` lie
+    in different decision steps.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: start of a range of times, s.
-        late: end of this range of times, s.
+        early: start of the time interval around which the function looks for a decision step, s.
+        late: end of the time interval that starts at ``early``, s.
 
     """
     step = at[LINE.TIME_STEP]
@@ -92,7 +93,7 @@ def lacking(kind: int, at: Floats, early: float, late: float, softest: float, ha
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         softest: smallest closing speed that a first contact between ``early`` and ``late`` can have under any command,
             m/s.
         hard: largest closing speed that the first contact may have, m/s.
@@ -129,7 +130,7 @@ def harm_of(
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         soft: smallest closing speed that the first contact may have, m/s.
         hard: largest closing speed that the first contact may have, m/s.
         floor: known lower bound on the harm of the other pair (the pair that does not have the first contact), m2/s2.
@@ -151,13 +152,13 @@ def harm_of(
 
 @compiled
 def room_for(heap: Floats, count: int, harm: float) -> int:
-    """Insert a row for a cell (range of first contacts) with bound ``harm`` into the heap, and return the index of the
-    row. The function fills in only the column ``HARM`` of this row. Row 0 of the heap is always the cell with the
-    smallest bound.
+    """Insert a row for a new cell (range of first contacts), whose bound is ``harm``, into the heap, and return the
+    index of the row. The function fills in only the column ``HARM`` of this row. Row 0 of the heap is always the cell
+    with the smallest bound.
 
     Args:
         heap: [CELLS, NEAR] binary heap with one row for each cell (range of first contacts); changed in place.
-        count: number of cells so far.
+        count: number of cells on the heap without the new cell.
         harm: lower bound on the harm of the first contacts in the new cell, m2/s2.
 
     """
@@ -176,12 +177,12 @@ def put(heap: Floats, count: int, harm: float, early: float, late: float, soft: 
 
     Args:
         heap: [CELLS, NEAR] binary heap with one row for each cell (range of first contacts); changed in place.
-        count: number of cells so far.
-        harm: lower bound on the harm of first contacts in the cell, m2/s2.
-        early: earliest time of a first contact in the cell, s.
-        late: latest time of a first contact in the cell, s.
-        soft: smallest closing speed of a first contact in the cell, m/s.
-        hard: largest closing speed of a first contact in the cell, m/s.
+        count: number of cells on the heap without the new cell.
+        harm: lower bound on the harm of all first contacts in the new cell, m2/s2.
+        early: earliest time in the new cell (range of first contacts), s.
+        late: latest time in the new cell (range of first contacts), s.
+        soft: smallest closing speed in the new cell (range of first contacts), m/s.
+        hard: largest closing speed in the new cell (range of first contacts), m/s.
 
     """
     at = room_for(heap, count, harm)
@@ -191,12 +192,11 @@ def put(heap: Floats, count: int, harm: float, early: float, late: float, soft: 
 
 @compiled(apart=True)
 def drop_first(heap: Floats, count: int) -> int:
-    """Remove row 0 (the cell of first contacts with the smallest bound) from the heap, and return the new number of
-    cells.
+    """Remove row 0 (the cell that has the smallest bound) from the heap, and return the new number of cells.
 
     Args:
         heap: binary heap with one row for each cell (range of first contacts); changed in place.
-        count: number of cells before the removal.
+        count: number of cells (ranges of first contacts) on the heap before the removal.
 
     """
     count -= 1
@@ -218,17 +218,17 @@ def drop_first(heap: Floats, count: int) -> int:
 def divide(
     kind: int, at: Floats, floor: float, count: int, plan: Floats, other: Floats, heap: Floats
 ) -> tuple[int, float]:
-    """Replace the cell (range of first contacts) with the smallest bound by its two halves.
+    """Split the cell (range of first contacts) that has the smallest bound into two halves.
 
-    Returns the new number of cells, and the bound (m2/s2) for one single contact in the cell. The smallest bound of all
-    first contacts is at most this second result.
+    Returns the new number of cells on the heap, and the bound (m2/s2) for one single first contact in the split cell.
+    The smallest bound of all first contacts is at most the bound for this one contact.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
             build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         floor: known lower bound on the harm of the other pair (the pair that does not have the first contact), m2/s2.
-        count: number of cells on the heap.
+        count: number of cells (ranges of first contacts) on the heap.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan`` (with brake build-up from
             ``empty_legs``); overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
@@ -263,15 +263,15 @@ def least_harm(
     kind: int, at: Floats, first: float, last: float, floor: float, best: float, enough: float, plan: Floats,
     other: Floats, heap: Floats,
 ) -> float:  # fmt: skip
-    """Return a lower bound (m2/s2) on the harm of every first contact between two times, or ``best`` if ``best`` is
-    smaller.
+    """Return a lower bound (m2/s2) on the harm of every first contact between the times ``first`` and ``last``, or
+    ``best`` if ``best`` is smaller.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
             build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         first: earliest time of the first contact, in s from the moment at which the controlled vehicle may act.
-        last: latest time of the first contact, counted like ``first``, s.
+        last: latest time of the first contact, in s from the moment at which the controlled vehicle may act.
         floor: known lower bound on the harm of the other pair (the pair that does not have the first contact), m2/s2.
         best: smallest harm that the search has reached so far, m2/s2.
         enough: lower bound that is already proven in another way, m2/s2; the function returns 0 if the bound of some
@@ -311,14 +311,14 @@ def next_split(kind: int, at: Floats, time: float, last: float) -> float:
     """Return the next time (s) after ``time`` at which a decision is due or the front vehicle comes to rest; at most
     ``last``.
 
-    With brake build-up the result is at most ``_PART_S`` later than ``time``.
+    With brake build-up, the result is at most ``_PART_S`` (0.05 s) later than ``time``.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
             build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         time: start of the interval in which the function searches, s.
-        last: largest possible result, s.
+        last: end of the interval in which the function searches, s; the result is at most ``last``.
 
     """
     until = last if kind < RAMPED_FRONT else min(last, time + _PART_S)

@@ -42,7 +42,7 @@ def least_before(at: Floats, met: float, squared: float) -> float:
     """Return the smallest closing speed (m/s) of a pair's first contact until ``met``, for a leader that follows a
     script. If the contact happens at the time t (s), its closing speed is at least ``c(t) + (g(t) / t)``. Here c(t) and
     g(t) are the closing speed (m/s) and the gap (m) at the time t if both vehicles brake fully. ``g(t) / t`` is the
-    additional speed that the follower needs to close this gap by time t.
+    additional speed that the follower needs to close the gap g(t) by the time t.
 
     Args:
         at: [PAIR_WIDTH] values of one pair, in the order ``PAIR_GAP`` to ``FOLLOWER_A``.
@@ -105,7 +105,7 @@ def bound_pairs(pairs: Floats, until: Floats, out: Floats) -> None:
     """Compute a lower bound on the harm of each of ``n`` pairs, whatever the vehicles do.
 
     Args:
-        pairs: [n, PAIR_WIDTH] pairs, with the columns ``PAIR_GAP`` to ``FOLLOWER_A``.
+        pairs: gap, speeds and capacities of each pair, [n, PAIR_WIDTH], in the columns ``PAIR_GAP`` to ``FOLLOWER_A``.
         until: [n] horizon of each pair, s; later harm does not count.
         out: [n] array into which the function writes the bounds, m2/s2; a contact without impact counts as 0.
 

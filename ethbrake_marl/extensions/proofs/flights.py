@@ -1,9 +1,10 @@
-"""Bound how much faster than the centre of mass of a pair one of its vehicles can be after the pair's first contact.
+"""Compute an upper bound on the speed of a vehicle relative to the centre of mass of its pair after a first contact.
 
-A *flight* is a period in which the two vehicles are not in contact. ``share`` is the mass of the *partner* (the
-neighbour of the first contact), as a share of the mass of both vehicles. ``press`` is the acceleration (m/s2) of the
-two vehicles towards each other under the extreme command (full drive or full braking). ``reach`` is the largest amount
-(m/s2) by which another command can lower ``press``. ``opening`` is the speed (m/s) at which the vehicles separate.
+A *flight* is a period in which the controlled vehicle and the neighbour of its first contact are not in contact.
+``share`` is the mass of the *partner* (the neighbour of the first contact), divided by the total mass of the partner
+and the controlled vehicle. ``press`` is the acceleration (m/s2) of these two vehicles towards each other under the
+extreme command (full drive or full braking). ``reach`` is the largest amount (m/s2) by which a command other than the
+extreme command can lower ``press``. ``opening`` is the speed (m/s) at which the two vehicles separate after an impact.
 docs/internals/proofs/lower-bound.md has the proofs.
 """
 
@@ -19,21 +20,21 @@ def flight_lead(share: float, press: float, reach: float, opening: float, flight
     """Return the *lead* of a flight: the speed (m/s) that the controlled vehicle gains by the flight, minus the speed
     that the flight costs.
 
-    A *flight* is a period in which the two vehicles are not in contact. The gain is the speed of the controlled vehicle
-    minus the speed of the centre of mass of both vehicles. For a flight that lasts L seconds and begins with the
-    opening speed o (m/s), the lead is ``share (press L - o) - G``. G is the speed (m/s) that the controlled vehicle
-    must give up so that the two vehicles stay apart for the time L: the smallest G with ``G L - G^2 / (2 reach) >=
-    (press L^2 / 2) - o L``. In each second the controlled vehicle can give up at most ``reach`` m/s. The result is -inf
-    if no command keeps the vehicles apart for the time L.
+    A *flight* is a period in which the controlled vehicle and the neighbour of its first contact are not in contact.
+    The gain is the speed of the controlled vehicle minus the speed of the centre of mass of these two vehicles. For a
+    flight that lasts L seconds and begins with the opening speed o (m/s), the lead is ``share (press L - o) - G``. G is
+    the speed (m/s) that the controlled vehicle must give up so that the two vehicles stay apart for the time L: the
+    smallest G with ``G L - G^2 / (2 reach) >= (press L^2 / 2) - o L``. In each second the controlled vehicle can give
+    up at most ``reach`` m/s. The result is -inf if no command keeps the vehicles apart for the time L.
 
     Args:
-        share: mass of the partner (the neighbour of the first contact), as a share of the mass of both vehicles, 0 to
-            1.
-        press: acceleration of the two vehicles towards each other under the extreme command (full drive or full
-            braking), m/s2.
-        reach: largest amount by which another command can lower the acceleration ``press``, m/s2; infinite if no limit
-            is known.
-        opening: speed at which the two vehicles separate, m/s.
+        share: mass of the partner (the neighbour of the first contact), divided by the total mass of the partner and
+            the controlled vehicle, 0 to 1.
+        press: acceleration, m/s2, of the controlled vehicle and the neighbour of its first contact towards each other,
+            under the extreme command (full drive or full braking).
+        reach: largest amount by which a command other than the extreme command can lower the acceleration ``press``,
+            m/s2; infinite if no limit is known.
+        opening: speed at which the two vehicles of the pair separate at the start of the flight, m/s.
         flight: duration of the flight, s.
 
     """
@@ -53,16 +54,16 @@ def best_flight(share: float, press: float, reach: float, opening: float) -> flo
     """Return the duration (s) of the flight with the largest ``flight_lead``; infinite if a longer flight always has a
     larger lead.
 
-    A *flight* is a period in which the two vehicles are not in contact.
+    A *flight* is a period in which the controlled vehicle and the neighbour of its first contact are not in contact.
 
     Args:
-        share: mass of the partner (the neighbour of the first contact), as a share of the mass of both vehicles, 0 to
-            1.
-        press: acceleration of the two vehicles towards each other under the extreme command (full drive or full
-            braking), m/s2.
-        reach: largest amount by which another command can lower the acceleration ``press``, m/s2; infinite if no limit
-            is known.
-        opening: speed at which the two vehicles separate, m/s.
+        share: mass of the partner (the neighbour of the first contact), divided by the total mass of the partner and
+            the controlled vehicle, 0 to 1.
+        press: acceleration, m/s2, of the controlled vehicle and the neighbour of its first contact towards each other,
+            under the extreme command (full drive or full braking).
+        reach: largest amount by which a command other than the extreme command can lower the acceleration ``press``,
+            m/s2; infinite if no limit is known.
+        opening: speed at which the two vehicles of the pair separate at the start of the flight, m/s.
 
     """
     if press <= 0.0:
@@ -85,21 +86,21 @@ def lead(
 ) -> float:
     """Return the largest ``flight_lead`` (m/s) of all flights that last from ``shortest`` to ``longest`` seconds.
 
-    A *flight* is a period in which the two vehicles are not in contact. The result is the maximum over all opening
-    speeds up to ``opening``, because a smaller opening speed may lead to a larger result if the duration of the flight
-    is limited.
+    A *flight* is a period in which the controlled vehicle and the neighbour of its first contact are not in contact.
+    The result is the maximum over all opening speeds up to ``opening``, because a smaller opening speed may lead to a
+    larger result if the duration of the flight is limited.
 
     Args:
-        share: mass of the partner (the neighbour of the first contact), as a share of the mass of both vehicles, 0 to
-            1.
-        press: acceleration of the two vehicles towards each other under the extreme command (full drive or full
-            braking), m/s2.
-        reach: largest amount by which another command can lower the acceleration ``press``, m/s2; infinite if no limit
-            is known.
-        opening: largest speed at which the two vehicles separate, m/s.
+        share: mass of the partner (the neighbour of the first contact), divided by the total mass of the partner and
+            the controlled vehicle, 0 to 1.
+        press: acceleration, m/s2, of the controlled vehicle and the neighbour of its first contact towards each other,
+            under the extreme command (full drive or full braking).
+        reach: largest amount by which a command other than the extreme command can lower the acceleration ``press``,
+            m/s2; infinite if no limit is known.
+        opening: largest speed at which the two vehicles of the pair may separate at the start of the flight, m/s.
         shortest: smallest duration of the flight, s.
         longest: largest duration of the flight, s.
-        lost: speed that the controlled vehicle loses in any case, m/s.
+        lost: speed that the controlled vehicle loses in any case, because it cannot change its command at once, m/s.
 
     """
     if press > 0.0:
@@ -117,17 +118,17 @@ def lead(
 
 @compiled
 def decays(share: float, press: float, reach: float, bounce: float) -> bool:
-    """Return True if the vehicle never gains speed by accelerating less now in order to bounce more strongly off its
-    partner later. If the result is True, ``reach`` limits the speed that the vehicle can gain in any flight (period
-    without contact).
+    """Return True if the vehicle cannot gain speed in the following way: accelerate less now, and therefore bounce more
+    strongly off its partner later. If the result is True, ``reach`` limits the speed that the vehicle can gain in any
+    flight (period without contact).
 
     Args:
-        share: mass of the partner (the neighbour of the first contact), as a share of the mass of both vehicles, 0 to
-            1.
-        press: acceleration of the two vehicles towards each other under the extreme command (full drive or full
-            braking), m/s2.
-        reach: largest amount by which another command can lower the acceleration ``press``, m/s2; infinite if no limit
-            is known.
+        share: mass of the partner (the neighbour of the first contact), divided by the total mass of the partner and
+            the controlled vehicle, 0 to 1.
+        press: acceleration, m/s2, of the controlled vehicle and the neighbour of its first contact towards each other,
+            under the extreme command (full drive or full braking).
+        reach: largest amount by which a command other than the extreme command can lower the acceleration ``press``,
+            m/s2; infinite if no limit is known.
         bounce: coefficient of restitution.
 
     """
@@ -145,31 +146,32 @@ def largest_lead(
     share: float, press: float, reach: float, bounce: float, opening: float, lost: float, late: float, end: float,
     since: float, until: float,
 ) -> float:  # fmt: skip
-    """Return an upper bound (m/s) on how much faster the controlled vehicle is than the centre of mass of a pair.
+    """Return an upper bound (m/s) on the speed of the controlled vehicle minus the speed of the centre of mass of a
+    pair.
 
     The pair is the controlled vehicle and the neighbour of its first contact. The motion of the centre of mass is
-    computed as if the vehicle executed the best command from the first contact on. In fact the earlier command still
-    applies in the *window* (the rest of the decision step). In the window the controlled vehicle loses the speed
-    ``lost`` (m/s).
+    computed as if the controlled vehicle executed the best command from the first contact on. In reality, the command
+    from before the contact still applies in the *window* (the rest of the decision step). In the window the controlled
+    vehicle loses the speed ``lost`` (m/s).
 
     A *flight* is a period in which the two vehicles of the pair are not in contact. The bound is the maximum over three
-    cases: the last flight before the contact with the other neighbour begins with the first impact, begins within the
-    window, or begins after the window.
+    cases: the last flight before the contact with the neighbour outside the pair begins with the first impact, begins
+    within the window, or begins after the window.
 
     Args:
-        share: mass of the partner (the neighbour of the first contact), as a share of the mass of both vehicles, 0 to
-            1.
-        press: acceleration of the two vehicles towards each other under the extreme command (full drive or full
-            braking), m/s2.
-        reach: largest amount by which another command can lower the acceleration ``press``, m/s2; infinite if no limit
-            is known.
+        share: mass of the partner (the neighbour of the first contact), divided by the total mass of the partner and
+            the controlled vehicle, 0 to 1.
+        press: acceleration, m/s2, of the controlled vehicle and the neighbour of its first contact towards each other,
+            under the extreme command (full drive or full braking).
+        reach: largest amount by which a command other than the extreme command can lower the acceleration ``press``,
+            m/s2; infinite if no limit is known.
         bounce: coefficient of restitution.
         opening: speed at which the pair separates after the first contact, m/s.
         lost: speed that the controlled vehicle loses in the window (the rest of the decision step), m/s.
         late: start of the window (the rest of the decision step of the first contact), s.
         end: end of the window (the rest of the decision step of the first contact), s.
-        since: earliest time of the contact with the other neighbour, s.
-        until: latest time of the contact with the other neighbour, s.
+        since: earliest time of the controlled vehicle's contact with the neighbour outside the pair, s.
+        until: latest time of the controlled vehicle's contact with the neighbour outside the pair, s.
 
     """
     if since < end:
@@ -196,14 +198,16 @@ def widest_flight(
 ) -> float:
     """Return the largest value of ``sqrt(p^2 + 2 press s)`` (m/s) in the flights of a vehicle and a partner that brakes
     harder. Here p is the speed at which the two vehicles separate (m/s), and s is the gap between them (m). A *flight*
-    is a period in which the two vehicles are not in contact. The result is infinite if no bound is known.
+    is a period in which the controlled vehicle and the neighbour of its first contact are not in contact. The result is
+    infinite if no bound is known.
 
     Args:
-        share: mass of the partner (the neighbour of the first contact), as a share of the mass of both vehicles, 0 to
-            1.
-        slack: braking capacity of the partner minus braking capacity of the vehicle, m/s2.
-        press: acceleration of the two vehicles towards each other under the extreme command (full drive or full
-            braking), m/s2.
+        share: mass of the partner (the neighbour of the first contact), divided by the total mass of the partner and
+            the controlled vehicle, 0 to 1.
+        slack: braking capacity of the partner (the neighbour of the first contact) minus braking capacity of the
+            controlled vehicle, m/s2.
+        press: acceleration, m/s2, of the controlled vehicle and the neighbour of its first contact towards each other,
+            under the extreme command (full drive or full braking).
         drive: largest acceleration that the vehicle can command, m/s2.
         bounce: coefficient of restitution.
         closing: closing speed of the first impact, m/s.

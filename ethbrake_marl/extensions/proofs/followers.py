@@ -1,13 +1,13 @@
-"""After a first contact of the controlled vehicle with one neighbour, bound the harm with the other neighbour.
+"""Compute lower bounds on the harm with the second neighbour after a first contact with the other neighbour.
 
-The time and the closing speed of the first contact determine the state of all three vehicles at that time. Afterwards
-the extreme command (full drive or full braking) is best for the centre of mass of the two vehicles in contact. The
-controlled vehicle moves faster or slower than this centre of mass only until it meets the first neighbour again;
-``flights.largest_lead`` bounds the difference. docs/internals/proofs/lower-bound.md has the proofs.
+The time and the closing speed of the first contact determine the state of all three vehicles at that time. After the
+first contact, the extreme command (full drive or full braking) is best for the centre of mass of the two vehicles in
+contact. The controlled vehicle moves faster or slower than this centre of mass only until it meets the first neighbour
+again; ``flights.largest_lead`` bounds the difference. docs/internals/proofs/lower-bound.md has the proofs.
 
 Each function computes one bound for all first contacts between the times ``early`` and ``late``, from the state at
-``early``. From ``late`` to ``end`` the command of the earlier decision still applies. This command differs from the
-extreme command by at least ``lack`` (m/s2).
+``early``. From ``late`` to ``end`` (the end of the decision step) the command of the earlier decision still applies.
+This command differs from the extreme command by at least ``lack`` (m/s2).
 """
 
 from __future__ import annotations
@@ -35,8 +35,7 @@ def least_of_line(
 ) -> float:  # fmt: skip
     """Return the smallest value of a piecewise linear function of time from ``since`` to ``until``.
 
-    The function is ``start + slope t + bend (t - turn)+ + other_bend (t - other_turn)+``, where ()+ is the positive
-    part.
+    The function of the time t is ``start + slope t + bend max(t - turn, 0) + other_bend max(t - other_turn, 0)``.
     """
     least = math.inf
     for time in (since, until, min(max(turn, since), until), min(max(other_turn, since), until)):
@@ -52,28 +51,30 @@ def least_closing(
 ) -> float:  # fmt: skip
     """Return the smallest closing speed (m/s) of the controlled vehicle's contact with its second neighbour.
 
-    The controlled vehicle had contact with its first neighbour before. The bound is a difference of two speeds, v - d.
-    Here v is the closing speed of the second neighbour relative to the centre of mass of the controlled vehicle and its
-    first neighbour, and d is the largest difference between the speeds of the controlled vehicle and this centre of
-    mass (``largest_lead``). In the *window* (the rest of the decision step of the first contact) the command of the
-    earlier decision still applies. In the window the controlled vehicle loses the speed ``lost`` (m/s). All times are
-    in s after the first contact.
+    The *first neighbour* is the vehicle with which the controlled vehicle had its first contact. The bound is a
+    difference of two speeds, v - d. Here v is the closing speed of the second neighbour relative to the centre of mass
+    of the controlled vehicle and its first neighbour, and d is the largest difference between the speeds of the
+    controlled vehicle and this centre of mass (``largest_lead``). In the *window* (the rest of the decision step of the
+    first contact) the command of the earlier decision still applies. In the window the controlled vehicle loses the
+    speed ``lost`` (m/s). All times are in s after the first contact.
 
     Args:
         start: closing speed, at the time of the first contact, of the second neighbour relative to the centre of mass
             of the controlled vehicle and its first neighbour, m/s.
         slope: rate at which this closing speed (``start``) changes from the first contact on, m/s2.
-        turn: time at which the rate of change (``slope``) increases by ``bend``, s.
-        bend: increase of the rate of change at ``turn``, m/s2; may be negative.
-        other_turn: time at which the rate of change increases by ``other_bend``, s.
-        other_bend: increase of the rate of change at ``other_turn``, m/s2; may be negative.
-        share: mass of the first neighbour, as a share of the mass of this neighbour and the controlled vehicle, 0 to 1.
-        press: acceleration of the two vehicles towards each other under the extreme command (full drive or full
-            braking), m/s2.
-        reach: largest amount by which another command can lower the acceleration ``press``, m/s2; infinite if no limit
-            is known.
+        turn: time at which the rate of change of the closing speed (``slope``) increases by ``bend``, s.
+        bend: increase of the rate of change of the closing speed at the time ``turn``, m/s2; may be negative.
+        other_turn: time at which the rate of change of the closing speed increases by ``other_bend``, s.
+        other_bend: increase of the rate of change of the closing speed at the time ``other_turn``, m/s2; may be
+            negative.
+        share: mass of the first neighbour, divided by the total mass of this neighbour and the controlled vehicle, 0 to
+            1.
+        press: acceleration, m/s2, of the controlled vehicle and the neighbour of its first contact towards each other,
+            under the extreme command (full drive or full braking).
+        reach: largest amount by which a command other than the extreme command can lower the acceleration ``press``,
+            m/s2; infinite if no limit is known.
         bounce: coefficient of restitution.
-        opening: speed at which the two vehicles separate after the first contact, m/s.
+        opening: speed at which the controlled vehicle and its first neighbour separate after the first contact, m/s.
         lost: speed that the controlled vehicle loses in the window (the rest of the decision step), m/s.
         late: start of the window (the rest of the decision step of the first contact), s.
         end: end of the window (the rest of the decision step of the first contact), s.
@@ -108,11 +109,11 @@ def pushed_by_leader(
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         closing: largest closing speed that the first contact may have, m/s.
         end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
-        lack: smallest possible difference between the command up to ``end`` and the best command after the contact,
-            m/s2.
+        lack: smallest possible difference between the command that applies until ``end`` and the best command after the
+            first contact, m/s2.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
@@ -157,7 +158,7 @@ def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: 
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         closing: largest closing speed that the first contact may have, m/s.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
@@ -204,17 +205,17 @@ def after_front(
     """Return the smallest squared closing speed (m2/s2) at the rear pair after a first contact with the front vehicle.
 
     The result is the largest of several bounds. If an obstacle may throw the vehicles back, the bounds that use the
-    centre of mass of both vehicles do not hold and are left out.
+    centre of mass of the front and the controlled vehicle do not hold, and are left out.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         closing: largest closing speed that the first contact may have, m/s.
         end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
-        lack: smallest possible difference between the command up to ``end`` and the best command after the contact,
-            m/s2.
+        lack: smallest possible difference between the command that applies until ``end`` and the best command after the
+            first contact, m/s2.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
@@ -243,8 +244,8 @@ def after_front(
 @compiled
 def obstacle_harm(at: Floats, late: float, closing: float) -> float:
     """Return the smallest squared speed (m2/s2) at which the front vehicle hits the obstacle after a push from behind.
-    After the push only its own brakes slow the front vehicle. The result is 0 if the front vehicle already stands at
-    the obstacle, because the push is then one impact of both vehicles and the obstacle.
+    After the push, the front vehicle is slowed only by its own brakes. The result is 0 if the front vehicle already
+    stands at the obstacle, because the push is then one impact of both vehicles and the obstacle.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -306,11 +307,11 @@ def pushed_by_rear(
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         closing: largest closing speed that the first contact may have, m/s.
         end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
-        lack: smallest possible difference between the command up to ``end`` and the best command after the contact,
-            m/s2.
+        lack: smallest possible difference between the command that applies until ``end`` and the best command after the
+            first contact, m/s2.
         gap: gap to the front vehicle at ``early``, m.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.

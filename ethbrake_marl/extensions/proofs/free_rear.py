@@ -1,6 +1,6 @@
 """Find the smallest harm over all first contacts of the controlled vehicle with a rear vehicle that may do anything.
 
-Whatever it does, the rear vehicle is at least as far ahead and at least as fast as if it braked fully. The *lead* of
+Whatever the rear vehicle does, it is at least as far ahead and at least as fast as if it braked fully. The *lead* of
 the rear vehicle is the distance (m) by which it is farther ahead than under full braking. The search describes a first
 contact by its time, its lead and its closing speed. A *cell* is a set of first contacts: a range of times, a range of
 leads and a range of closing speeds. The search halves cells until the smallest bound of any cell is close to the
@@ -45,10 +45,10 @@ def gained(near: float, time: float, since: float, power: float) -> float:
 
     Args:
         near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m.
-        time: time for which the two speeds are compared, s.
+        time: time at which the rear vehicle's speed is compared with its speed under full braking, s.
         since: time from which on the rear vehicle may brake less than fully, s.
-        power: largest difference between the rear vehicle's acceleration and its full braking, m/s2; infinite if other
-            vehicles may push the rear vehicle.
+        power: largest difference between the rear vehicle's acceleration and its acceleration under full braking, m/s2;
+            infinite if other vehicles may push the rear vehicle.
 
     """
     if near <= 0.0 or time <= since:
@@ -79,8 +79,8 @@ def behind_full_braking(at: Floats, early: float, late: float) -> float:
 
 @compiled
 def soft_behind(at: Floats, early: float, late: float, near: float, far: float, since: float, power: float) -> float:
-    """Return the smallest closing speed (m/s) of the first contacts with the rear vehicle in a range of times and
-    leads.
+    """Return the smallest closing speed (m/s) of all first contacts with the rear vehicle in a range of times and a
+    range of leads.
 
     The *lead* is the distance by which the rear vehicle is farther ahead than under its own full braking.
 
@@ -88,12 +88,12 @@ def soft_behind(at: Floats, early: float, late: float, near: float, far: float, 
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m.
         far: largest distance by which the rear vehicle is farther ahead than if it braked fully, m.
         since: time from which on the rear vehicle may brake less than fully, s.
-        power: largest difference between the rear vehicle's acceleration and its full braking, m/s2; infinite if other
-            vehicles may push the rear vehicle.
+        power: largest difference between the rear vehicle's acceleration and its acceleration under full braking, m/s2;
+            infinite if other vehicles may push the rear vehicle.
 
     """
     faster = gained(near, late, since, power)
@@ -110,14 +110,14 @@ def after_behind(
 ) -> float:  # fmt: skip
     """Return the smallest squared closing speed (m2/s2) at the front pair after a first contact with the rear vehicle.
 
-    The bound is computed for one motion, which starts from a state at ``early``. After any of these first contacts, the
-    controlled vehicle is at every time at least as far ahead and as fast as in this motion.
+    The bound is computed for one motion, which starts from a state at ``early``. After every first contact in the given
+    ranges, the controlled vehicle is at every time at least as far ahead and at least as fast as in this motion.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m.
         far: largest distance by which the rear vehicle is farther ahead than if it braked fully, m.
         hard: largest closing speed that the first contact may have, m/s.
@@ -154,7 +154,8 @@ def put_behind(
     at: Floats, early: float, late: float, near: float, far: float, soft: float, hard: float, search: Floats,
     count: int, moved: Floats, plan: Floats, other: Floats, heap: Floats,
 ) -> int:  # fmt: skip
-    """Add a cell of first contacts with the rear vehicle to the heap, if the cell may contain the smallest harm.
+    """Add a cell (range of first contacts with the rear vehicle) to the heap, if the cell may contain the contact with
+    the smallest harm.
 
     Returns the new number of cells on the heap.
 
@@ -162,15 +163,15 @@ def put_behind(
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m.
         far: largest distance by which the rear vehicle is farther ahead than if it braked fully, m.
         soft: smallest closing speed that the first contact may have, m/s.
         hard: largest closing speed that the first contact may have, m/s.
-        search: [SEARCH] numbers that the search needs: ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of ``gained``;
-            ``FLOOR`` is the bound of the front pair alone (m2/s2); ``BEST`` is the smallest harm that the search has
-            reached so far (m2/s2).
-        count: number of cells on the heap.
+        search: four numbers that the search needs, [SEARCH]. ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of the
+            function ``gained``. ``FLOOR`` is the lower bound on the harm of the front pair alone (m2/s2). ``BEST`` is
+            the smallest harm that the search has reached so far (m2/s2).
+        count: number of cells (ranges of first contacts) on the heap.
         moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
@@ -200,18 +201,19 @@ def put_behind(
 def try_behind(
     at: Floats, time: float, near: float, far: float, search: Floats, moved: Floats, plan: Floats, other: Floats
 ) -> None:
-    """Lower ``search[BEST]`` to the harm of the gentlest first contact with the rear vehicle at ``time``, if this harm
-    is smaller.
+    """Lower ``search[BEST]`` to the harm of the gentlest first contact (smallest closing speed) with the rear vehicle
+    at ``time``, if this harm is smaller.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         time: time of the contact, s.
-        near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m; the function
-            raises this distance if no contact at ``time`` is possible with it.
+        near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m; the function uses
+            a larger distance if no contact at ``time`` is possible with the distance ``near``.
         far: largest distance by which the rear vehicle is farther ahead than if it braked fully, m.
-        search: [SEARCH] numbers that the search needs: ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of ``gained``;
-            ``FLOOR`` is the bound of the front pair alone (m2/s2); ``BEST`` is the smallest harm that the search has
-            reached so far (m2/s2). The function lowers ``BEST`` if it reaches a smaller harm.
+        search: four numbers that the search needs, [SEARCH]. ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of the
+            function ``gained``. ``FLOOR`` is the lower bound on the harm of the front pair alone (m2/s2). ``BEST`` is
+            the smallest harm that the search has reached so far (m2/s2). The function lowers ``BEST`` if it reaches a
+            smaller harm.
         moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
@@ -230,17 +232,18 @@ def try_behind(
 def divide_behind(
     at: Floats, search: Floats, count: int, moved: Floats, plan: Floats, other: Floats, heap: Floats
 ) -> int:
-    """Replace the cell with the smallest bound by its two halves, and return the new number of cells.
+    """Split the cell that has the smallest bound into two halves, and return the new number of cells on the heap.
 
     A cell is a range of times, leads and closing speeds of first contacts with the rear vehicle. The *lead* is the
     distance by which the rear vehicle is farther ahead than under its own full braking.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        search: [SEARCH] numbers that the search needs: ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of ``gained``;
-            ``FLOOR`` is the bound of the front pair alone (m2/s2); ``BEST`` is the smallest harm that the search has
-            reached so far (m2/s2). The function lowers ``BEST`` if it reaches a smaller harm.
-        count: number of cells on the heap.
+        search: four numbers that the search needs, [SEARCH]. ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of the
+            function ``gained``. ``FLOOR`` is the lower bound on the harm of the front pair alone (m2/s2). ``BEST`` is
+            the smallest harm that the search has reached so far (m2/s2). The function lowers ``BEST`` if it reaches a
+            smaller harm.
+        count: number of cells (ranges of first contacts) on the heap.
         moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
@@ -277,14 +280,15 @@ def meetings_behind(
 ) -> float:
     """Return a lower bound (m2/s2) on the harm of all first contacts with the rear vehicle until ``last`` (s).
 
-    The result is at most ``search[BEST]``.
+    The result is at most ``search[BEST]``, the smallest harm that the search has reached.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        last: latest time of the contact, s after the controlled vehicle may act.
-        search: [SEARCH] numbers that the search needs: ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of ``gained``;
-            ``FLOOR`` is the bound of the front pair alone (m2/s2); ``BEST`` is the smallest harm that the search has
-            reached so far (m2/s2). The function lowers ``BEST`` if it reaches a smaller harm.
+        last: latest time of the first contact, in s from the moment at which the controlled vehicle may act.
+        search: four numbers that the search needs, [SEARCH]. ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of the
+            function ``gained``. ``FLOOR`` is the lower bound on the harm of the front pair alone (m2/s2). ``BEST`` is
+            the smallest harm that the search has reached so far (m2/s2). The function lowers ``BEST`` if it reaches a
+            smaller harm.
         moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.

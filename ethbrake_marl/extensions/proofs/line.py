@@ -63,7 +63,7 @@ AHEAD_M = 1e-9  # an overlap below this does not count as contact with the other
 
 @compiled
 def leader(at: Floats, time: float) -> tuple[float, float]:
-    """Return speed (m/s) and distance (m) of the front vehicle at ``time`` (s) if no other vehicle pushes it.
+    """Return speed (m/s) and travelled distance (m) of the front vehicle at ``time`` (s) if no other vehicle pushes it.
 
     ``at`` is the state of one world, [LINE.WIDTH] numbers in the order of ``line.LINE``.
     """
@@ -73,7 +73,7 @@ def leader(at: Floats, time: float) -> tuple[float, float]:
 
 @compiled
 def follower(at: Floats, time: float) -> tuple[float, float]:
-    """Return speed (m/s) and distance (m) of the rear vehicle at ``time`` (s) if no other vehicle pushes it.
+    """Return speed (m/s) and travelled distance (m) of the rear vehicle at ``time`` (s) if no other vehicle pushes it.
 
     ``at`` is the state of one world, [LINE.WIDTH] numbers in the order of ``line.LINE``.
     """

@@ -64,8 +64,8 @@ def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
     """Return the smallest squared closing speed (m2/s2) at the rear pair's first contact, and the latest time of this
     contact (s).
 
-    Full drive of the controlled vehicle leads to exactly this closing speed and this time. The time is infinite if full
-    drive avoids contact.
+    If the controlled vehicle drives fully, the first contact of the rear pair has exactly the returned squared closing
+    speed and time. The time is infinite if full drive avoids contact.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -83,8 +83,8 @@ def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
 
 @compiled(apart=True)
 def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
-    """Return whether the gentlest first contact with one neighbour at ``time`` comes before any contact with the other
-    neighbour.
+    """Return whether the gentlest first contact (smallest closing speed) with one neighbour at ``time`` comes before
+    any contact with the other neighbour.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST``.
@@ -104,16 +104,17 @@ def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, o
     """Return the latest time (s) of a first contact with one neighbour that comes before any contact with the other
     neighbour.
 
-    The function finds this time by bisection, because the other neighbour is nearer if the first contact is later. For
-    a later contact with the front vehicle the controlled vehicle drives for a shorter time, so the rear vehicle comes
-    nearer. For a later contact with the rear vehicle the controlled vehicle brakes for a shorter time, so it comes
-    nearer to the front vehicle.
+    The function finds this time by bisection: the later the first contact, the nearer is the other neighbour. For a
+    later contact with the front vehicle the controlled vehicle drives for a shorter time, so the rear vehicle comes
+    nearer. For a later contact with the rear vehicle the controlled vehicle brakes for a shorter time, so the
+    controlled vehicle comes nearer to the front vehicle.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST``.
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        first: time at which a first contact with this neighbour is possible before the other neighbour arrives, s.
-        last: latest time of a contact with this neighbour, s; the result is at most ``last``.
+        first: a time at which a first contact with the neighbour ``kind`` is possible before the other neighbour
+            arrives, s.
+        last: latest time of a contact with the neighbour ``kind``, s; the result is at most ``last``.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
@@ -161,10 +162,11 @@ def front_first(
     """Return a lower bound (m2/s2) on the harm if the first contact is with the front vehicle or with both neighbours
     at once.
 
-    The result is at most ``best``. In a contact of all three vehicles at once, the closing speeds of the two pairs add
-    up to W, the closing speed of the rear vehicle relative to the front vehicle. The closing speed of the front pair is
-    at least its smallest possible value at that time. The result covers such a contact of all three vehicles only if a
-    first contact with the front vehicle can come at that time.
+    The result is at most ``best``, the smallest harm that the search has reached. In a contact of all three vehicles at
+    once, the closing speeds of the two pairs add up to W, the closing speed of the rear vehicle relative to the front
+    vehicle. The closing speed of the front pair is at least the smallest closing speed that is possible at the time of
+    this contact. The result covers a contact of all three vehicles only if a first contact with the front vehicle is
+    possible at the same time.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -211,14 +213,14 @@ def soft_harm(
 ) -> float:
     """Return a lower bound (m2/s2) on the harm of first contacts from ``early`` to ``late`` with any closing speed.
 
-    The result is at most ``best``.
+    The result is at most ``best``, the smallest harm that the search has reached.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST``.
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         floor: known lower bound on the harm of the other pair (the pair that does not have the first contact), m2/s2.
         best: smallest harm that the search has reached so far, m2/s2.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
@@ -240,7 +242,8 @@ def soft_harm(
 def rear_first(
     at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
-    """Return a lower bound (m2/s2) on the harm if the first contact is with the rear vehicle; at most ``best``.
+    """Return a lower bound (m2/s2) on the harm if the first contact is with the rear vehicle. The result is at most
+    ``best``, the smallest harm that the search has reached.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -285,8 +288,9 @@ def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
     """Return a time (s) after which no first contact with the rear vehicle is possible.
 
     Until its first contact, the rear vehicle passes neither the front vehicle nor the controlled vehicle. Suppose that
-    the rear vehicle brakes harder than the controlled vehicle, by b (m/s2). Then t seconds before the contact the rear
-    vehicle was faster than the controlled vehicle by at least ``b t`` (m/s), if it already braked at that time.
+    the rear vehicle brakes harder than the controlled vehicle, by b (m/s2). In this case, t seconds before the contact,
+    the rear vehicle was faster than the controlled vehicle by at least ``b t`` (m/s), if the rear vehicle already
+    braked at that time.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -408,9 +412,10 @@ def lower_bound(
 ) -> LowerBound:
     """Return a proven lower bound on the harm of every world, over all commands of one vehicle.
 
-    ``harm = early + max((front_pair + rear_pair), combined)``. Each term of this formula is lowered by the largest
-    possible rounding error (``rounding``). ``combined`` is 0 in worlds in which contact can be avoided. Harm that may
-    come only after ``horizon_s`` counts as 0. The function covers the same lines as ``avoidability``.
+    The fields of the result satisfy ``harm = early + max((front_pair + rear_pair), combined)``. Each term of this
+    formula is lowered by the largest possible rounding error (``rounding``). ``combined`` is 0 in worlds in which
+    contact can be avoided. Harm that may come only after ``horizon_s`` counts as 0. The function covers the same lines
+    as ``avoidability``.
 
     If brakes build up, the bound holds for commands that change at any time, and it is weaker (smaller). ``contact``,
     the verdict on avoidable contact, is None if brakes build up in any of the worlds.
@@ -428,8 +433,8 @@ def lower_bound(
             ones every ``time_step_s`` after it, as for every agent. With a time step the computation takes ten times as
             long as with None. If ``time_step_s`` is None, commands may change at any time.
 
-    Raises ``InvalidInput`` for other lines, for an unknown ``harm_count``, for a time step below ``LEAST_TIME_STEP_S``,
-    and for a horizon that is not finite or lies before the vehicle may act.
+    Raises ``InvalidInput`` for lines that ``avoidability`` does not cover, for an unknown ``harm_count``, for a time
+    step below ``LEAST_TIME_STEP_S``, and for a horizon that is not finite or lies before the vehicle may act.
 
     """
     check_asked("lower_bound", harm_count, horizon_s, time_step_s)

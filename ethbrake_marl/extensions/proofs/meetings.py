@@ -2,8 +2,8 @@
 time.
 
 Times are measured from the moment at which the controlled vehicle (f) may act. The front vehicle (leader, l) already
-brakes at time 0. The rear vehicle (r) coasts until its onset and then brakes. All speeds and gaps are at least 0.
-docs/internals/proofs/lower-bound.md has the proofs.
+brakes at time 0. The rear vehicle (r) coasts until its latency has elapsed, and then brakes. All speeds and gaps are at
+least 0. docs/internals/proofs/lower-bound.md has the proofs.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ _GUARD = 2.0**-46  # largest relative rounding error of positions; closing speed
 
 @compiled(apart=True)
 def gentlest_front(at: Floats, time: float) -> tuple[float, float]:
-    """Return the smallest closing speed (m/s) of a contact with the front vehicle at ``time``, and the duration of the
-    drive before it (s).
+    """Return the smallest closing speed (m/s) of a contact with the front vehicle at ``time``, and how long (s) the
+    controlled vehicle drives before it brakes.
 
     The controlled vehicle reaches the place of the contact at ``time`` with the smallest possible speed if it drives
     first and then brakes.
@@ -57,7 +57,8 @@ def gentlest_front(at: Floats, time: float) -> tuple[float, float]:
 
 @compiled
 def braked_then_driven(at: Floats, brake: float, time: float) -> tuple[float, float]:
-    """Return distance (m) and speed (m/s) of the controlled vehicle at ``time`` if it brakes first and then drives.
+    """Return travelled distance (m) and speed (m/s) of the controlled vehicle at ``time`` if it brakes first and then
+    drives.
 
     A vehicle that brakes to rest waits there until it drives.
 
@@ -86,7 +87,7 @@ def braking_to_rear(at: Floats, time: float, further: float) -> float:
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         time: time of the contact, in s from the moment at which the controlled vehicle may act.
-        further: distance by which the rear vehicle is farther ahead than under full braking, m.
+        further: distance by which the rear vehicle is farther ahead than if it braked fully, m.
 
     """
     place = follower(at, time)[1] - at[LINE.GAP_R] + further
@@ -102,8 +103,8 @@ def braking_to_rear(at: Floats, time: float, further: float) -> float:
 
 @compiled(apart=True)
 def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
-    """Return the smallest closing speed (m/s) of a contact with the rear vehicle at ``time``, and the duration of the
-    braking before it (s).
+    """Return the smallest closing speed (m/s) of a contact with the rear vehicle at ``time``, and how long (s) the
+    controlled vehicle brakes before it drives.
 
     The controlled vehicle reaches the place of the contact at ``time`` with the largest possible speed if it brakes
     first and then drives. The duration of the braking is returned as infinite if the vehicle reaches its speed limit by
@@ -124,7 +125,7 @@ def gentlest(kind: int, at: Floats, time: float) -> tuple[float, float]:
     """Return the smallest closing speed (m/s) of a first contact at ``time``, and how long (s) the controlled vehicle
     drives or brakes first.
 
-    With brake build-up this duration is returned as 0.
+    With brake build-up, the duration of this driving or braking is returned as 0.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake

@@ -1,8 +1,8 @@
-"""Bound the harm that must follow a first contact if an obstacle is ahead of the leader (the front vehicle).
+"""Compute lower bounds on the harm that must follow a first contact if an obstacle is ahead of the front vehicle.
 
-``beyond`` is the squared speed (m2/s2) at which the leader hits the obstacle. This speed limits how far ahead the
-leader can be at any time. Position 0 is the place of the controlled vehicle at the moment at which it may act. Masses
-are in units of the controlled vehicle's mass. docs/internals/proofs/lower-bound-obstacle.md has the proofs.
+``beyond`` is the squared speed (m2/s2) at which the leader (front vehicle) hits the obstacle. This speed limits how far
+ahead the leader can be at any time. Position 0 is the place of the controlled vehicle at the moment at which it may
+act. Masses are in units of the controlled vehicle's mass. docs/internals/proofs/lower-bound-obstacle.md has the proofs.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ def all_three(at: Floats) -> tuple[float, float, float, float]:
     (m/s2).
 
     Masses are in units of the controlled vehicle's mass. The third result is the largest deceleration of the centre of
-    mass before the rear vehicle brakes. The fourth result is the additional deceleration of this centre of mass by the
-    rear vehicle's brakes.
+    mass before the rear vehicle brakes. The fourth result is the additional deceleration of this centre of mass that
+    the rear vehicle's brakes cause.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -105,7 +105,8 @@ def least_beyond(
 
 @compiled(apart=True)
 def slowest(at: Floats, early: float, late: float, faster: float) -> tuple[float, float, float]:
-    """Return the smallest position (m) and speed (m/s) at ``late`` of a vehicle that brakes after its first contact.
+    """Return the smallest possible position (m) and the smallest possible speed (m/s), at ``late``, of a vehicle that
+    brakes after its first contact.
 
     The third result is the deceleration of the vehicle (m/s2): the largest braking capacity of all three vehicles, so
     that no command and no push brings the vehicle further behind.
@@ -114,7 +115,7 @@ def slowest(at: Floats, early: float, late: float, faster: float) -> tuple[float
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         faster: speed of the vehicle minus speed of the front vehicle after the first contact, m/s.
 
     """
@@ -134,7 +135,7 @@ def last_drive(room: float, speed: float, brakes: float, drive: float, time: flo
 
     Args:
         room: distance that the vehicle must travel, m.
-        speed: speed now, m/s.
+        speed: present speed of the vehicle, m/s.
         brakes: deceleration while the vehicle brakes, m/s2.
         drive: acceleration while the vehicle drives, m/s2.
         time: total time of braking and driving, s.
@@ -164,7 +165,7 @@ def stopped_there(
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         hard: largest closing speed that the first contact may have, m/s.
         beyond: squared speed at which the front vehicle hits the obstacle, m2/s2.
         struck: time at which the front vehicle hits the obstacle, s.
@@ -211,7 +212,7 @@ def behind_leader(
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         soft: smallest closing speed that the first contact may have, m/s.
         hard: largest closing speed that the first contact may have, m/s.
         beyond: largest squared speed at which the front vehicle hits the obstacle, m2/s2.
@@ -295,7 +296,7 @@ def after_at_obstacle(
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         soft: smallest closing speed that the first contact may have, m/s.
         hard: largest closing speed that the first contact may have, m/s.
         follows: known lower bound on the harm of the rear pair, m2/s2.
@@ -339,7 +340,7 @@ def beyond_rear(
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         closing: largest closing speed that the first contact may have, m/s.
         least: lower bound on the result that is known already, m2/s2; the result is at least ``least``.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
@@ -367,11 +368,11 @@ def after_rear(
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         closing: largest closing speed that the first contact may have, m/s.
         end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
-        lack: smallest possible difference between the command up to ``end`` and the best command after the contact,
-            m/s2.
+        lack: smallest possible difference between the command that applies until ``end`` and the best command after the
+            first contact, m/s2.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
@@ -404,7 +405,8 @@ def after(
     kind: int, at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats,
     other: Floats,
 ) -> float:  # fmt: skip
-    """Return the smallest harm (m2/s2) at the other pair (and at an obstacle) after a first contact with one neighbour.
+    """Return the smallest harm (m2/s2) with the second neighbour (and at an obstacle) after a first contact with the
+    other neighbour.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
@@ -412,11 +414,11 @@ def after(
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         closing: largest closing speed that the first contact may have, m/s.
         end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
-        lack: smallest possible difference between the command up to ``end`` and the best command after the contact,
-            m/s2.
+        lack: smallest possible difference between the command that applies until ``end`` and the best command after the
+            first contact, m/s2.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan`` (with brake build-up from
             ``empty_legs``); overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.

@@ -54,8 +54,8 @@ def fill_braking(plan: Floats, onset: float, braking: float) -> None:
 
 @compiled
 def fill_window(plan: Floats, u: float, late: float, end: float, change: float, turn: float, step: float) -> None:
-    """Write a plan with acceleration ``u`` (m/s2), plus ``step`` from ``turn`` on, plus ``change`` from ``late`` to
-    ``end``.
+    """Write a plan with the acceleration ``u`` (m/s2). From ``turn`` on, ``step`` is added to the acceleration; from
+    ``late`` to ``end``, ``change`` is added to it.
 
     ``step`` and ``change`` are in m/s2, the times in s. ``plan`` [2, PIECES] is overwritten.
     """
@@ -80,11 +80,11 @@ def fill_drive_then_brake(plan: Floats, v: float, u: float, limit: float, drive:
 
     Args:
         plan: [2, PIECES] array into which the function writes the motion.
-        v: speed now, m/s.
+        v: present speed of the vehicle, m/s.
         u: driving acceleration, m/s2.
-        limit: speed limit, m/s.
+        limit: speed limit of the vehicle, m/s.
         drive: how long the vehicle drives before it brakes, s.
-        braking: deceleration, m/s2, positive.
+        braking: deceleration while the vehicle brakes, m/s2, positive.
 
     """
     cap = min(time_to_limit(v, u, limit), drive)
@@ -97,11 +97,11 @@ def fill_brake_then_drive(plan: Floats, v: float, u: float, limit: float, brake:
 
     Args:
         plan: [2, PIECES] array into which the function writes the motion.
-        v: speed now, m/s.
+        v: present speed of the vehicle, m/s.
         u: driving acceleration, m/s2.
-        limit: speed limit, m/s.
+        limit: speed limit of the vehicle, m/s.
         brake: how long the vehicle brakes before it drives, s.
-        braking: deceleration, m/s2, positive.
+        braking: deceleration while the vehicle brakes, m/s2, positive.
 
     """
     cap = brake + time_to_limit(max(v - braking * brake, 0.0), u, limit)
@@ -143,10 +143,10 @@ def walk(
     If there is no contact, the time is infinite and the closing speed 0. The motion is computed as if the vehicles
     could pass through each other, so a negative smallest gap is the depth of their overlap. A gap that reaches 0 and
     opens again does not count as contact. A gap that reaches 0 and would become negative counts as contact, even at
-    closing speed 0. Both speeds must be at least 0.
+    closing speed 0. The speeds of both vehicles must be at least 0.
 
     Args:
-        gap: gap now, m.
+        gap: present gap between the two vehicles, m.
         v_front: speed of the front vehicle, m/s.
         front: motion of the front vehicle, [2, PIECES]: ends (s) and accelerations (m/s2) of its intervals of constant
             acceleration.

@@ -82,7 +82,8 @@ def combined_ramped(
 
 @compiled
 def bound_ramped(states: Floats, has_front: Bools, has_rear: Bools, both: Bools, out: Floats) -> None:
-    """Compute lower bounds on the harm of ``n`` worlds with brake build-up: for each pair alone, and for both together.
+    """Compute lower bounds on the harm of ``n`` worlds with brake build-up: for each pair alone, and for both pairs
+    together.
 
     Args:
         states: [n, LINE.WIDTH] worlds; ``line.LINE`` names the columns.

@@ -59,11 +59,11 @@ def range_of(sign: float, at: Floats) -> tuple[float, float, float, float]:
     and fastest fall.
 
     Here *force* means force per mass, which is an acceleration (m/s2); rates are in m/s3. The smallest value is
-    negative and is returned without its minus sign. If ``sign`` is 1, the largest value is full drive; if ``sign`` is
-    -1, it is full braking.
+    negative and is returned without its minus sign. If ``sign`` is 1, the largest value belongs to full drive; if
+    ``sign`` is -1, the largest value belongs to full braking.
 
     Args:
-        sign: 1 or -1, the factor of the force.
+        sign: 1 or -1, by which the force is multiplied.
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
 
     """
@@ -96,8 +96,8 @@ def fill_controlled(at: Floats, sign: float, switch: float, time: float, final: 
 def switch_for(
     at: Floats, sign: float, time: float, place: float, final: float, halvings: int, plan: Floats
 ) -> tuple[float, float, float]:
-    """Return a time (s) just before, and a time (s) just after, the switch that brings the controlled vehicle to
-    ``place`` at ``time``.
+    """Return a time (s) just before the switch and a time (s) just after the switch with which the controlled vehicle
+    reaches ``place`` at ``time``.
 
     The *switch* is the time at which ``sign`` times the vehicle's force stops rising and begins to fall; a *force* is
     an acceleration. The third result is the speed (m/s) at ``time`` if the switch is at the earlier of the two times.
@@ -108,7 +108,8 @@ def switch_for(
         time: time of the contact, in s from the moment at which the controlled vehicle may act.
         place: ``sign`` times the position that the vehicle must reach at ``time``, m.
         final: required value of ``sign`` times the force at ``time``, m/s2; -inf if no value is required.
-        halvings: number of bisection steps in the search for the switch.
+        halvings: number of bisection steps in the search for the switch (the time at which ``sign`` times the force
+            begins to fall).
         plan: working memory for the motion of one vehicle, an array from ``empty_legs``; overwritten.
 
     """
@@ -166,8 +167,8 @@ def gentlest_ramped(kind: int, at: Floats, time: float) -> float:
 def slack_of(
     kind: int, at: Floats, early: float, late: float, v: float, hard: float, plan: Floats
 ) -> tuple[float, float]:
-    """Return the largest distance (m) to the neighbour and the largest excess of the closing speed (m/s), both at
-    ``early``.
+    """Return the largest possible distance (m) to the neighbour at ``early``, and the largest possible excess of the
+    closing speed (m/s) at ``early``.
 
     The excess (m/s) is the closing speed at ``early`` minus ``hard``. The first contact comes between ``early`` and
     ``late``.
@@ -177,7 +178,7 @@ def slack_of(
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         v: speed of the neighbour at ``early``, m/s.
         hard: largest closing speed that the first contact may have, m/s.
         plan: working memory for the motion of one vehicle, an array from ``empty_legs``; overwritten.
@@ -199,7 +200,7 @@ def gentlest_ramped_between(kind: int, at: Floats, early: float, late: float) ->
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
 
     """
     plan = empty_legs()
@@ -219,14 +220,14 @@ def force_of_meeting(kind: int, at: Floats, early: float, late: float, hard: flo
     """Return an upper bound (m/s2) on the controlled vehicle's acceleration at a first contact whose closing speed is
     at most ``hard``.
 
-    For a contact with the rear vehicle, the result is an upper bound on the controlled vehicle's deceleration instead.
+    If the contact is with the rear vehicle, the result is an upper bound on the controlled vehicle's deceleration.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         hard: largest closing speed that the first contact may have, m/s.
 
     """
@@ -251,17 +252,17 @@ def force_of_meeting(kind: int, at: Floats, early: float, late: float, hard: flo
 def after_ramped(
     kind: int, at: Floats, early: float, late: float, hard: float, plan: Floats, other: Floats
 ) -> float:  # fmt: skip
-    """Return the smallest squared closing speed (m2/s2) of the contact with the other neighbour that follows a first
-    contact, with brake build-up.
+    """Return the smallest squared closing speed (m2/s2) of the contact with the second neighbour after a first contact
+    with the other neighbour, with brake build-up.
 
-    The bound uses the motion of the controlled vehicle alone.
+    The bound is computed from the motion of the controlled vehicle, not of a centre of mass.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
             act.
-        late: latest time of the controlled vehicle's first contact, s, counted like ``early``.
+        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         hard: largest closing speed that the first contact may have, m/s.
         plan: working memory for the motion of one vehicle, an array from ``empty_legs``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
@@ -307,7 +308,8 @@ def after_ramped(
 
 @compiled(apart=True)
 def is_first_ramped(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
-    """Return whether a first contact at ``time`` or later is possible before the other neighbour arrives.
+    """Return whether a first contact with one neighbour at ``time`` or later is possible before the other neighbour
+    arrives.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
@@ -338,8 +340,8 @@ def meet_ramped(kind: int, at: Floats, sign: float, plan: Floats, other: Floats)
     """Return time (s) and closing speed (m/s) of the contact with a neighbour under full drive or full braking.
 
     Brakes build up at finite rates. The time is infinite and the closing speed 0 if there is no contact. The third
-    result is the smallest closing speed (m/s) over all motions of the pair whose gap is never larger than in this
-    motion.
+    result is the smallest closing speed (m/s) over all motions of the pair in which the gap is never larger than in the
+    motion under full drive or full braking.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
@@ -386,7 +388,8 @@ class LowerBound:
 
     @property
     def impact_proven(self) -> Bools:
-        """Worlds in which every command of the controlled vehicle certainly leads to an impact: boolean mask, [n].
+        """Boolean mask [n]: True for worlds in which every command of the controlled vehicle certainly leads to an
+        impact.
 
         False means that no impact is proven; an impact may be unavoidable nevertheless.
         """
@@ -398,8 +401,9 @@ def at_onset_of(
 ) -> tuple[Worlds, Floats, Floats, Bools]:
     """Simulate worlds until the first of ``vehicles`` may act.
 
-    Returns the worlds at that moment, the time of that moment ([n], s), the harm up to that moment ([n], m2/s2), and a
-    boolean mask of pairs, [n, P]. The mask is True for pairs whose next impact counts and whose vehicles move forward.
+    Returns the worlds at the moment when the first of ``vehicles`` may act, the time of this moment ([n], s), the harm
+    before this moment ([n], m2/s2), and a boolean mask of pairs, [n, P]. The mask is True for pairs whose next impact
+    counts and whose vehicles move forward.
 
     Args:
         where: name of the calling function, with which error messages begin.
@@ -454,23 +458,25 @@ def rounding(worlds: Worlds, vehicle: int | Ints, way_m: Floats | float = 0.0) -
 
     A squared closing speed is ``D = w^2 + 2 b g``, with closing speed w, closing acceleration b and gap g. Let ``V`` be
     the largest speed in the line, ``G`` the sum of its gaps (plus ``way_m``), ``A`` the largest closing acceleration
-    and ``a`` the weakest brakes. Then ``w^2`` is at most ``V^2``. No gap grows beyond ``G + V^2 / (2 a)`` (plus ``V a /
-    r`` if brakes build up at rate r). So all terms of D stay below ``S = V^2 (1 + A / a) + 2 A G``.
+    and ``a`` the weakest brakes. The term ``w^2`` of D is at most ``V^2``. No gap grows beyond ``G + V^2 / (2 a)``
+    (plus ``V a / r`` if brakes build up at rate r). Therefore all terms of D stay below ``S = V^2 (1 + A / a) + 2 A
+    G``.
 
     In a segment of motion, the computation rounds each speed twice and each gap five times. In a round of impacts,
     rounding changes each speed by up to 8 eps of the largest speed. Rounding in one segment, or in one round of
-    impacts, changes D by at most 8 eps S (eps = 2^-52). These errors add up and do not multiply, because the proofs
-    compare a motion only with the formulas for this same motion. ``BOUND_EPS`` allows for 500 segments and rounds of
-    impacts. This is enough: an episode of 8 s has 80 steps, and the computation of the bound itself rounds a few
-    hundred times.
+    impacts, changes the squared closing speed D by at most 8 eps S (eps = 2^-52). These errors add up and do not
+    multiply, because the proofs compare a motion only with the formulas for this same motion. ``BOUND_EPS`` allows for
+    500 segments and rounds of impacts. This number is enough: an episode of 8 s has 80 steps, and the computation of
+    the bound itself rounds a few hundred times.
 
-    If controlled vehicles may drive, V is at least the largest of their speed limits, and A includes the largest of
-    their driving capacities.
+    If controlled vehicles may drive, the largest speed V is at least the largest of their speed limits, and the largest
+    closing acceleration A includes the largest of their driving capacities.
 
     Args:
         worlds: the worlds, [n].
-        vehicle: index of the controlled vehicle, or several indices.
-        way_m: distance to add to the sum of the gaps, m; one number, or [n] with a number for each world.
+        vehicle: index of the controlled vehicle, or indices of several controlled vehicles.
+        way_m: additional distance, such as the gap to an obstacle, that is added to the sum of the gaps, m; one number,
+            or [n] with a number for each world.
 
     """
     v, chosen = worlds.vehicles, np.atleast_1d(vehicle)

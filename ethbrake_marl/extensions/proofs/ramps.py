@@ -28,8 +28,8 @@ _MEETING_HALVINGS = 30
 
 @compiled
 def empty_legs() -> Floats:
-    """Return an uninitialised plan, [3, LEGS]. Its rows are for the end (s), the initial acceleration (m/s2) and the
-    jerk (m/s3) of each interval of constant jerk.
+    """Return an uninitialised plan, [3, LEGS]. The three rows of the plan are for the end (s), the initial acceleration
+    (m/s2) and the jerk (m/s3) of each interval of constant jerk.
     """
     return np.empty((3, LEGS))
 
@@ -45,7 +45,7 @@ def put_leg(plan: Floats, k: int, end: float, force: float, jerk: float) -> None
 
 @compiled
 def fill_build_up(plan: Floats, since: float, force: float, wanted: float, rate: float) -> None:
-    """Write a plan: ``force`` until ``since`` (s), then a change at ``rate`` (m/s3) to ``wanted``.
+    """Write a plan: the force is ``force`` until ``since`` (s), and then changes to ``wanted`` at ``rate`` (m/s3).
 
     Forces are accelerations in m/s2. The rate may be infinite. ``plan`` [3, LEGS] is overwritten.
     """
@@ -62,16 +62,16 @@ def fill_switch(
 ) -> None:  # fmt: skip
     """Write a plan: the force rises from ``force`` to at most ``high`` until ``switch``, then falls to ``-low``.
 
-    Before ``time`` the force rises again, and reaches ``final`` at ``time``. A *force* is an acceleration in m/s2; the
-    arguments below are forces that are already multiplied by ``sign``.
+    Before ``time`` the force rises again, and reaches ``final`` at ``time``. A *force* is an acceleration in m/s2; all
+    forces in the arguments are already multiplied by ``sign``.
 
     Args:
         plan: [3, LEGS] array into which the function writes the motion.
-        sign: 1 or -1, the factor of all forces.
+        sign: 1 or -1, by which the forces in the arguments are already multiplied.
         force: force now.
         high: largest force.
         rise: rate at which the force rises, m/s3; may be infinite.
-        low: magnitude of the smallest force, which is negative.
+        low: the smallest force, which is negative, without its minus sign.
         fall: rate at which the force falls, m/s3.
         switch: time at which the force begins to fall, s. If ``rise`` is infinite, ``switch`` may be from -1 to 0: the
             force in this case jumps to ``force + (1 + switch) (high - force)`` and falls at once.
@@ -99,17 +99,17 @@ def fill_switch(
 
 @compiled
 def leg_at(plan: Floats, now: float, v: float, limit: float) -> tuple[float, float, float, float]:
-    """Return acceleration (m/s2) and jerk (m/s3) at ``now``, the time until which this jerk lasts (s), and the speed at
-    that time (m/s).
+    """Return acceleration (m/s2) and jerk (m/s3) at ``now``, the time at which this jerk ends (s), and the speed at the
+    end of this jerk (m/s).
 
-    The speed is NaN unless the vehicle is at rest or at the speed limit at that time.
+    The speed is NaN unless the vehicle is at rest or at the speed limit when the jerk ends.
 
     Args:
         plan: [3, LEGS] motion of the vehicle: end (s), initial acceleration (m/s2) and jerk (m/s3) of each interval of
             constant jerk.
         now: present time, s.
         v: present speed, m/s.
-        limit: speed limit, m/s.
+        limit: speed limit of the vehicle, m/s.
 
     """
     k = 0
@@ -150,13 +150,13 @@ def speed_after(v: float, u: float, jerk: float, step: float, reached: float) ->
 
 @compiled(apart=True)
 def travel(plan: Floats, v: float, limit: float, until: float) -> tuple[float, float]:
-    """Return speed (m/s) and distance (m) at ``until`` (s) of a vehicle that follows ``plan``.
+    """Return speed (m/s) and travelled distance (m), at ``until`` (s), of a vehicle that follows ``plan``.
 
     Args:
         plan: [3, LEGS] motion of the vehicle: end (s), initial acceleration (m/s2) and jerk (m/s3) of each interval of
             constant jerk.
         v: speed at the start, m/s.
-        limit: speed limit, m/s.
+        limit: speed limit of the vehicle, m/s.
         until: end of the motion, s.
 
     """
@@ -183,7 +183,7 @@ def force_of(plan: Floats, now: float) -> float:
 def least_on_cubic(constant: float, pressing: float, jerk: float, since: float, until: float) -> float:
     """Return the smallest ``(constant / t) + (pressing * t / 2) + (jerk * t^2 / 3)`` for t from ``since`` to ``until``.
 
-    The result is -inf if the function falls without bound as t approaches 0.
+    The result is -inf if this expression falls without bound as t approaches 0.
     """
     if since <= 0.0 and constant <= 0.0:
         return -math.inf
@@ -221,7 +221,8 @@ def meeting(
 
     Args:
         gap: gap at ``since``, m.
-        slack: largest distance by which the gap of another motion of the pair may be smaller at ``since``, m.
+        slack: largest distance by which, at ``since``, the gap in another motion of the pair may be smaller than
+            ``gap``, m.
         v_front: speed of the front vehicle at ``since``, m/s.
         front: motion of the front vehicle, [3, LEGS].
         front_limit: speed limit of the front vehicle, m/s.

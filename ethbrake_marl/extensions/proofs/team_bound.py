@@ -45,8 +45,8 @@ def _combined_bound_of_line(
     """Return the combined bound: a lower bound on the harm of the first two pairs together, [n] m2/s2, or 0 if nothing
     is proven.
 
-    The combined bound is 0 in worlds in which the first vehicle does not brake yet. The second vehicle is treated as if
-    it may act now.
+    The combined bound is 0 in worlds in which the first vehicle of the line does not brake yet. The second vehicle of
+    the line is treated as if it may act now.
 
     Args:
         now: the ``n`` worlds in their present state.
@@ -114,7 +114,7 @@ class TeamBound:
 
     @property
     def impact_proven(self) -> Bools:
-        """Worlds in which an impact is certain whatever the controlled vehicles do: boolean mask, [n].
+        """Boolean mask [n]: True for worlds in which an impact is certain whatever the controlled vehicles do.
 
         False means that no impact is proven; an impact may be unavoidable nevertheless.
         """
@@ -132,10 +132,10 @@ def team_bound(
 ) -> TeamBound:
     """Return a proven lower bound on the harm of every world, whatever several controlled vehicles do together.
 
-    ``harm = early + obstacle + max((pairs[:, 0] + pairs[:, 1]), combined) + pairs[:, 2:].sum(axis=1)``. Each term of
-    this formula is lowered by the largest possible rounding error. If Vehicle 1 is controlled, ``combined`` covers the
-    obstacle, Vehicle 1 and Vehicle 2: ``harm = early + max((obstacle + pairs[:, 0]), combined) + pairs[:,
-    1:].sum(axis=1)``. Harm that may come only after ``horizon_s`` counts as 0.
+    The fields of the result satisfy ``harm = early + obstacle + max((pairs[:, 0] + pairs[:, 1]), combined) + pairs[:,
+    2:].sum(axis=1)``. Each term of this formula is lowered by the largest possible rounding error. If Vehicle 1 is
+    controlled, ``combined`` covers the obstacle, Vehicle 1 and Vehicle 2: ``harm = early + max((obstacle + pairs[:,
+    0]), combined) + pairs[:, 1:].sum(axis=1)``. Harm that may come only after ``horizon_s`` counts as 0.
 
     All other vehicles brake fully from their latencies on. With a single controlled vehicle, ``lower_bound`` gives
     larger bounds for the lines that it covers.
@@ -151,11 +151,12 @@ def team_bound(
         time_step_s: time between two decisions, s. If ``time_step_s`` is a number, the bound holds only for commands
             that change at decisions. The first decision comes when the first controlled vehicle may act, and the next
             ones every ``time_step_s`` after it. If Vehicle 2 is the first controlled vehicle that may act, the bound is
-            larger with a number than with None. If ``time_step_s`` is None, commands may change at any time.
+            larger if ``time_step_s`` is a number than if it is None. If ``time_step_s`` is None, commands may change at
+            any time.
 
     Raises ``InvalidInput`` if ``vehicles`` is empty, or has an unknown or repeated index. The function also raises
-    ``InvalidInput`` for another script, an unknown harm count, a time step below ``LEAST_TIME_STEP_S``, and a horizon
-    that is not finite or lies before the first of the vehicles may act.
+    ``InvalidInput`` for a script other than full_brake, an unknown harm count, a time step below ``LEAST_TIME_STEP_S``,
+    and a horizon that is not finite or lies before the first of the vehicles may act.
 
     """
     check_asked("team_bound", harm_count, horizon_s, time_step_s)

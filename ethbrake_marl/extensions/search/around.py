@@ -64,7 +64,7 @@ class Searched(AgentAround):
         Args:
             alert: the worlds at the alert, [n].
             vehicle: index of the controlled vehicle.
-            scripts: scripts of the other vehicles, by index.
+            scripts: maps the index of each other vehicle to its script.
 
         """
         others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)

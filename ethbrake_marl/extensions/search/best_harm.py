@@ -74,7 +74,8 @@ def best_harm(
         budget: number of profiles that are simulated in each world for each harm count.
         seed: seed of the random search.
         threads: number of threads; None: one for each core.
-        known: table for the same controlled vehicles; the search starts from its profiles. None: no table.
+        known: table of best known harm for the same controlled vehicles; the search starts from the profiles in this
+            table. None: no table.
         objective: objective to minimise, as under a scenario's key ``objective``. If the objective is not ``total``,
             the table contains the objective's values instead of the harm of the line, and its header names the
             objective.
@@ -144,13 +145,13 @@ def search_list(
 
     Args:
         scenario: scenario of the worlds.
-        sample: worlds of the list, with their numbers.
+        sample: the worlds to search, with the number of each world in its list.
         counts: harm counts to minimise: ``first``, ``total``, or both.
         vehicles: indices of the controlled vehicles; None: the learners of the scenario.
         budget: number of profiles that are simulated in each world for each harm count.
         seed: seed of the random search.
         threads: number of threads; None: one for each core.
-        known: table of best known harm; the search starts from its profiles. None: no table.
+        known: table of best known harm; the search starts from the profiles in this table. None: no table.
         chunks: folder in which the table of each finished chunk (``CHUNK`` worlds of the list) is stored as a file. A
             later call with the same arguments reads these files; a call with other arguments overwrites them. If
             ``chunks`` is None, no files are read or written.
@@ -194,13 +195,13 @@ def _kept_or_searched(
 ) -> BestHarmTable:
     """Return the table of best known harm for one chunk (at most ``CHUNK`` worlds of the list).
 
-    If ``file`` contains a table of these worlds that was made with the same options, this table is returned. If
+    If ``file`` contains a table of the chunk's worlds that was made with the same options, this table is returned. If
     ``file`` contains no such table, the worlds are searched, and the new table is written to ``file``.
 
     Args:
         task: scenario and controlled vehicles.
-        every: all worlds of the list.
-        file: file with the table of these worlds; None: no file is read or written.
+        every: all worlds that ``search_list`` searches.
+        file: file for the table of the chunk; None: no file is read or written.
         options: keyword arguments with which ``best_harm`` is called.
         rows: indices of the chunk's worlds in the list of worlds.
 
@@ -227,7 +228,7 @@ def chunks_left(scenario: Scenario, sample: Sample, *, budget: int, chunks: Path
 
     Args:
         scenario: scenario of the worlds.
-        sample: worlds of the list.
+        sample: the worlds that ``search_list`` searches.
         budget: number of profiles that are simulated in each world for each harm count.
         chunks: folder with the files that ``search_list`` has written, one file for each ``CHUNK`` worlds.
 
@@ -303,8 +304,8 @@ def _searched(
 ) -> Found:  # fmt: skip
     """Search each world, and return the best profiles and their harm under each harm count.
 
-    With several controlled vehicles, the search also starts from the best profile of each one while the others brake
-    fully.
+    With several controlled vehicles, the search also starts from the best profile of each controlled vehicle while the
+    others brake fully.
 
     Args:
         worlds: worlds at t = 0, [n].
@@ -333,7 +334,8 @@ def starting_profiles(
 ) -> list[Profiles]:
     """Return the profiles from which a search starts: constant commands and the profiles ``given``.
 
-    With one controlled vehicle, the list also contains coupled E-V2X-BM and the extreme profiles.
+    With one controlled vehicle, the result also contains the profiles of coupled E-V2X-BM and the extreme profiles
+    (full drive and full braking).
 
     Args:
         problem: search problem that was made from ``worlds``.
@@ -359,7 +361,7 @@ def starting_profiles(
 def startable(profiles: Profiles) -> Profiles:
     """Shorten profiles to at most ``MOST_PHASES`` phases (intervals of constant command), as a search needs them.
 
-    A profile with more phases is replaced by its first command for the whole episode.
+    A profile with more than ``MOST_PHASES`` phases is replaced by its first command for the whole episode.
     """
     ends, commands = Profiles.padded([profiles], MOST_PHASES)[0]
     last = ends[:, -1:]
@@ -371,7 +373,8 @@ def startable(profiles: Profiles) -> Profiles:
 
 
 def joined(parts: list[Profiles], n: int) -> Profiles:
-    """Join several arrays of profiles, [n * Q_j] each, into one array [n * Q] with Q = sum of Q_j.
+    """Join several arrays of profiles into one: array j has Q_j profiles of each of n worlds, and the result has Q =
+    sum of Q_j profiles of each world.
 
     Each array lists the profiles of world 0 first, then the profiles of world 1, and so on.
     """
@@ -383,7 +386,7 @@ def joined(parts: list[Profiles], n: int) -> Profiles:
 
 
 def driven_profiles(agent: Driver, worlds: Worlds, task: Task, last_step: Ints) -> Profiles:
-    """Let ``agent`` drive the worlds, and return its commands as profiles [n].
+    """Let ``agent`` drive the n worlds, and return its commands as one profile for each world, [n].
 
     Neighbouring steps with equal commands become one phase (interval of constant command).
 
@@ -417,7 +420,7 @@ def fold_episodes(
         table: table to improve.
         scenario: scenario of the worlds.
         worlds: worlds at t = 0; worlds with best known harm 0 are skipped.
-        name: name of the agent, for the header.
+        name: name of the agent, which the table's header mentions.
         agents: for each harm count, an agent that minimises this count. Every episode is compared with the table under
             both harm counts.
 

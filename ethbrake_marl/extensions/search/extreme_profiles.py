@@ -98,7 +98,8 @@ def try_changes(
 
     Args:
         world: world to simulate, with the bounds of the commands and a random stream.
-        kind: which vehicle the controlled vehicle meets: ``FRONT_FIRST`` the one ahead, ``REAR_FIRST`` the one behind.
+        kind: ``FRONT_FIRST`` if the controlled vehicle meets the vehicle ahead, ``REAR_FIRST`` if it meets the vehicle
+            behind.
         at: state of the world at the first decision, [WIDTH], in the order of the columns ``proofs.line.LINE``.
         start: state of the simulation at the first decision, [S].
         low: earliest time at which the command first changes, s.
@@ -139,15 +140,17 @@ def fill_extreme(
     """Write one profile: a first command, the opposite command from ``change`` to ``meeting``, the first command again.
 
     Commands can change only between time steps. If the time ``change`` is within a time step, the command of this step
-    is the mean of the two commands, weighted with their durations. The speed at the end of the step is then exact.
+    is the mean of the two commands, weighted with their durations. With this mean command, the speed at the end of the
+    step is exact.
 
     Args:
         world: world of the profile, with the bounds of the commands and the time step.
         kind: the first command: ``FRONT_FIRST`` for full drive, ``REAR_FIRST`` for full braking.
         change: time at which the command first changes, s.
         meeting: time of the second change of the command, s.
-        early: number of time steps by which the second change of the command comes before ``meeting``.
-        share: weight of the first command, from 0 to 1, in the time step in which the command changes back to it.
+        early: how many time steps before ``meeting`` the command changes for the second time.
+        share: weight of the first command, from 0 to 1, in the time step in which the second command changes back to
+            the first command.
         ends: output: time step at which each phase ends, [5].
         commands: output: command of each phase, [5, 1] m/s2.
 

@@ -120,12 +120,12 @@ class LimitMeasures(MeasureSet):
         return regrets
 
     def row(self, tally: AgentTally, worlds: int, context: Regrets | Silent) -> dict[str, Any]:
-        """Return additional values for an agent in the summary, by name.
+        """Return additional values for the summary of an agent, as a dictionary from the name to the value.
 
         ``known_best_share`` is the share of the worlds for which a best known harm existed before the evaluation.
-        ``below_best_known`` is the number of worlds in which the agent does less than this earlier best known harm.
-        ``best_known_warning`` is a warning text or None. ``impact_unproven`` describes the worlds in which contact is
-        proven unavoidable but an impact is not, with the fields of ``Between``.
+        ``below_best_known`` is the number of worlds in which the agent does less harm than this earlier best known
+        harm. ``best_known_warning`` is a warning text or None. ``impact_unproven`` describes the worlds in which
+        contact is proven unavoidable but an impact is not, with the fields of ``Between``.
 
         Args:
             tally: counts and means over the agent's episodes.
@@ -196,7 +196,7 @@ def _unavoidable(row: SummaryRow) -> str:
 def _best(row: SummaryRow, first: float, total: float) -> str:
     """Return a sentence with the best known harm, the proven bound, and the difference between them.
 
-    ``first`` and ``total`` are the means of the best known harm under the two counts, m2/s2.
+    ``first`` is the mean best known first-impact harm, and ``total`` is the mean best known total harm, m2/s2.
     """
     least = 0.0 if row["proven_harm"] is None else row["proven_harm"].value
     gaps = [

@@ -35,7 +35,7 @@ class Unproven:
 
 @dataclass(frozen=True, slots=True)
 class Proof:
-    """Proven facts about each world, [n] each."""
+    """Proven facts about each world, as arrays [n]."""
 
     avoidable: Bools | None  # True if some command avoids all contact; None if that is not known
     reason: NDArray[np.str_] | None  # reason if unavoidable: "early", "front" or "rear"; "" if avoidable
@@ -54,7 +54,7 @@ class Proof:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Proofs and best known harm of each world before any agent drives, [n] each."""
+    """Proofs and best known harm of each world, as arrays [n], before any agent drives."""
 
     proof: Proof  # the proven facts
     # best known first-impact harm (m2/s2): 0 if contact is avoidable, else from a table; NaN if in no table
@@ -63,7 +63,7 @@ class Limits:
 
     @property
     def known(self) -> Bools:
-        """True for worlds for which a best known harm, under both counts, existed before the evaluation, [n]."""
+        """True for worlds for which a best known harm, under both harm counts, existed before the evaluation, [n]."""
         return np.isfinite(self.first_impact_harm) & np.isfinite(self.total_harm)
 
     @property
@@ -138,9 +138,10 @@ def undecided_because(worlds: Worlds, task: Task) -> str | None:
 
 
 def _uncovered_because(worlds: Worlds, task: Task) -> str | None:
-    """Return the reason why the proof ``avoidability`` does not cover ``task``, as a clause; None if it does.
+    """Return the reason why the proof ``avoidability`` does not cover ``task``, as a clause; None if the proof covers
+    ``task``.
 
-    The function does not check whether the brakes act at once, as this proof assumes.
+    The proof ``avoidability`` assumes that brakes act at once; the function does not check this assumption.
     """
     scenario, names = task.scenario, task.scenario.vehicle_names
     if not task.vehicles or (len(task.vehicles) > 1 and set(task.vehicles) not in _DECIDED):
@@ -176,8 +177,8 @@ def _is_team(task: Task) -> bool:
 def _script_because(task: Task, proven: str) -> str | None:
     """Return a clause that names a vehicle with a script other than full_brake; None if there is no such vehicle.
 
-    ``task`` names the scenario and the controlled vehicles. ``proven`` is the part of the clause that says what is
-    proven if the vehicle follows full_brake, for instance "avoidability is proven".
+    ``task`` names the scenario and the controlled vehicles. ``proven`` says what is proven if the vehicle follows
+    full_brake, for instance "avoidability is proven"; this text becomes part of the clause.
     """
     scenario = task.scenario
     for i in range(scenario.vehicles):

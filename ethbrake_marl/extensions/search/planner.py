@@ -86,11 +86,11 @@ class Planner:
     """Receding-horizon planner: at each decision it searches for the best commands until the horizon.
 
     Each search starts from constant commands and the previous plan; the first search starts from constant commands and
-    the pairwise optimum. The planner expects that the other vehicles follow their scripts, and that other learners
-    brake fully. ``predicted_harm`` [n] is the harm of the first plan, m2/s2. If the other vehicles do what the planner
-    expects, the simulated harm is at most ``predicted_harm``. Raises ``InvalidInput`` if ``argument`` is not a whole
-    number from 1 to ``MOST_CANDIDATES``, or if ``harm_count`` is unknown. ``begin`` raises ``InvalidInput`` if the
-    command of another vehicle's script is not fixed at the alert.
+    the command of pairwise E-V2X-BM. The planner expects that the other vehicles follow their scripts, and that other
+    learners brake fully. ``predicted_harm`` [n] is the harm of the plan made at the alert, m2/s2. If the other vehicles
+    do what the planner expects, the simulated harm is at most ``predicted_harm``. Raises ``InvalidInput`` if
+    ``argument`` is not a whole number from 1 to ``MOST_CANDIDATES``, or if ``harm_count`` is unknown. ``begin`` raises
+    ``InvalidInput`` if the command of another vehicle's script is not fixed at the alert.
 
     Args:
         argument: number of profiles that are simulated in each world at each decision, as text; None: ``CANDIDATES``.
@@ -133,12 +133,12 @@ class Planner:
         self._outlook = Outlook(harm_count, horizon_s, time_step_s, objective)
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Search for the first plan of each world, and return it as memory.
+        """Search for the first plan of each world, and return these plans as memory.
 
         Args:
             alert: the worlds at the alert, [n].
             vehicle: index of the controlled vehicle.
-            scripts: scripts of the other vehicles, by index.
+            scripts: maps the index of each other vehicle to its script.
 
         """
         others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)

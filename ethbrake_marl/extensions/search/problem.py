@@ -18,7 +18,7 @@ _MIX = 0xD1342543DE82EF95  # odd multiplier that spreads seeds over 64 bits
 
 
 def seeded(identity: UInt64s, seed: int) -> UInt64s:
-    """Return the initial state of each world's random stream, [n], from its hash ``identity`` [n] and ``seed``."""
+    """Return the initial state of each world's random stream, [n], from the hash ``identity`` [n] and ``seed``."""
     with np.errstate(over="ignore"):
         z = identity ^ np.uint64((int(seed) * _MIX) % 2**64)
         z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -60,8 +60,8 @@ def search_profiles(problem: ProfileProblem, given: Profiles, *, budget: int, se
 
     A profile has at most ``MOST_PHASES`` phases of constant command. The best profile is never worse than any profile
     of ``given``. The harm is the quantity that ``problem`` minimises. Raises ``InvalidInput`` for ``budget`` or
-    ``threads`` below 1 or a negative seed, and ``PhysicsError`` with the worlds in which the physics could simulate no
-    profile.
+    ``threads`` below 1 or a negative seed, and ``PhysicsError``, which names the worlds in which the physics could
+    simulate no profile.
 
     Args:
         problem: n worlds, with the commands of the other vehicles and the harm to minimise.

@@ -163,7 +163,7 @@ ATTENTION_STEPS = 30  # phases are divided within this number of steps from the 
 
 
 class Population(NamedTuple):
-    """The *field*: the M profiles that the search improves at the same time. A profile has up to K phases."""
+    """The *field*: M profiles that the search improves at the same time. A profile has up to K phases."""
 
     ends: Ints  # [M, K] steps at which the phases end
     commands: Floats  # [M, K, C] commands of the C controlled vehicles in each phase, m/s2
@@ -301,7 +301,7 @@ def gather(
 ) -> None:
     """Fill the field (profiles to improve) with the best of the starting profiles and of ``drawn`` random profiles.
 
-    Any two profiles of the field differ in harm.
+    No two profiles of the field have the same harm.
 
     Args:
         world: world to simulate, with the bounds of the commands and a random stream.
@@ -310,7 +310,7 @@ def gather(
         states: [K + 1, S] state of the world at the start of each phase; row 0: state at the first decision;
             overwritten.
         drawn: number of random profiles to simulate.
-        field: output: the best profiles.
+        field: output: the profiles with the least harm.
 
     """
     Q, K = seed_ends.shape
@@ -364,7 +364,7 @@ def sort(field: Population, left: int) -> None:
 
 @compiled
 def is_among(value: float, values: Floats) -> bool:
-    """Return whether ``value`` differs from one of ``values`` by less than ``SAME``."""
+    """Return whether ``value`` differs from at least one of ``values`` by less than ``SAME``."""
     for other in values:  # noqa: SIM110  # any() is not compiled
         if abs(other - value) < SAME:
             return True
@@ -385,8 +385,8 @@ def largest(values: Floats) -> int:
 def divide(world: SearchWorld, field: Population) -> None:
     """Halve phases of the best profile of ``field``, in place, until this profile has K phases.
 
-    The longest phase is halved first. Only the steps of a phase that are among the first ``ATTENTION_STEPS`` steps of
-    the episode count for its length. ``world`` contains the number of steps of the episode.
+    The longest phase is halved first. The length of a phase is counted only within the first ``ATTENTION_STEPS`` steps
+    of the episode. ``world`` contains the number of steps of the episode.
     """
     used = field.phases[0]
     if used > 0 and field.values[0] > 0.0:
@@ -415,11 +415,12 @@ def divide(world: SearchWorld, field: Population) -> None:
 def select_stepwise(
     world: SearchWorld, seed_ends: Ints, seed_commands: Floats, states: Floats, field: Population
 ) -> None:
-    """Switch to stepwise simulation, and write the profile with the least harm to the first place of ``field``.
+    """Switch ``world`` to stepwise simulation, and write the profile with the least harm to the first place of
+    ``field``.
 
-    The profiles of ``field`` and the starting profiles are compared. Stepwise simulation computes one decision after
-    the other, with the same rounding errors as the engine. The rounding errors matter if harm is a discontinuous
-    function of the commands: rounding may then decide how much harm a profile causes.
+    The function compares the harm of the profiles of ``field`` and of the starting profiles. Stepwise simulation
+    computes one decision after the other, with the same rounding errors as the engine. The rounding errors matter if
+    harm is a discontinuous function of the commands: rounding may then decide how much harm a profile causes.
 
     Args:
         world: world to simulate, with the bounds of the commands and a random stream.
@@ -427,7 +428,7 @@ def select_stepwise(
         seed_commands: commands of the starting profiles, [Q, K, C] m/s2.
         states: [K + 1, S] state of the world at the start of each phase; row 0: state at the first decision;
             overwritten.
-        field: profiles that the search improves; the first one is overwritten.
+        field: profiles that the search improves; the first profile is overwritten.
 
     """
     world.episode.clock[CLOCK.STEPWISE] = 1.0

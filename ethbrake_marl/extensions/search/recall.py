@@ -28,7 +28,7 @@ PROFILE_BUDGET = 20_000  # candidates in a world that is in no table
 START = "universal"  # policy whose episode a search also starts from
 
 Recall = Callable[[ProfileProblem, HarmCount], tuple[Profiles, Bools]]
-"""Function that returns the stored profiles [n] of a problem and a mask [n] of the worlds that have one."""
+"""Function that returns the stored profiles [n] of a problem and a mask [n]: True for worlds that have a profile."""
 
 
 class BestHarm:
@@ -42,9 +42,10 @@ class BestHarm:
     unknown. ``begin`` raises ``InvalidInput`` if the command of another vehicle's script is not fixed at the alert.
 
     Args:
-        recall: function that returns the stored profile of each world, and a mask of the worlds that have one.
-        scenario: scenario of the worlds; the agent minimises the scenario's objective. None: the agent minimises the
-            harm of the line, and does not search a second time.
+        recall: function that returns the stored profile of each world, and a mask: True for worlds that have a stored
+            profile.
+        scenario: scenario of the worlds; the agent minimises the scenario's objective. If ``scenario`` is None, the
+            agent minimises the harm of the line, and does not search a second time.
         harm_count: harm count to minimise, ``first`` or ``total``.
         horizon_s: end of the episode, s.
         budget: number of profiles that each search simulates in a world without a stored profile.
@@ -80,7 +81,8 @@ class BestHarm:
         Args:
             argument: number of profiles that a search simulates, as text; None: ``PROFILE_BUDGET``.
             settings: scenario, harm count to minimise and other settings of agents.
-            recall: function that returns the stored profile of each world, and a mask of the worlds that have one.
+            recall: function that returns the stored profile of each world, and a mask: True for worlds that have a
+                stored profile.
 
         """
         budget = PROFILE_BUDGET if argument is None else budget_of(argument)
@@ -101,7 +103,7 @@ class BestHarm:
         Args:
             alert: the worlds at the alert, [n].
             vehicle: index of the controlled vehicle.
-            scripts: scripts of the other vehicles, by index.
+            scripts: maps the index of each other vehicle to its script.
 
         """
         others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)

@@ -1,9 +1,9 @@
 """Compiled random search around the commands of an episode.
 
-The search improves two sequences of commands by random changes of a few neighbouring steps. The first sequence is given
-by the caller. The second sequence is the best of some random *templates*, because small changes of the given commands
-may miss the best commands. A template is a random braking profile of three phases: one command, then another command
-for a short while, then full braking. The search simulates one decision after the other, as the engine does, and
+The search improves two sequences of commands by random changes of a few neighbouring steps. The caller gives the first
+sequence. The second sequence is the best of some random *templates*; it is needed because small changes of the caller's
+commands may miss the best commands. A template is a random braking profile of three phases: one command, then another
+command for a short while, then full braking. The search simulates one decision after the other, as the engine does, and
 therefore computes exactly the same harm as the engine.
 """
 
@@ -58,8 +58,8 @@ def refine(problem: ProfileProblem, commands_mps2: Floats, *, budget: int, seed:
     The result is never worse than the given commands. The harm is the quantity that ``problem`` minimises, and equals
     the harm that the engine computes. The result for a world does not depend on the other worlds. Raises
     ``InvalidInput`` if several vehicles are controlled, if the commands have a wrong shape or exceed a capacity, or if
-    ``budget`` is below 1. Raises ``PhysicsError`` with the worlds in which the physics cannot simulate the given
-    commands.
+    ``budget`` is below 1. Raises ``PhysicsError``, which names the worlds in which the physics cannot simulate the
+    given commands.
 
     Args:
         problem: n worlds with one controlled vehicle, the commands of the other vehicles, and the harm to minimise.
@@ -123,7 +123,8 @@ def _refine_worlds(
 def _refine_world(world: SearchWorld, mine: Plan, other: Plan, room: Plan, budget: int) -> bool:
     """Improve the commands ``mine`` of one world in place. Return False if the physics cannot simulate these commands.
 
-    ``other`` and ``room`` are arrays for intermediate results. ``budget`` is the number of candidates to simulate.
+    ``other`` and ``room`` are arrays for intermediate results. ``budget`` is the number of candidates (sequences of
+    commands) to simulate.
     """
     templates, theirs = int(TEMPLATE_SHARE * budget), int(THEIR_CLIMB_SHARE * budget)
     value, reached = follow_steps(world.episode, mine, 0, math.inf)
@@ -142,7 +143,7 @@ def _refine_world(world: SearchWorld, mine: Plan, other: Plan, room: Plan, budge
 
 @compiled(apart=True)
 def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[float, int]:
-    """Simulate the commands of ``plan`` from step ``begin`` on, and write the later states into ``plan``.
+    """Simulate the commands of ``plan`` from step ``begin`` on, and write the state after each step into ``plan``.
 
     Returns the harm (m2/s2) and the number of steps of the episode; -1 steps if the simulation fails.
 
@@ -175,7 +176,7 @@ def climb(world: SearchWorld, plan: Plan, room: Plan, value: float, reached: int
     """Improve ``plan`` in place by random changes, and return its harm (m2/s2) and its number of steps.
 
     Most changes add an amount to the commands of some neighbouring steps; the others replace these commands. If adding
-    an amount lowers the harm, the next candidate adds twice this amount to the commands of the same steps.
+    an amount lowers the harm, the next change adds twice this amount to the commands of the same steps.
 
     Args:
         world: world to simulate, with the bounds of the commands and a random stream.
@@ -233,10 +234,10 @@ def draw_templates(world: SearchWorld, best: Plan, room: Plan, bound: float, num
 
     Args:
         world: world to simulate, with the bounds of the commands and a random stream.
-        best: output: commands and states of the best template.
+        best: output: commands and states of the template (random braking profile) with the least harm.
         room: arrays for intermediate results.
         bound: a template with at least this harm is rejected, m2/s2.
-        number: number of templates to draw.
+        number: number of templates (random braking profiles) to draw.
 
     """
     low, high, T = world.bounds[0, 0], world.bounds[0, 1], room.commands.shape[0]

@@ -47,7 +47,8 @@ class Regrets:
         return outcome.ledger.world_harm(harm_count) - self.best(harm_count)
 
     def below(self, outcome: Outcome) -> Bools:
-        """Return True for worlds in which an agent does less harm than the best harm known before the evaluation, [n].
+        """Return a mask [n]: True for worlds in which an agent does less harm than the best harm known before the
+        evaluation.
 
         The agent's harm must be smaller by more than ``TOLERANCE``, under at least one of the two harm counts.
         """
@@ -81,7 +82,7 @@ class Between:
 
     @property
     def text(self) -> str:
-        """Sentence about the worlds with unavoidable contact but no proven impact; empty if there are none."""
+        """Sentence about the worlds with unavoidable contact but no proven impact; empty if no such world exists."""
         if self.rate == 0.0:
             return ""
         text = f" In {100 * self.rate:.1f} % of the worlds, contact is proven unavoidable but an impact is not."

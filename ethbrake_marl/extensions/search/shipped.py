@@ -43,7 +43,8 @@ def best_known(worlds: Worlds, task: Task) -> dict[HarmCount, Floats]:
 
 
 def shipped_profiles(problem: ProfileProblem, harm_count: HarmCount) -> tuple[Profiles, Bools]:
-    """Return the stored profile of each of the n worlds of ``problem``, and a mask [n] of the worlds that have one.
+    """Return the stored profile of each of the n worlds of ``problem``, and a mask [n]: True for worlds that have a
+    stored profile.
 
     ``problem`` has one controlled vehicle. ``harm_count`` is the harm count that the profiles minimise: ``first`` or
     ``total``.

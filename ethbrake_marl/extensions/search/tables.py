@@ -128,7 +128,7 @@ class BestHarmTable:
         return np.where(rows >= 0, self.best[harm_count].harm[rows], np.nan)
 
     def profiles(self, identity: UInt64s, harm_count: HarmCount, last_step: Ints) -> tuple[Profiles, Bools]:
-        """Return the stored profile of each world, [m], and a mask [m] of the worlds that have one.
+        """Return the stored profile of each world, [m], and a mask [m]: True for worlds that have a stored profile.
 
         A world without a stored profile gets the profile of coasting.
 
@@ -151,7 +151,8 @@ class BestHarmTable:
     def improved(
         self, identity: UInt64s, harm_count: HarmCount, harm: Floats, profiles: Profiles | None = None
     ) -> tuple[BestHarmTable, Bools]:
-        """Return a copy of the table with all smaller values from ``harm``, and a mask [m] of the changed worlds.
+        """Return a copy of the table in which smaller values from ``harm`` replace the old values, and a mask [m]: True
+        for the changed worlds.
 
         A value in ``harm`` must be smaller than the value in the table by more than ``TOLERANCE``. Worlds that are not
         in the table are ignored. Raises ``InvalidInput`` if the table does not contain ``harm_count``, or if ``harm``
@@ -229,7 +230,7 @@ def _rows(harm_count: HarmCount) -> list[ArrayRow]:
 
 
 class _Header(BaseModel):
-    """Header of a table file: entries that are checked when the file is read. Further entries are allowed."""
+    """Header of a table file: entries that are checked when the file is read. The header may have other entries."""
 
     model_config = ConfigDict(strict=True, extra="allow")
 
