@@ -41,7 +41,8 @@ REASON, MARGIN, SPARE, DRIVE, TOUCH, FOLLOW, RESULT_WIDTH = range(7)  # columns 
 def spare_gap(gap: float, v_l: float, a_l: float, v_f: float, a_f: float) -> float:
     """Return the smallest gap (m) if the follower and the front vehicle both brake fully from now on. A negative result
     means that the two vehicles make contact. If the follower comes to rest last, the smallest gap is the gap at rest.
-    If the follower does not come to rest last, the gap is smallest when both speeds are equal.
+    If the follower does not come to rest last, the gap is smallest when both speeds are equal, or now if the leader is
+    at least as fast as the follower.
 
     Args:
         gap: gap between the two vehicles, m.

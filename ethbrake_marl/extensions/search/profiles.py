@@ -418,8 +418,8 @@ def select_stepwise(
     """Switch ``world`` to stepwise simulation, and write the profile with the least harm to the first place of
     ``field``.
 
-    The function compares the harm of the profiles of ``field`` and of the starting profiles. Stepwise simulation
-    computes one decision after the other, with the same rounding errors as the engine. The rounding errors matter if
+    The function compares the harm of the first ``SMALLEST_FIELD`` profiles of ``field`` and of all starting profiles.
+    Stepwise simulation computes one decision after the other, with the same rounding errors as the engine. The rounding errors matter if
     harm is a discontinuous function of the commands: rounding may then decide how much harm a profile causes.
 
     Args:
