@@ -419,8 +419,9 @@ def select_stepwise(
     ``field``.
 
     The function compares the harm of the first ``SMALLEST_FIELD`` profiles of ``field`` and of all starting profiles.
-    Stepwise simulation computes one decision after the other, with the same rounding errors as the engine. The rounding errors matter if
-    harm is a discontinuous function of the commands: rounding may then decide how much harm a profile causes.
+    Stepwise simulation computes one decision after the other, with the same rounding errors as the engine. The rounding
+    errors matter if harm is a discontinuous function of the commands: rounding may then decide how much harm a profile
+    causes.
 
     Args:
         world: world to simulate, with the bounds of the commands and a random stream.
