@@ -25,7 +25,8 @@ def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings
 
     Args:
         policy: the agent to shield.
-        argument: which worlds of the box to certify: ``corners`` or ``interior``; None means ``corners``.
+        argument: worlds of the box in which the shield certifies actions: ``corners`` or ``interior``; None means
+            ``corners``.
         settings: settings of the agent: its scenario, uncertainty and harm count, and its spec (the text that asked for
             the agent) for error messages.
 
@@ -46,7 +47,8 @@ def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: 
 
     Args:
         policy: the agent to shield.
-        argument: which worlds of the box to certify: ``corners`` or ``interior``; None means ``corners``.
+        argument: worlds of the box in which the shield certifies actions: ``corners`` or ``interior``; None means
+            ``corners``.
         settings: settings of the agent: its scenario, its harm count, and its spec (the text that asked for the agent)
             for error messages.
 
@@ -82,7 +84,8 @@ def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: 
     """Make the shield ``+episode:estimated`` or ``+episode:pairwise:estimated``: the paper's Algorithm 1 on estimates.
 
     At the first decision the shield predicts, in the estimated world, the harm of ``policy`` and of E-V2X-BM (the best
-    constant deceleration). The one with less predicted harm controls the vehicle for the whole episode.
+    constant deceleration). The policy or E-V2X-BM, whichever has less predicted harm, controls the vehicle for the
+    whole episode.
 
     Raises ``InvalidInput`` if ``policy`` already decides on received information.
 
@@ -106,7 +109,7 @@ def make_estimating_e_v2x_bm(argument: str | None, settings: AgentSettings) -> A
     """Make the agent ``e_v2x_bm:estimated`` or ``e_v2x_bm:pairwise:estimated``.
 
     The agent is E-V2X-BM (the best constant deceleration) in the estimated world. ``argument`` is ``pairwise`` for the
-    pairwise form of E-V2X-BM, or None for the coupled form. ``settings`` has the scenario.
+    pairwise form of E-V2X-BM, or None for the coupled form. ``settings`` contains the scenario of the worlds.
     """
     return Estimating(make_e_v2x_bm(argument, settings), settings.needed_scenario())
 

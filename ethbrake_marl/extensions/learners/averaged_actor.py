@@ -35,7 +35,7 @@ class Deterministic(BasePolicy):
         raise NotImplementedError
 
     def expect(self, observation: Float32s) -> Floats:
-        """Predict the size of the gradient of the return with respect to the action, [rows].
+        """Return the predicted size of the gradient of the return with respect to the action, [rows].
 
         ``observation`` [rows, F] are the observations from which the gradient is predicted.
         """
@@ -48,7 +48,8 @@ class Deterministic(BasePolicy):
     def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
         """Return copies of the averaged weights, by name.
 
-        The weights have the same names as in a policy bundle whose network is ``network``.
+        The weights have the names that they have in a policy bundle; ``network`` is the description of the network in
+        this bundle.
         """
         return tensors_of(self, network)
 

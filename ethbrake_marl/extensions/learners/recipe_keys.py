@@ -1,4 +1,4 @@
-"""Types of recipe keys that both algorithms, ``vine`` and ``rollout-classification``, use."""
+"""Types of the values of recipe keys that both algorithms, ``vine`` and ``rollout-classification``, use."""
 
 from __future__ import annotations
 

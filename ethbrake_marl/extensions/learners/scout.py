@@ -89,7 +89,7 @@ def choose_rows(
 
     Args:
         observed: [n, F] observations at all decisions.
-        rows: indices, in ``observed``, of the decisions to draw from.
+        rows: indices (in ``observed``) of the decisions from which the function draws.
         count: number of decisions to draw.
         focus: share of the draws with probabilities in proportion to the predicted size, with replacement (see
             ``draw_rows``). If ``focus`` is 0, all decisions are drawn uniformly and without replacement.

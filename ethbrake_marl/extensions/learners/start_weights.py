@@ -34,14 +34,15 @@ def widened(policy: Policy, training: Training) -> dict[str, NDArray[np.float32]
 
 
 def padded(policy: Policy, training: Training, key: str) -> dict[str, NDArray[np.float32]]:
-    """Return the weights of ``policy`` by name, without the critic, for a training run that may observe more features.
+    """Return the weights of ``policy`` by name, except the weights of its critic, for a training run that may observe
+    more features.
 
     The weights for features that the policy does not observe are 0. Raises ``InvalidInput`` if the training run does
     not observe a feature of the policy.
 
     Args:
         policy: trained policy.
-        training: training run that uses the weights.
+        training: training run that will use the returned weights.
         key: key of the recipe that names the policy; it is quoted in the error message.
 
     """

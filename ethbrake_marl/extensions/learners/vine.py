@@ -25,7 +25,8 @@ from ethbrake_marl.training.training import Training
 class Vine(Algorithm):
     """The algorithm vine, which measures gradients of the return and trains an actor with them.
 
-    The same actor drives all learners. A single learner may be driven by a mixture of experts instead.
+    The same actor drives all learners. If there is only one learner, a mixture of experts may drive this learner
+    instead.
     """
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> VineModel:
@@ -49,7 +50,8 @@ class Vine(Algorithm):
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
         """Return copies of an actor's averaged weights, by name.
 
-        The weights have the same names as in a policy bundle whose network is ``network``.
+        The weights have the names that they have in a policy bundle; ``network`` is the description of the network in
+        this bundle.
         """
         tensors: dict[str, Float32s] = actor.tensors(network)
         return tensors
