@@ -1,6 +1,6 @@
 """First contacts in a box of worlds: when, and at which closing speed, a pair of vehicles may come into contact.
 
-Each function looks at one piece (time interval of constant command). A *path* is a set of worlds with the same impacts
+Each function considers one piece (time interval of constant command). A *path* is a set of worlds with the same impacts
 so far (``affine.Path``). The affine forms of a path may also enclose states of worlds with other impacts. The results
 of the functions are correct for the worlds that really have the impacts of the path.
 """

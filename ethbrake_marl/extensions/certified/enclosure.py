@@ -214,7 +214,7 @@ def ramp(
     Args:
         force: acceleration at the start as an affine form [W] (centre, slopes, remainder), m/s2; the function replaces
             it by the acceleration at the end.
-        wanted: acceleration of the command as an affine form [W], m/s2.
+        wanted: acceleration that the vehicle commands, as an affine form [W], m/s2.
         duration: time during which the command acts, as an affine form [W], s.
         longest: upper limit of ``duration``, s.
         rates: [2, W] rates at which the brakes build up (index 0) and release (index 1), m/s3.
@@ -453,8 +453,8 @@ SCRIPTS = ("full_brake", "coast", "constant")
 
 
 class Boxes(NamedTuple):
-    """Boxes around ``n`` reported worlds: in a box each of a world's ``Q = 8 N - 1`` numbers lies between ``low`` and
-    ``high``.
+    """Boxes around ``n`` reported worlds: each of the ``Q = 8 N - 1`` numbers of a world in the box lies between
+    ``low`` and ``high``.
     """
 
     # [n, Q] smallest values: braking and driving capacity, latency, mass, brake rate, release rate and speed of each
@@ -477,10 +477,11 @@ class Boxes(NamedTuple):
         vehicle with a script other than full braking, coasting or one constant deceleration.
 
         Args:
-            robust: worlds of the box to certify: ``corners`` (for which the function never raises an error) or
-                ``interior``.
+            robust: worlds of the box in which actions are certified: ``corners`` (for which the function never raises
+                an error) or ``interior``.
             scenario: the scenario of the worlds.
-            harm_count: impacts that count: ``first`` (first impact of each pair) or ``total`` (every impact).
+            harm_count: impacts whose harm is counted: ``first`` (first impact of each pair) or ``total`` (every
+                impact).
             others: scripts of the other vehicles; the keys are vehicle indices.
 
         """
@@ -505,7 +506,7 @@ class Boxes(NamedTuple):
     def of(
         cls, possible: Worlds, problem: ProfileProblem, n: int, scenario: Scenario, others: Mapping[int, Script]
     ) -> Boxes:
-        """Return the boxes of ``n`` worlds at the alert.
+        """Return the boxes around ``n`` reported worlds at the alert.
 
         Raises ``InvalidInput`` for worlds that interior mode cannot certify: an obstacle ahead, a vehicle whose command
         changes over time (profile), brakes that began to build up before the alert, or another vehicle whose command is

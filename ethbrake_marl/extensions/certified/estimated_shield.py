@@ -70,13 +70,13 @@ class EstimatedShield:
     The shield starts at the first decision. The shield restarts when its vehicle learns of a further vehicle, learns
     that another vehicle reacts, or sees a vehicle move otherwise than predicted. After a restart, the shield keeps the
     rest of the previous plan if this rest is at least as good as the new plan. From the first decision on,
-    ``predicted_harm`` [n] is the bound at the first decision. ``predicted_harm`` is infinite if the vehicle had an
-    impact before the first decision, because the harm of that impact is unknown.
+    ``predicted_harm`` [n] contains the bound on harm at the first decision. ``predicted_harm`` is infinite if the
+    vehicle had an impact before the first decision, because the harm of that impact is unknown.
 
     Args:
         scenario: the scenario of the worlds; a mixture raises ``InvalidInput``.
         vehicle: index of the shielded vehicle.
-        harm_count: impacts that count: ``first`` (first impact of each pair) or ``total`` (every impact).
+        harm_count: impacts whose harm is counted: ``first`` (first impact of each pair) or ``total`` (every impact).
         robust: worlds in which actions are certified. None: only the median world, in which every unknown quantity has
             its median. ``corners``: the median world and all corners of the ranges of the unknown quantities; more than
             ``MOST_CORNERS`` corners raise ``InvalidInput``. ``interior``: all worlds between the corners that are
@@ -171,12 +171,12 @@ class EstimatedShield:
     ) -> Floats:
         """Return the certified actions, [n], from -1 (full braking) to 1; 0 before the vehicle's latency has elapsed.
 
-        A repeated call at the same time returns the same actions. Raises ``InvalidInput`` for an episode that was not
-        started with ``begin``.
+        A repeated call at the same time of the episodes returns the same actions. Raises ``InvalidInput`` for an
+        episode that was not started with ``begin``.
 
         Args:
             worlds: the true worlds; only the information that the vehicle received is read.
-            proposed: [n] proposed actions.
+            proposed: [n] actions that the policy proposes.
             proposer: the policy and its memory. If no other plan certifies a proposed action, the shield also tries the
                 policy's rollout (simulated episode) in the estimated worlds. If ``proposer`` is None, the shield does
                 not try this rollout.

@@ -45,7 +45,7 @@ class Odometer(NamedTuple):
 
 
 class Estimating(AgentAround):
-    """Agent that lets another agent, ``policy``, control its vehicle on the basis of the estimated world.
+    """Agent whose vehicle is controlled by another agent, ``policy``, on the basis of the estimated world.
 
     The policy starts at its first decision, with the information received by then. The policy restarts in a world when
     the vehicle learns of a further vehicle, or when a message over a channel says that another vehicle reacts. The
@@ -53,7 +53,7 @@ class Estimating(AgentAround):
     policy expected at its first decision.
 
     Args:
-        policy: any agent that reads the state of the line.
+        policy: agent that controls the vehicle; any agent that reads the state of the line is possible.
         scenario: the scenario, which declares the ranges of all unknown quantities; a mixture raises ``InvalidInput``.
         shows: if True, the policy sees the estimated world at every decision; if False, only when the policy starts.
 

@@ -18,7 +18,7 @@ from ethbrake_marl.shields.factories import shield_episodes
 
 
 def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
-    """Make the shield ``+robust`` or ``+robust:interior`` around ``policy``.
+    """Return the shield ``+robust`` or ``+robust:interior`` around ``policy``.
 
     The uncertainty is an interval around each uncertain quantity; together the intervals form a box of possible worlds.
     The shield certifies actions for the corners of this box, or for its whole interior.
@@ -40,7 +40,7 @@ def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings
 
 
 def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
-    """Make the shield ``+robust:estimated`` or ``+robust:interior:estimated``.
+    """Return the shield ``+robust:estimated`` or ``+robust:interior:estimated``.
 
     The shield certifies actions in the estimated world, and also for other values of the quantities that its vehicle
     did not receive, within the ranges of these quantities.
@@ -61,7 +61,7 @@ def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: 
 
 
 def shield_steps_as_estimated(policy: Driver, argument: str | None, settings: AgentSettings) -> Driver:
-    """Make the shield ``+step:estimated``, which certifies every action of ``policy`` in the estimated world.
+    """Return the shield ``+step:estimated``, which certifies every action of ``policy`` in the estimated world.
 
     Raises ``InvalidInput`` if ``policy`` is a team or if the scenario has several learners.
 
@@ -81,7 +81,8 @@ def shield_steps_as_estimated(policy: Driver, argument: str | None, settings: Ag
 
 
 def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
-    """Make the shield ``+episode:estimated`` or ``+episode:pairwise:estimated``: the paper's Algorithm 1 on estimates.
+    """Return the shield ``+episode:estimated`` or ``+episode:pairwise:estimated``: the paper's Algorithm 1 on
+    estimates.
 
     At the first decision the shield predicts, in the estimated world, the harm of ``policy`` and of E-V2X-BM (the best
     constant deceleration). The policy or E-V2X-BM, whichever has less predicted harm, controls the vehicle for the
@@ -106,7 +107,7 @@ def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: 
 
 
 def make_estimating_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
-    """Make the agent ``e_v2x_bm:estimated`` or ``e_v2x_bm:pairwise:estimated``.
+    """Return the agent ``e_v2x_bm:estimated`` or ``e_v2x_bm:pairwise:estimated``.
 
     The agent is E-V2X-BM (the best constant deceleration) in the estimated world. ``argument`` is ``pairwise`` for the
     pairwise form of E-V2X-BM, or None for the coupled form. ``settings`` contains the scenario of the worlds.

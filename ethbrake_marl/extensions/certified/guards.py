@@ -19,9 +19,7 @@ from ethbrake_marl.shields.guard import StepGuard
 
 
 class RobustMode(IntEnum):
-    """Number by which the info ``shield_mode`` reports mode ``robust``; ``eb.ShieldMode`` has the numbers of the other
-    modes.
-    """
+    """Value of the info ``shield_mode`` in mode ``robust``; ``eb.ShieldMode`` contains the values for the other modes."""
 
     ROBUST = 2
 
@@ -62,7 +60,7 @@ class EstimatedGuard(ShieldGuard):
         Args:
             running: the engine, in its state before the step.
             memory: the shield and the policies as they are before the step.
-            proposed: [n, 1] proposed actions.
+            proposed: [n, 1] actions that the policy proposes.
 
         """
         worlds = running.worlds

@@ -40,7 +40,7 @@ class RobustShield(StepShield):
             possible worlds to ``begin`` (argument ``possible``).
         robust: worlds in which actions are certified: ``corners`` (of the box of possible worlds) or ``interior`` (the
             whole box).
-        harm_count: impacts that count: ``first`` (first impact of each pair) or ``total`` (every impact).
+        harm_count: impacts whose harm is counted: ``first`` (first impact of each pair) or ``total`` (every impact).
         others: scripts of the other vehicles; the keys are vehicle indices. None: the scripts of the scenario.
         settings: further keyword arguments of ``StepShield``.
 
@@ -160,7 +160,8 @@ def certify_inside(
         decision: the present decision; its plans are certified for the corners of the boxes (each uncertain number at
             an end of its interval), but not yet for all worlds of the boxes.
         asked: [n] True for episodes that have a decision now. In interior mode an episode ends only at the horizon,
-            because a box may contain moving worlds when all its corners are at rest.
+            because vehicles may still move in some world of a box when all vehicles are at rest in the corners of the
+            box.
 
     """
     plan, other = decision.backup.plan.copy(), (decision.backup.plan != held.plan).any(axis=1)

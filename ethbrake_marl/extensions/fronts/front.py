@@ -114,8 +114,8 @@ def search_front(
 
     For each choice of weights, the result in a world is at least as good as each of ``CONSTANTS`` constant commands,
     and as the results for all other choices of weights. With one learner, the result is also at least as good as the
-    profile that is shipped for this world, as ``agents``, and as every shipped policy that can drive the learner. The
-    result for a world depends neither on ``threads`` nor on the other worlds. Raises the exceptions of
+    profile that is shipped for this world, as each of ``agents``, and as every shipped policy that can drive the
+    learner. The result for a world depends neither on ``threads`` nor on the other worlds. Raises the exceptions of
     ``checked_weights``, ``best_harm`` and ``make_agents``, and ``InvalidInput`` if ``agents`` are given but the
     scenario has several learners.
 
@@ -210,7 +210,9 @@ class Preferring(NamedTuple):
     def of(
         cls, scenario: Scenario, weights: Floats, agents: Sequence[str], silent: Sequence[str], harm_count: HarmCount
     ) -> Preferring:
-        """Fix the ``weights`` [N] in ``scenario``, and make the agents that ``agents`` and ``silent`` name."""
+        """Return ``scenario`` with the fixed ``weights`` [N], and the agents whose specs ``agents`` and ``silent``
+        contain.
+        """
         fixed = scenario.replace(harm_weight=weights.tolist(), objective="preference")
         made = (make_agents(specs, fixed, harm_count=harm_count) for specs in (agents, silent))
         return cls(fixed, *made)
@@ -294,7 +296,9 @@ def observes_weights(agent: Driver) -> bool:
 
 
 class Pool:
-    """Profiles that were tried in the same worlds; the methods choose the best profile of each world for any weights."""
+    """Profiles that were tried in the same worlds. For given weights, the methods choose the best profile of each
+    world.
+    """
 
     def __init__(self) -> None:
         self._profiles: list[Profiles] = []

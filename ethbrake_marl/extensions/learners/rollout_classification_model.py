@@ -151,7 +151,8 @@ class RolloutClassificationModel(VineModel):
         return observed[rows], tried, costs
 
     def _usual(self, rows: Ints, least: Floats) -> Floats:
-        """Update the mean cost of each scenario of a mixture; return the mean costs for B decisions, [B].
+        """Update the mean cost of the cheapest choice in each scenario of a mixture of scenarios; return, for each of B
+        decisions, the mean cost in its scenario, [B].
 
         A mean cost below ``LEAST_USUAL`` is returned as ``LEAST_USUAL``, because costs are divided by the result.
 

@@ -53,7 +53,7 @@ class Scout(nn.Module):
 
         Args:
             observation: [rows, F] observations at the decisions.
-            size: [rows] measured size of each decision.
+            size: [rows] measured size of each decision (absolute gradient, or difference in cost).
             importance: [rows] weight of each decision in the loss.
 
         """
@@ -67,7 +67,7 @@ def draw_rows(expected: Floats, count: int, focus: float) -> tuple[Ints, Float32
 
     Args:
         expected: [n] size of each decision (predicted gradient, or difference in cost), above 0.
-        count: number of decisions to draw.
+        count: number of decisions that are drawn.
         focus: share of the draws with probabilities in proportion to ``expected``; the other draws are uniform.
 
     Returns the indices of the drawn decisions [count], and their importance [count], which is their weight in the loss:
@@ -90,7 +90,7 @@ def choose_rows(
     Args:
         observed: [n, F] observations at all decisions.
         rows: indices (in ``observed``) of the decisions from which the function draws.
-        count: number of decisions to draw.
+        count: number of decisions that are drawn.
         focus: share of the draws with probabilities in proportion to the predicted size, with replacement (see
             ``draw_rows``). If ``focus`` is 0, all decisions are drawn uniformly and without replacement.
         expect: function that predicts the size of decisions, [rows], from observations [rows, F]. If ``expect`` is
