@@ -456,7 +456,8 @@ def since(cell: Cell, i: int, time: float) -> Floats:
 
 @compiled(apart=True)
 def stop(moving: bool, speed: Floats, i: int, length: float, motion: Motion) -> None:
-    """Set speed and distance of a braking vehicle that stops, or may stop, within a piece and then stays at rest.
+    """Set the speed and the distance of a braking vehicle that stops, or may stop, within a piece and then stays at
+    rest.
 
     Args:
         moving: True if the acceleration of any vehicle builds up gradually instead of at once.

@@ -126,7 +126,8 @@ def may_meet(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> b
 def approach(
     cell: Cell, path: Path, motion: Motion, p: int, length: float, front_stands: bool
 ) -> tuple[Approach, bool]:
-    """Return closing speed and time of the contact of pair ``p`` in this piece, and whether such a contact is possible.
+    """Return the closing speed and the time of a contact of pair ``p`` in this piece, and whether such a contact is
+    possible.
 
     Let w be the present closing speed, b the closing acceleration and g the gap. The square of the closing speed w' at
     the contact is then ``w^2 + 2 b g``, and the contact comes after the time ``2 g / (w + w')``. If the front vehicle

@@ -66,8 +66,8 @@ def spring_apart(
 
 @compiled(apart=True)
 def stand_still(cell: Cell, pull: Floats, vague: float, left: float, speed: Floats, way: Floats) -> None:
-    """Correct speed and distance of a braking vehicle: the vehicle stands from the time at which its speed would become
-    negative.
+    """Correct the speed and the distance of a braking vehicle: the vehicle stands from the time at which its speed
+    would become negative.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.

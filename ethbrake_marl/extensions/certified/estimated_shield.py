@@ -80,7 +80,7 @@ class EstimatedShield:
         robust: worlds in which actions are certified. None: only the median world, in which every unknown quantity has
             its median. ``corners``: the median world and all corners of the ranges of the unknown quantities; more than
             ``MOST_CORNERS`` corners raise ``InvalidInput``. ``interior``: all worlds between the corners that are
-            possible at the first decision; in this mode, later information does not restart the shield.
+            possible at the first decision; with ``interior``, later information does not restart the shield.
         others: scripts of the other vehicles; the keys are vehicle indices. None: the scripts of the scenario.
 
     """
@@ -140,7 +140,7 @@ class EstimatedShield:
         return apart
 
     def take(self, rows: Ints) -> EstimatedShield:
-        """Return an independent shield for the episodes with the indices ``rows``."""
+        """Return an independent copy of the shield for only the episodes with the indices ``rows``."""
         apart = copy.copy(self)
         if self.shield.memory.running is not None:
             apart.shield = self.shield.take(rows)
@@ -169,7 +169,8 @@ class EstimatedShield:
     def decide(
         self, worlds: Worlds, proposed: Floats, proposer: Proposer | None = None, *, only: Bools | None = None
     ) -> Floats:
-        """Return the certified actions, [n], from -1 (full braking) to 1; 0 before the vehicle's latency has elapsed.
+        """Return the certified actions, [n], from -1 (full braking) to 1; the action is 0 until the vehicle's latency
+        has elapsed.
 
         A repeated call at the same time of the episodes returns the same actions. Raises ``InvalidInput`` for an
         episode that was not started with ``begin``.
@@ -208,8 +209,8 @@ class EstimatedShield:
         new information requires a restart.
 
         Args:
-            worlds: the true worlds.
-            estimated: the estimated worlds.
+            worlds: the true worlds at the present time, [n].
+            estimated: the estimated worlds at the present time, [n].
             way_m: [n] distance that the shielded vehicle has travelled since the alert, m.
             due: [n] True for worlds that have a decision now.
 
@@ -243,16 +244,17 @@ class EstimatedShield:
     def _begin_shield(
         self, worlds: Worlds, estimated: Worlds, way_m: Floats, rows: Ints, keeps: Bools, before: StepShield | None
     ) -> None:
-        """Start the inner shield (``self.shield``) in the episodes ``rows``. The inner shield certifies actions in the
-        median world and, in mode ``robust``, in the corners of the ranges of unknown quantities.
+        """Start the inner shield (``self.shield``) in the episodes with the indices ``rows``. The inner shield
+        certifies actions in the median world and, in mode ``robust``, in the corners of the ranges of unknown
+        quantities.
 
         Args:
-            worlds: the true worlds of the episodes ``rows``.
-            estimated: the estimated worlds of the episodes ``rows``.
+            worlds: [m] the true worlds of the episodes with the indices ``rows``.
+            estimated: [m] the estimated worlds of the episodes with the indices ``rows``.
             way_m: [m] distance that the shielded vehicle has travelled since the alert, m.
             rows: [m] indices of the episodes in the batch.
             keeps: [m, N] True for vehicles whose predicted state replaces their received state.
-            before: the inner shield before the restart; None at the first start.
+            before: the inner shield as it was before the restart; None if the inner shield starts for the first time.
 
         """
         parts = []

@@ -1,4 +1,4 @@
-"""Agents that decide in the estimated world: received information, completed from the scenario's ranges."""
+"""Agents that decide in the estimated world, which is received information, completed from the scenario's ranges."""
 
 from __future__ import annotations
 

@@ -27,8 +27,8 @@ def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings
         policy: the agent to shield.
         argument: worlds of the box in which the shield certifies actions: ``corners`` or ``interior``; None means
             ``corners``.
-        settings: settings of the agent: its scenario, uncertainty and harm count, and its spec (the text that asked for
-            the agent) for error messages.
+        settings: settings of the agent: its scenario, uncertainty and harm count, and its spec (the text that names the
+            agent), which error messages quote.
 
     """
     where = f"agent {settings.spec!r}"
@@ -49,8 +49,8 @@ def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: 
         policy: the agent to shield.
         argument: worlds of the box in which the shield certifies actions: ``corners`` or ``interior``; None means
             ``corners``.
-        settings: settings of the agent: its scenario, its harm count, and its spec (the text that asked for the agent)
-            for error messages.
+        settings: settings of the agent: its scenario, its harm count, and its spec (the text that names the agent),
+            which error messages quote.
 
     """
     where = f"agent {settings.spec!r}"
@@ -68,8 +68,8 @@ def shield_steps_as_estimated(policy: Driver, argument: str | None, settings: Ag
     Args:
         policy: the agent to shield.
         argument: not used.
-        settings: settings of the agent: its scenario, its harm count, and its spec (the text that asked for the agent)
-            for error messages.
+        settings: settings of the agent: its scenario, its harm count, and its spec (the text that names the agent),
+            which error messages quote.
 
     """
     scenario = settings.needed_scenario()
@@ -93,8 +93,8 @@ def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: 
     Args:
         policy: the agent to compare with E-V2X-BM.
         argument: ``pairwise`` for the pairwise form of E-V2X-BM, None for the coupled form.
-        settings: settings of the agent: its scenario, its harm count, and its spec (the text that asked for the agent)
-            for error messages.
+        settings: settings of the agent: its scenario, its harm count, and its spec (the text that names the agent),
+            which error messages quote.
 
     """
     hybrid = shield_episodes(policy, argument, settings)

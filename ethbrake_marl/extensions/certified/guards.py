@@ -19,7 +19,7 @@ from ethbrake_marl.shields.guard import StepGuard
 
 
 class RobustMode(IntEnum):
-    """Value of the info ``shield_mode`` in mode ``robust``; ``eb.ShieldMode`` contains the values for the other modes."""
+    """Value of the info ``shield_mode`` in mode ``robust``. ``eb.ShieldMode`` contains the values for other modes."""
 
     ROBUST = 2
 

@@ -155,8 +155,8 @@ def checked_uncertainty(given: object) -> Uncertainty | None:
 
 
 def mode_uncertainty(mode: str, given: object, where: str) -> Uncertainty | None:
-    """Return the uncertainty ``given`` as an ``Uncertainty``, after a check that it fits the shield mode ``mode``; None
-    if ``given`` is None.
+    """Check that the uncertainty ``given`` fits the shield mode ``mode``; return it as an ``Uncertainty``, or None if
+    ``given`` is None.
 
     Raises ``InvalidInput`` if mode ``robust`` has no uncertainty, or another mode has one; ``where`` is the beginning
     of the error message. ``given`` is an ``Uncertainty``, a text such as ``"gaps_m=0.5"``, or None.

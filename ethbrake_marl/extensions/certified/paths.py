@@ -118,7 +118,8 @@ def keep_rough(cell: Cell, path: Path, worst: float, out: Floats) -> float:
 def branch(
     cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, how: Approach, worst: float, out: Floats
 ) -> float:
-    """Handle the worlds in which pair ``p`` has an impact in this piece; return the largest harm recorded so far.
+    """For the worlds in which pair ``p`` has an impact in this piece, record the harm or put a new path on the stack;
+    return the largest harm recorded so far.
 
     If no other impact can follow, the harm in the worlds with the impact is final and is recorded. If another impact
     can follow, these worlds become a new path on the stack. If the new path cannot be simulated, a rough bound on its

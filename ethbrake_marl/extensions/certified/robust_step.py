@@ -134,9 +134,10 @@ class RobustShield(StepShield):
     def _leaves_range(self, running: Running) -> Bools:
         """Return a mask [n]: True for each reported world whose box may have a world that leaves the range between the
         members. The members are the reported world and the corners of its box; ``running`` contains the states of the
-        members. The mask is True where ``StepShield`` returns True. In interior mode the mask is also True where the
-        latency of the shielded vehicle is uncertain, because the worlds of a box then have their decisions at different
-        times. If one uncertain number (friction) changes several quantities, the mask is True for all worlds.
+        members. The mask is True where the method of the same name in ``StepShield`` returns True. In interior mode the
+        mask is also True where the latency of the shielded vehicle is uncertain, because the worlds of a box then have
+        their decisions at different times. If one uncertain number (friction) changes several quantities, the mask is
+        True for all worlds.
         """
         leaves, boxes = super()._leaves_range(running), self.boxes
         if boxes is not None:

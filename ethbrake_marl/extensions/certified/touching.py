@@ -85,7 +85,7 @@ def apart(touch: Floats) -> float:
 @compiled(apart=True)
 def faster(cell: Cell, p: int) -> float:
     """Return the largest possible ratio v / u, for an impact of pair ``p``: v is the front vehicle's speed after the
-    impact, and u is the rear vehicle's speed before the impact. The result is at least 1. ``cell`` contains the
+    impact, and u is the rear vehicle's speed before the impact. The returned ratio is at least 1. ``cell`` contains the
     coefficient of restitution and each vehicle's share of the pair's mass.
     """
     return float(max(1.0, (1.0 + cell.restitution) * high(cell.share[p, 0])))
@@ -96,8 +96,8 @@ def backwards(cell: Cell, p: int) -> float:
     """Return the largest backward speed of the rear vehicle of pair ``p`` after an impact, as a multiple of this
     vehicle's speed before the impact.
 
-    The result is at least 0. ``cell`` contains the coefficient of restitution and each vehicle's share of the pair's
-    mass.
+    The returned multiple is at least 0. ``cell`` contains the coefficient of restitution and each vehicle's share of
+    the pair's mass.
     """
     return float(max(0.0, (1.0 + cell.restitution) * high(cell.share[p, 1]) - 1.0))
 
@@ -229,8 +229,8 @@ def creep(cell: Cell, touch: Floats, p: int, slowest: float, weakest: float, har
         touch: [TOUCH_WIDTH] state of the pair in contact (a row of ``Path.touch``); the function changes it in place.
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         slowest: smallest speed of the pair's centre of mass in the piece, m/s.
-        weakest: smallest acceleration that either vehicle commands, m/s2.
-        hardest: largest acceleration that either vehicle commands, m/s2.
+        weakest: smallest acceleration that either vehicle of the pair commands in the piece, m/s2.
+        hardest: largest acceleration that either vehicle of the pair commands in the piece, m/s2.
         length: duration of the piece (time interval of constant command), s.
 
     """

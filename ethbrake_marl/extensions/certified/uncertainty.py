@@ -172,7 +172,7 @@ class Uncertainty:
 
         Args:
             worlds: the reported worlds, [n].
-            rng: source of randomness.
+            rng: generator of the random numbers.
             corners: if True, draw one of the corners of the box; if False, draw uniformly from the whole box.
 
         """
@@ -274,8 +274,8 @@ def _placed(worlds: Worlds, sides: list[_Side], share: Callable[[int], Floats | 
     Args:
         worlds: the reported worlds, [n].
         sides: the uncertain numbers and their smallest and largest values, as ``_sides`` returns them.
-        share: function that gets the index of an uncertain number and returns its position in the interval, a number or
-            [n]: 0 is the smallest value, 1 the largest.
+        share: function from the index of an uncertain number to the position of this number in its interval; a position
+            is one number for all worlds, or [n]; 0 is the smallest value, 1 the largest.
 
     """
     changed: dict[str, Any] = {}

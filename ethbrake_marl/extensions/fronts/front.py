@@ -133,7 +133,7 @@ def search_front(
         harm_count: harm count that is weighted, ``first`` or ``total``.
         budget: number of profiles to try for each world and choice of weights.
         seed: seed of the random search.
-        threads: number of threads.
+        threads: number of threads of the search.
         agents: specs of agents for the one learner, such as ``universal``. For each choice of weights, the agents drive
             every world, in the scenario with these weights as ``harm_weight`` and with the objective ``preference``.
         on_progress: function that is called with the number of finished searches and the number of all searches. There
@@ -172,15 +172,15 @@ def least_largest(scenario: Scenario, worlds: Worlds, front: Front, *, budget: i
     """Search for commands that minimise the largest harm of a vehicle, and return the harm of each vehicle under these
     commands.
 
-    The result is an array [n, N] in m2/s2 for each harm count. In every world, the largest harm of a vehicle under the
-    resulting commands is at most the largest harm of a vehicle under any profile of ``front``.
+    The result is a dictionary from the harm count to an array [n, N] in m2/s2. In every world, the largest harm of a
+    vehicle under the resulting commands is at most the largest harm of a vehicle under any profile of ``front``.
 
     Args:
         scenario: scenario of the worlds.
         worlds: worlds at t = 0, [n].
         front: front that was searched in the same worlds.
         budget: number of profiles to try in each world.
-        threads: number of threads.
+        threads: number of threads of the search.
 
     """
     count, task = front.harm_count, Task(scenario, scenario.learners, front.harm_count)

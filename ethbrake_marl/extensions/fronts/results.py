@@ -38,7 +38,7 @@ def front_results(
     weighted harm.
 
     Args:
-        front: front that is written to the file.
+        front: front whose results the function returns.
         scenario: scenario of the worlds.
         sample: worlds for which the front was searched.
         beside: results to compare with the front: a mapping from a name to a mapping from the harm count to the harm of

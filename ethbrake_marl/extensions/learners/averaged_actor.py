@@ -46,7 +46,7 @@ class Deterministic(BasePolicy):
         return np.clip(self.means(observation), -1.0, 1.0)
 
     def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return copies of the averaged weights, by name.
+        """Return a dictionary from names to copies of the averaged weights.
 
         The weights have the names that they have in a policy bundle; ``network`` is the description of the network in
         this bundle.
@@ -102,7 +102,7 @@ class AveragedActor(Deterministic):
     def take_over(self, tensors: Mapping[str, Float32s]) -> None:
         """Copy the weights of a policy bundle into both networks, ``learning`` and ``average``.
 
-        ``tensors`` contains the weights of the policy bundle by name.
+        ``tensors`` is a mapping from names to the weights of the policy bundle.
         """
         state = self.state_dict()
         for name, theirs in sb3_names(self._spec).items():

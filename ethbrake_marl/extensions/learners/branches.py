@@ -84,7 +84,7 @@ def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) 
         decide: function that returns the actions of the learners, [m, L]. The three arguments of ``decide`` are the
             observations [m, L, F], the indices of the m worlds, and the number of steps so far.
         gamma: discount factor per time step.
-        at_least: during this number of first steps, no world ends early because its vehicles are at rest.
+        at_least: number of steps, from the start, in which no world ends early because its vehicles are at rest.
 
     If harm is the only term of the reward, the simulation of a world ends as soon as all its vehicles are at rest and
     will stay at rest. If the simulation of a world fails, its return is NaN.
@@ -130,9 +130,9 @@ def visit(engine: Engine, act: Act) -> tuple[Observations, State]:
 def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
     """Return, for each of m worlds, whether all its vehicles are at rest and will stay at rest, [m] bool.
 
-    ``rows`` [m] are the indices of the worlds in the engine; ``before`` [m, columns] is their packed state one step
-    earlier. The result is True only if nothing has changed in this step and if every latency has elapsed. When a
-    latency elapses, the observation may change, so that a policy may move a vehicle again.
+    ``rows`` [m] are the indices of the worlds in the engine; ``before`` [m, columns] is the packed state of these
+    worlds one time step earlier. The result is True only if nothing has changed in this step and if every latency has
+    elapsed. When a latency elapses, the observation may change, so that a policy may move a vehicle again.
     """
     if engine.packed.has_messages or engine.in_pieces:
         return np.zeros(len(rows), np.bool_)  # a message may still change the observation, or a profile the command

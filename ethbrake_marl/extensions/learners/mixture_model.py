@@ -93,8 +93,8 @@ class ExpertsModel(VineModel):
         update_learning_rate(optimizers, rate)
 
     def _enter(self, stage: Stage, number: int) -> None:
-        """Prepare a stage of the training run. ``number`` is the number of the update at which the stage begins or is
-        resumed.
+        """Prepare a stage of the training run of a mixture of experts. ``number`` is the number of the update at which
+        the stage begins or is resumed.
 
         If the stage trains a second or later expert, this expert first imitates templates (random braking profiles)
         that do better than the earlier experts. After the imitation, the worlds for the training of this expert are
@@ -176,8 +176,8 @@ class ExpertsModel(VineModel):
         the cost of the cheapest expert.
 
         Args:
-            seen: [B, F] observations.
-            costs: [B, K] cost of each expert.
+            seen: [B, F] observations at the B decisions.
+            costs: [B, K] cost of each expert at each of the B decisions.
             importance: [B] weight of each decision in the loss; None: all weights are 1.
 
         """

@@ -33,7 +33,7 @@ class RolloutClassification(Algorithm):
         return RolloutClassificationModel(environment, recipe, weights)
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return copies of an actor's averaged weights, by name.
+        """Return a dictionary from names to copies of an actor's averaged weights.
 
         The weights have the names that they have in a policy bundle; ``network`` is the description of the network in
         this bundle.

@@ -62,7 +62,7 @@ class ChoosingActor(Deterministic):
         action_space: Gymnasium space of an action.
         rate: learning rate as a function of the share of the training run that remains (1 to 0).
         recipe: recipe of the training run.
-        policies: for each trained policy that the actor can choose, its weights by name.
+        policies: for each trained policy that the actor can choose, a mapping from names to weights.
         members: number of scenarios in the mixture of scenarios in which the actor is trained; 1 if the scenario is not
             a mixture.
 
@@ -131,7 +131,7 @@ class ChoosingActor(Deterministic):
         """Store m decisions, with the tried choices and their extra costs, in the memory.
 
         Args:
-            seen: [m, F] observations.
+            seen: [m, F] observations at the m decisions.
             tried: [m, C] numbers of the tried choices, as ``choose`` returns them; column 0: the actor's own choice.
             more: [m, C] extra cost of each tried choice.
 
@@ -150,8 +150,8 @@ class ChoosingActor(Deterministic):
         Args:
             batches: number of gradient steps.
             count: number of decisions for each gradient step.
-            focus: share of the draws with probabilities in proportion to a decision's largest extra cost; the other
-                draws are uniform.
+            focus: share of the draws in which the probability of a decision is proportional to its largest extra cost;
+                the other draws are uniform.
 
         """
         known = min(int(self.known), len(self.seen))

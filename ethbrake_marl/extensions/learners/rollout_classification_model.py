@@ -36,7 +36,7 @@ class RolloutClassificationModel(VineModel):
     Args:
         environment: environment in which the model is trained.
         recipe: recipe of the training run.
-        policies: for each trained policy that the actor can choose, its weights by name.
+        policies: for each trained policy that the actor can choose, a mapping from names to weights.
 
     """
 

@@ -33,7 +33,7 @@ def trusted_targets(tried: Tried, radius: float, anchor: float) -> tuple[Float32
     target of an output at or below -1 is never below the output.
 
     Args:
-        tried: decisions, with the actor's outputs and the measured gradients.
+        tried: decisions at which two actions were tried, with the actor's outputs and the measured gradients.
         radius: trust radius; the distance from an output to its target is always smaller than this radius.
         anchor: weight in the loss of a decision with gradient 0; must be above 0. A larger ``anchor`` moves the target
             closer to the output, especially if the gradient is small.

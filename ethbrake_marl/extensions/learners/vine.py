@@ -1,6 +1,7 @@
 """The algorithm ``vine``: try two actions in the same state, and measure the gradient of the return.
 
-The name is from Schulman et al. 2015 (TRPO), who sample branches from visited states with common random numbers.
+The name of the algorithm is from Schulman et al. 2015 (TRPO), who sample branches from visited states with common
+random numbers.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class Vine(Algorithm):
         return model
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return copies of an actor's averaged weights, by name.
+        """Return a dictionary from names to copies of an actor's averaged weights.
 
         The weights have the names that they have in a policy bundle; ``network`` is the description of the network in
         this bundle.
@@ -57,7 +58,7 @@ class Vine(Algorithm):
         return tensors
 
     def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:
-        """Return the model's optimisers by name.
+        """Return a dictionary from names to the optimisers of the model.
 
         A model with one actor has one optimiser, ``policy``. A mixture of experts has the optimisers ``network_1``,
         ``network_2``, ... of its experts, and ``gate`` of its gating network.

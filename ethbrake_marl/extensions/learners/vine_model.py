@@ -82,7 +82,7 @@ class VineModel(BaseAlgorithm):
         return self
 
     def _update(self, callback: BaseCallback, total: int) -> None:
-        """Make one update of the training: collect decisions, and learn from them.
+        """Make one update of the training run: collect decisions, and learn from them.
 
         ``callback`` is the callback of the training run, and ``total`` is the number of decisions in the whole training
         run.
@@ -122,7 +122,7 @@ class VineModel(BaseAlgorithm):
         Args:
             seen: [steps, rows, F] observations at the visited decisions.
             moments: states of the worlds at the visited decisions.
-            actor: policy; a tried action is the policy's action plus or minus an offset.
+            actor: policy that drives; a tried action is the action of this policy plus or minus an offset.
 
         Returns the decisions at which the two actions were tried, with the measured gradients.
 

@@ -26,7 +26,7 @@ _RIGHT_START = "must be the name of a shipped policy, for instance ppo, or ppo@P
 
 
 class ActorShape(Shape):
-    """Network of the actor. The algorithm vine has no critic."""
+    """Description of the actor's network. The algorithm vine has no critic."""
 
     policy: Layers = Field(description=ACTOR_LAYERS)
     activation: Activation = "relu"  # activation function of the hidden layers
