@@ -221,8 +221,8 @@ def ramp(
         rise: change of speed as an affine form [W], m/s; the function adds its result to this form in place.
         gain: distance minus (initial speed times duration) as an affine form [W], m; the function adds its result to
             this form in place.
-        swing: [2]; the function writes the largest deviation of the acceleration from its mean (m/s2) into it: at index
-            0 if the acceleration falls, at index 1 if the acceleration rises.
+        swing: [2] array in which the function stores the largest deviation of the acceleration from its mean, m/s2: at
+            index 0 if the acceleration falls, at index 1 if the acceleration rises.
 
     """
     start, there = difference(force, wanted), True

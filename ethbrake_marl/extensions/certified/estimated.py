@@ -132,7 +132,7 @@ def _places_of(worlds: Worlds, vehicle: int) -> Floats:
     [n, N] m.
 
     Positions ahead are positive, positions behind negative. The position of a direct neighbour is exactly plus or minus
-    the gap.
+    the gap to this neighbour.
     """
     ahead = np.concatenate([np.zeros((worlds.n, 1)), -np.cumsum(worlds.gaps_m, axis=1)], axis=1)
     place: Floats = ahead - ahead[:, [vehicle]]

@@ -74,7 +74,7 @@ class EstimatedShield:
     vehicle had an impact before the first decision, because the harm of that impact is unknown.
 
     Args:
-        scenario: the scenario of the worlds; a mixture raises ``InvalidInput``.
+        scenario: the scenario of the worlds; a mixture of scenarios raises ``InvalidInput``.
         vehicle: index of the shielded vehicle.
         harm_count: impacts whose harm is counted: ``first`` (first impact of each pair) or ``total`` (every impact).
         robust: worlds in which actions are certified. None: only the median world, in which every unknown quantity has
@@ -312,7 +312,7 @@ class EstimatedShield:
 
         Args:
             estimated: the estimated worlds at the present time, [n].
-            heard: [n, N] True for vehicles whose received state is compared with the predicted states.
+            heard: [n, N] True for each vehicle whose received state is compared with its predicted states.
 
         """
         running = self.shield.memory.running

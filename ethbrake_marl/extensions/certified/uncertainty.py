@@ -2,10 +2,10 @@
 these intervals.
 
 The true value of a quantity with the reported value x lies in [x - h, x + h]. The half-width h is a number in the
-quantity's unit, or a share of x (such as 5 %). Impossible values are cut off from the interval: latencies, speeds and
-gaps below 0, and speeds above the vehicle's limit. The *box* of a world is the set of all combinations of values in its
-intervals. The *members* of a world are the reported world and every corner of its box: 2^d corners for d uncertain
-numbers. In shield mode ``robust`` the bound on the harm is proven for the members
+quantity's unit, or a share of x (such as 5 %). Impossible values are cut off from the interval of a quantity:
+latencies, speeds and gaps below 0, and speeds above the speed limit of the vehicle. The *box* of a world is the set of
+all combinations of values in its intervals. The *members* of a world are the reported world and every corner of its
+box: 2^d corners for d uncertain numbers. In shield mode ``robust`` the bound on the harm is proven for the members
 (``docs/internals/proofs/shield-corners.md``).
 """
 

@@ -171,7 +171,8 @@ def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, sta
 
 
 def counted_harm(engine: Engine, count: HarmCount) -> Floats:
-    """Return the harm up to the present time that each of the L learners of an engine should make small, [n, L] m2/s2.
+    """Return, for each of the L learners of an engine, the harm (up to the present time) that this learner should make
+    small, [n, L] m2/s2.
 
     If the reward has objectives, this harm is the value of the learner's objective. If the reward has no objectives,
     this harm is the harm of the whole line. ``count`` is the count of harm: ``first`` (each pair's first impact) or

@@ -100,7 +100,8 @@ class ExpertsModel(VineModel):
         that do better than the earlier experts. After the imitation, the worlds for the training of this expert are
         selected.
 
-        The preparation depends only on the earlier experts, so a resumed training run repeats the preparation exactly.
+        The preparation of a stage depends only on the earlier experts, so a resumed training run repeats the
+        preparation exactly.
 
         Raises ``NoBetterTemplate`` if no template does better than the earlier experts, or if no world can be selected.
         """

@@ -47,7 +47,8 @@ PolicyName = Annotated[str, Field(pattern=r"^[a-z-]+(@.+)?$", max_length=4096)]
 
 
 class RolloutClassificationRecipe(TrainingRecipe):
-    """Recipe of rollout classification: at some decisions several actions are tried, each to the end of the episode.
+    """Recipe of rollout classification: at some decisions several actions are tried; after each of them, the episode is
+    simulated to its end.
 
     At each decision the policy chooses one of ``network.choices`` actions, evenly spaced from -1 to 1, or one of the
     trained ``policies``. A round consists of ``n_envs x n_steps`` decisions and an update. At ``tried`` decisions of a
