@@ -447,7 +447,7 @@ def since(cell: Cell, i: int, time: float) -> Floats:
     """Return the time (at least 0 s) for which the command of vehicle ``i`` has been in effect at ``time``, as an
     affine form [W].
 
-    ``time`` is in s after the first decision. ``cell`` contains the box of worlds.
+    ``time`` is in s, measured from the first decision. ``cell`` contains the box of worlds.
     """
     since = negative(cell.onset[i])
     since[0] += time

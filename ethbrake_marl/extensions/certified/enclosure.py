@@ -316,7 +316,7 @@ def pieces(known: Known, onset: Floats, earliest: float, plan: Floats) -> tuple[
     """Return the times that separate the J pieces (time intervals of constant command), [J + 1], and the action in each
     piece, [J].
 
-    The times are in s after the first decision.
+    The times are in s, measured from the first decision.
 
     Args:
         known: quantities that are the same in all worlds of the box.

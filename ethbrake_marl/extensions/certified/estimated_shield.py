@@ -81,7 +81,8 @@ class EstimatedShield:
             its median. ``corners``: the median world and all corners of the ranges of the unknown quantities; more than
             ``MOST_CORNERS`` corners raise ``InvalidInput``. ``interior``: all worlds between the corners that are
             possible at the first decision; with ``interior``, later information does not restart the shield.
-        others: scripts of the other vehicles; the keys are vehicle indices. None: the scripts of the scenario.
+        others: scripts of the other vehicles; the keys are vehicle indices. If ``others`` is None, the shield uses the
+            scripts of the scenario.
 
     """
 

@@ -31,7 +31,7 @@ class RobustOptions(ShieldOptions):
             ``robust`` if ``uncertainty`` is given, and ``step`` if ``uncertainty`` is not given.
         uncertainty: for mode ``robust``, an interval around each uncertain quantity, such as ``"gaps_m=0.5"``.
         robust: worlds in which mode ``robust`` certifies actions: ``corners`` (fast) means only the ends of the
-            intervals, ``interior`` all values in the intervals.
+            intervals, and ``interior`` means all values in the intervals.
         estimated: if True, certify actions in the estimated world, which uses only the information that the vehicle
             received and the scenario's ranges. ``estimated=True`` is possible in modes ``step`` and ``robust`` with one
             learner, and without ``uncertainty``, ``allowance``, ``cap``, ``logging`` and ``shares``.

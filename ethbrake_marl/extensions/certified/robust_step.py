@@ -41,7 +41,8 @@ class RobustShield(StepShield):
         robust: worlds in which actions are certified: ``corners`` (of the box of possible worlds) or ``interior`` (the
             whole box).
         harm_count: impacts whose harm is counted: ``first`` (first impact of each pair) or ``total`` (every impact).
-        others: scripts of the other vehicles; the keys are vehicle indices. None: the scripts of the scenario.
+        others: scripts of the other vehicles; the keys are vehicle indices. If ``others`` is None, the shield uses the
+            scripts of the scenario.
         settings: further keyword arguments of ``StepShield``.
 
     Raises ``InvalidInput`` in three cases: if ``StepShield`` raises this error, if an uncertainty is combined with

@@ -29,8 +29,8 @@ def driven(cell: Cell, i: int, speed: float, since: float) -> float:
     """Return the largest speed (m/s) that vehicle ``i`` can reach by driving if its speed at the time ``since`` is at
     most ``speed``.
 
-    ``since`` is in s after the first decision. ``cell`` contains the box of worlds and the vehicles' commands over
-    time.
+    ``since`` is a time in s, measured from the first decision. ``cell`` contains the box of worlds and the vehicles'
+    commands over time.
     """
     drive, rest = 0.0, cell.times[-1] - since
     if i == cell.vehicle:

@@ -25,9 +25,9 @@ def nondominated(points: Floats) -> Bools:
 def hypervolume(points: Floats, reference: Floats) -> float:
     """Return the volume of the region that the points dominate, up to the reference point.
 
-    Smaller coordinates are better. A point that is not below the reference point in every coordinate is ignored. The
-    volume is exact; the function cuts the region into slices along the last coordinate (Zitzler 1999, "hypervolume by
-    slicing objectives").
+    Smaller coordinates are better. The function ignores every point of which at least one coordinate is not below the
+    same coordinate of the reference point. The volume is exact; the function cuts the region into slices along the last
+    coordinate (Zitzler 1999, "hypervolume by slicing objectives").
 
     >>> import numpy as np
     >>> from ethbrake_marl.extensions.fronts.hypervolume import hypervolume

@@ -32,7 +32,7 @@ def front_results(
 ) -> Json:
     """Return the content of ``front.json``: the front, full braking, maximin, and the agents.
 
-    All means have 95 % intervals. An interval is computed over worlds, or over recordings if the worlds come from
+    All means have 95 % intervals. The intervals are computed over worlds or, if the worlds come from recordings, over
     recordings. For each choice of weights, ``ratio`` is the mean weighted harm of an agent divided by the mean weighted
     harm of the front (null if the latter is 0), and ``above`` is the agent's mean weighted harm minus the front's mean
     weighted harm.
@@ -142,7 +142,7 @@ def hypervolumes(front: Front, full_brake: Floats, clusters: Texts | None = None
 def _interval(values: Floats) -> Json | None:
     """Return ``values[0]`` and its 95 % interval: the 2.5 % and 97.5 % percentiles of ``values[1:]``.
 
-    Returns None if one of the values is not finite.
+    Returns None if at least one of ``values`` is not finite.
     """
     if not np.isfinite(values).all():
         return None
