@@ -3,9 +3,9 @@
 A *box* contains all worlds whose K uncertain numbers lie in given intervals. An *affine form* represents a number that
 differs from world to world. An affine form is an array of W = K + 2 numbers for ``c + g_1 e_1 + ... + g_K e_K + r e``:
 a centre c, one slope g_k for each uncertain number, and a remainder r. ``e_k`` in [-1, 1] is the position of a world in
-the interval of uncertain number k; all forms use the same ``e_k``. ``e`` in [-1, 1] is unknown, and each form has its
-own ``e``. In the difference of two affine forms, parts that depend on the same ``e_k`` cancel. The difference of two
-plain intervals would be wider.
+the interval of uncertain number k; all affine forms use the same ``e_k``. ``e`` in [-1, 1] is unknown, and each affine
+form has its own ``e``. In the difference of two affine forms, parts that depend on the same ``e_k`` cancel. The
+difference of two plain intervals would be wider than this difference.
 
 The result of every operation on affine forms encloses the exact result: for each world of the box, some value of ``e``
 makes the form equal to the exact result. The operations ignore floating-point rounding; instead, the speeds and
@@ -78,7 +78,7 @@ def negative(x: Floats) -> Floats:
 def between(least: float, most: float, width: int) -> Floats:
     """Return an affine form that encloses every number between ``least`` and ``most``.
 
-    ``width`` is the number W of entries of the form (centre, slopes, remainder).
+    ``width`` is the number W of entries of the affine form (centre, slopes, remainder).
     """
     out = np.zeros(width)
     out[0], out[-1] = 0.5 * (least + most), 0.5 * (most - least)
@@ -181,8 +181,8 @@ def cut(x: Floats, least: float, most: float) -> Floats:
     """Return an affine form [W] (centre, slopes, remainder) that encloses ``x``, whose values are known to lie between
     ``least`` and ``most``.
 
-    If the limits ``least`` and ``most`` make the interval of ``x`` less than half as wide, the result encloses every
-    number of this smaller interval. If they do not, the result is ``x`` itself.
+    If the limits ``least`` and ``most`` leave less than half of the interval of ``x``, the result encloses every number
+    of the part that they leave. If they leave at least half, the result is ``x`` itself.
     """
     inside_low, inside_high = max(low(x), least), min(high(x), most)
     if inside_high - inside_low < radius(x):
@@ -210,9 +210,9 @@ TOUCH_WIDTH = 9
 class Forces(NamedTuple):
     """Accelerations while brakes or engines build up gradually: affine forms for every vehicle and time interval.
 
-    On the second axis of an array, index 0 is the time from the alert to the first piece (time interval of constant
-    command), and index j + 1 is piece j. Impacts do not change the accelerations, so the arrays are the same for every
-    sequence of impacts.
+    On the second axis of an array, index 0 belongs to the time from the alert to the first piece (time interval of
+    constant command), and index j + 1 belongs to piece j. Impacts do not change the accelerations, so the arrays are
+    the same for every sequence of impacts.
     """
 
     mean: Floats  # [N, J + 1, W] mean acceleration of the piece, m/s2
@@ -300,8 +300,8 @@ def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
         path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
             interval of constant command).
-        piece: index of the piece (time interval of constant command), from 0 to J - 1.
-        motion: the function writes its results into this object.
+        piece: index of the piece (time interval of constant command), from 0 to J - 1 if there are J pieces.
+        motion: object into which the function writes its results.
 
     """
     for i in range(cell.speed.shape[0]):
@@ -353,9 +353,10 @@ def hold(speed: Floats, i: int, length: float, motion: Motion) -> None:
     """Widen the affine forms of the motion of vehicle ``i`` in place, because brakes that release gradually may still
     hold the vehicle at rest.
 
-    A vehicle that such brakes hold may stand until its acceleration is above 0. Let u be the size of the negative speed
-    that the formulas give for the time of standing. The true speed of the vehicle is larger than the computed speed by
-    at most u. The true distance is larger than the computed distance by at most u times the duration of the piece.
+    A vehicle that is held by gradually releasing brakes may stand until its acceleration is above 0. While the vehicle
+    stands, the formulas give a negative speed; let u be the absolute value of this speed. The true speed of the vehicle
+    is larger than the computed speed by at most u. The true distance is larger than the computed distance by at most u
+    times the duration of the piece.
 
     Args:
         speed: speed at the start of the piece as an affine form [W], m/s.
@@ -387,13 +388,13 @@ def command(cell: Cell, i: int, piece: int, motion: Motion) -> None:
     """Set ``motion.pull`` of vehicle ``i`` in a piece: the acceleration that the vehicle commands, or 0 before the
     vehicle's latency has elapsed.
 
-    The function also sets ``motion.rest`` and ``motion.vague`` of the vehicle.
+    The function also sets ``motion.rest`` and ``motion.vague`` of vehicle ``i``.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
         i: index of the vehicle.
-        piece: index of the piece (time interval of constant command), from 0 to J - 1.
-        motion: the function writes its results into this object.
+        piece: index of the piece (time interval of constant command), from 0 to J - 1 if there are J pieces.
+        motion: object into which the function writes its results.
 
     """
     pull = motion.pull[i]
@@ -421,7 +422,7 @@ def begin_later(cell: Cell, i: int, piece: int, motion: Motion) -> None:
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
         i: index of the vehicle.
-        piece: index of the piece (time interval of constant command), from 0 to J - 1.
+        piece: index of the piece (time interval of constant command), from 0 to J - 1 if there are J pieces.
         motion: motion of each vehicle in the piece; the function changes ``onward``, ``reach``, ``pull`` and ``vague``
             of vehicle ``i``.
 
@@ -443,10 +444,10 @@ def begin_later(cell: Cell, i: int, piece: int, motion: Motion) -> None:
 
 @compiled(apart=True)
 def since(cell: Cell, i: int, time: float) -> Floats:
-    """Return for how many seconds (at least 0) the command of vehicle ``i`` has been in effect at ``time``, as an
+    """Return the time (at least 0 s) for which the command of vehicle ``i`` has been in effect at ``time``, as an
     affine form [W].
 
-    ``time`` is in s after the first decision. ``cell`` has the box of worlds.
+    ``time`` is in s, measured from the first decision. ``cell`` contains the box of worlds.
     """
     since = negative(cell.onset[i])
     since[0] += time
@@ -455,7 +456,8 @@ def since(cell: Cell, i: int, time: float) -> Floats:
 
 @compiled(apart=True)
 def stop(moving: bool, speed: Floats, i: int, length: float, motion: Motion) -> None:
-    """Set speed and distance of a braking vehicle that stops, or may stop, within a piece and then stays at rest.
+    """Set the speed and the distance of a braking vehicle that stops, or may stop, within a piece and then stays at
+    rest.
 
     Args:
         moving: True if the acceleration of any vehicle builds up gradually instead of at once.

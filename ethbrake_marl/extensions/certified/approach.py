@@ -1,6 +1,6 @@
 """First contacts in a box of worlds: when, and at which closing speed, a pair of vehicles may come into contact.
 
-Each function looks at one piece (time interval of constant command). A *path* is a set of worlds with the same impacts
+Each function considers one piece (time interval of constant command). A *path* is a set of worlds with the same impacts
 so far (``affine.Path``). The affine forms of a path may also enclose states of worlds with other impacts. The results
 of the functions are correct for the worlds that really have the impacts of the path.
 """
@@ -57,8 +57,8 @@ class Approach(NamedTuple):
 
 @compiled(apart=True)
 def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
-    """Return the largest change of the relative speed or the gap of pair ``p`` that bounces of the neighbouring pairs
-    may cause.
+    """Return the largest change, caused by bounces of the neighbouring pairs, of the relative speed or of the gap of
+    pair ``p``.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -78,9 +78,9 @@ def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
 
 @compiled(apart=True)
 def pressing(motion: Motion, p: int) -> tuple[float, float]:
-    """Return the smallest and the largest closing acceleration of pair ``p`` in a piece, m/s2. The two results also
-    cover vehicles that stop within the piece. ``motion`` has the motion of all vehicles in the piece (time interval of
-    constant command).
+    """Return the smallest and the largest closing acceleration of pair ``p`` in a piece, m/s2. The two results are also
+    correct if a vehicle stops within the piece. ``motion`` contains the motion of all vehicles in the piece (time
+    interval of constant command).
     """
     front_low, front_high = low(motion.pull[p]) - motion.vague[p], high(motion.pull[p]) + motion.vague[p]
     rear_low, rear_high = low(motion.pull[p + 1]) - motion.vague[p + 1], high(motion.pull[p + 1]) + motion.vague[p + 1]
@@ -126,11 +126,12 @@ def may_meet(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> b
 def approach(
     cell: Cell, path: Path, motion: Motion, p: int, length: float, front_stands: bool
 ) -> tuple[Approach, bool]:
-    """Return closing speed and time of the contact of pair ``p`` in this piece, and whether such a contact is possible.
+    """Return the closing speed and the time of a contact of pair ``p`` in this piece, and whether such a contact is
+    possible.
 
-    Let w be the present closing speed, b the closing acceleration and g the gap. The closing speed at contact, w', then
-    has the square ``w^2 + 2 b g``, and the contact comes after the time ``2 g / (w + w')``. If the front vehicle stops
-    before the contact, g includes the stopping distance of the front vehicle.
+    Let w be the present closing speed, b the closing acceleration and g the gap. The square of the closing speed w' at
+    the contact is then ``w^2 + 2 b g``, and the contact comes after the time ``2 g / (w + w')``. If the front vehicle
+    stops before the contact, g includes the stopping distance of the front vehicle.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.

@@ -29,7 +29,7 @@ from ethbrake_marl.physics.state import Floats
 def spring_apart(
     cell: Cell, motion: Motion, p: int, how: Approach, jump: Floats, left: Floats, after: Path, way: Floats
 ) -> None:
-    """Compute how both vehicles of a pair that separates after an impact move to the end of the piece.
+    """Compute the motion of both vehicles of a pair that separates after an impact, up to the end of the piece.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -39,8 +39,8 @@ def spring_apart(
         how: closing speed and time of the contact of pair ``p``, as ``approach`` returns them.
         jump: change of the pair's relative speed by the impact, as an affine form [W] (centre, slopes, remainder), m/s.
         left: time from the impact to the end of the piece (time interval of constant command) as an affine form [W], s.
-        after: the path (worlds with the same impacts so far) after the impact; the function writes the vehicles' speeds
-            at the end of the piece into it.
+        after: the path (worlds with the same impacts so far) after the impact; the function writes into this path the
+            vehicles' speeds at the end of the piece.
         way: [N, W] distances travelled in the piece, m; the function writes the distances of the two vehicles of the
             pair into it.
 
@@ -66,8 +66,8 @@ def spring_apart(
 
 @compiled(apart=True)
 def stand_still(cell: Cell, pull: Floats, vague: float, left: float, speed: Floats, way: Floats) -> None:
-    """Correct speed and distance of a braking vehicle: the vehicle stands from the time at which its speed would become
-    negative.
+    """Correct the speed and the distance of a braking vehicle: the vehicle stands from the time at which its speed
+    would become negative.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -94,7 +94,7 @@ def stand_still(cell: Cell, pull: Floats, vague: float, left: float, speed: Floa
 def stay(
     cell: Cell, path: Path, motion: Motion, p: int, how: Approach, speed: Floats, left: Floats, after: Path, way: Floats
 ) -> None:
-    """Compute how both vehicles of a pair that stays in contact after an impact move to the end of the piece.
+    """Compute the motion of both vehicles of a pair that stays in contact after an impact, up to the end of the piece.
 
     Both vehicles get the speed of the pair's centre of mass.
 

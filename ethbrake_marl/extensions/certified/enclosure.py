@@ -1,8 +1,8 @@
 """Upper bound on the harm of a plan in all worlds of a box, by branch and bound.
 
 A *box* contains all worlds whose uncertain numbers lie in given intervals. A *plan* has one action for each decision up
-to the horizon. The search divides the box into parts: it repeatedly halves the part with the largest bound. Letters for
-shapes: a world consists of ``Q`` numbers, of which ``K`` are uncertain; a plan has ``L`` actions.
+to the horizon. The search divides the box into parts: it repeatedly halves the part with the largest upper bound on the
+harm. Letters for shapes: a world consists of ``Q`` numbers, of which ``K`` are uncertain; a plan has ``L`` actions.
 """
 
 from __future__ import annotations
@@ -90,10 +90,10 @@ def form_of(low_: Floats, high_: Floats, which: int, free: Ints) -> Floats:
 def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats) -> tuple[Cell, Floats]:
     """Return the cell of a box, and the time (s) from the alert to the start of the first piece as an affine form [W].
 
-    A *cell* is the box as affine forms, with the commands divided into pieces (time intervals of constant command).
-    Times in a cell count from the first decision. (If the shielded vehicle's latency is uncertain, the time from the
-    alert to the first decision differs between worlds.) The first piece starts before the first decision: d seconds
-    before it, where d is the shortest time from the alert to the first decision in any world of the box.
+    A *cell* is the box as affine forms, with the commands divided into pieces (time intervals of constant command). All
+    times in a cell are measured from the first decision. If the shielded vehicle's latency is uncertain, the time from
+    the alert to the first decision differs between worlds. The first piece starts d seconds before the first decision,
+    where d is the shortest time from the alert to the first decision in any world of the box.
 
     Args:
         low_: [Q] smallest value in the box for each of the Q numbers of a world.
@@ -204,25 +204,25 @@ def ramp(
     force: Floats, wanted: Floats, duration: Floats, longest: float, rates: Floats, rise: Floats, gain: Floats,
     swing: Floats,
 ) -> bool:  # fmt: skip
-    """Let an acceleration approach its target ``wanted`` for some time, and add the effect on speed and distance.
+    """Let an acceleration approach its target ``wanted`` during ``duration``, and add the effect on speed and distance.
 
     Let d be the difference (acceleration minus ``wanted``) at the start, e this difference at the end, t the duration,
     and m the time during which the acceleration changes. The changes of speed and distance are those of the constant
-    acceleration ``wanted``, plus ``m (d + e) / 2`` in speed and ``m t (d + e) / 2 - m^2 (d + 2 e) / 6`` in distance.
-    Returns True if the acceleration equals ``wanted`` at the end in every world of the box.
+    acceleration ``wanted``, plus ``m (d + e) / 2`` for the speed and ``m t (d + e) / 2 - m^2 (d + 2 e) / 6`` for the
+    distance. Returns True if the acceleration equals ``wanted`` at the end in every world of the box.
 
     Args:
         force: acceleration at the start as an affine form [W] (centre, slopes, remainder), m/s2; the function replaces
             it by the acceleration at the end.
-        wanted: acceleration of the command as an affine form [W], m/s2.
-        duration: time for which the command acts, as an affine form [W], s.
+        wanted: acceleration that the vehicle commands, as an affine form [W], m/s2.
+        duration: time during which the command acts, as an affine form [W], s.
         longest: upper limit of ``duration``, s.
         rates: [2, W] rates at which the brakes build up (index 0) and release (index 1), m/s3.
         rise: change of speed as an affine form [W], m/s; the function adds its result to this form in place.
         gain: distance minus (initial speed times duration) as an affine form [W], m; the function adds its result to
             this form in place.
-        swing: [2]; the function writes the largest deviation of the acceleration from its mean (m/s2) into it: at index
-            0 if the acceleration falls, at index 1 if the acceleration rises.
+        swing: [2] array in which the function stores the largest deviation of the acceleration from its mean, m/s2: at
+            index 0 if the acceleration falls, at index 1 if the acceleration rises.
 
     """
     start, there = difference(force, wanted), True
@@ -316,12 +316,12 @@ def pieces(known: Known, onset: Floats, earliest: float, plan: Floats) -> tuple[
     """Return the times that separate the J pieces (time intervals of constant command), [J + 1], and the action in each
     piece, [J].
 
-    The times are in s after the first decision.
+    The times are in s, measured from the first decision.
 
     Args:
         known: quantities that are the same in all worlds of the box.
         onset: [N, W] time after the first decision at which each vehicle's command takes effect, s.
-        earliest: shortest time from the alert to the first decision in any world, s.
+        earliest: shortest time from the alert to the first decision in any world of the box, s.
         plan: [L] action of the shielded vehicle at each decision.
 
     """
@@ -397,8 +397,8 @@ def bound_box(
     low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, enough: float, cells: int, only_enough: bool
 ) -> tuple[float, int]:
     """Return an upper bound (m2/s2) on the harm of a plan in all worlds of a box, and how many parts of the box were
-    examined. The function halves the part with the largest bound until the bound of the whole box is at most
-    ``enough``, or ``cells`` parts were examined.
+    examined. The function repeatedly halves the part with the largest bound, until the bound of the whole box is at
+    most ``enough``, or ``cells`` parts were examined.
 
     Args:
         low_: [Q] smallest value in the box for each of the Q numbers of a world.
@@ -453,8 +453,8 @@ SCRIPTS = ("full_brake", "coast", "constant")
 
 
 class Boxes(NamedTuple):
-    """Boxes around ``n`` reported worlds: in a box each of a world's ``Q = 8 N - 1`` numbers lies between ``low`` and
-    ``high``.
+    """Boxes around ``n`` reported worlds: each of the ``Q = 8 N - 1`` numbers of a world in the box lies between
+    ``low`` and ``high``.
     """
 
     # [n, Q] smallest values: braking and driving capacity, latency, mass, brake rate, release rate and speed of each
@@ -477,10 +477,11 @@ class Boxes(NamedTuple):
         vehicle with a script other than full braking, coasting or one constant deceleration.
 
         Args:
-            robust: worlds of the box to certify: ``corners`` (for which the function never raises an error) or
-                ``interior``.
+            robust: worlds of the box in which actions are certified: ``corners`` (for which the function never raises
+                an error) or ``interior``.
             scenario: the scenario of the worlds.
-            harm_count: impacts that count: ``first`` (first impact of each pair) or ``total`` (every impact).
+            harm_count: impacts whose harm is counted: ``first`` (first impact of each pair) or ``total`` (every
+                impact).
             others: scripts of the other vehicles; the keys are vehicle indices.
 
         """
@@ -505,7 +506,7 @@ class Boxes(NamedTuple):
     def of(
         cls, possible: Worlds, problem: ProfileProblem, n: int, scenario: Scenario, others: Mapping[int, Script]
     ) -> Boxes:
-        """Return the boxes of ``n`` worlds at the alert.
+        """Return the boxes around ``n`` reported worlds at the alert.
 
         Raises ``InvalidInput`` for worlds that interior mode cannot certify: an obstacle ahead, a vehicle whose command
         changes over time (profile), brakes that began to build up before the alert, or another vehicle whose command is
@@ -514,8 +515,7 @@ class Boxes(NamedTuple):
         Args:
             possible: [n * M] worlds, M consecutive worlds for each box: the reported world, then the corners of its
                 box.
-            problem: table of the worlds in ``possible`` (one row for each world), including the commands of the other
-                vehicles.
+            problem: table with one row for each world in ``possible``, including the commands of the other vehicles.
             n: number of boxes.
             scenario: the scenario of the worlds.
             others: scripts of the other vehicles; the keys are vehicle indices.
@@ -561,7 +561,7 @@ class Boxes(NamedTuple):
         """Return the boxes of all running episodes, with the new boxes (``self``) at the indices ``rows``.
 
         Args:
-            old: boxes of all episodes from before the new episodes begin; None if no episode has begun yet.
+            old: boxes of all episodes as they were before the new episodes began; None if no episode had begun before.
             rows: [m] indices of the new episodes. If all episodes are new, ``old`` is not used.
 
         """
@@ -573,12 +573,12 @@ class Boxes(NamedTuple):
         return self._replace(**arrays)
 
     def at_alert(self, plans: Floats, harm: Floats) -> Floats:
-        """Return an upper bound on the harm of each world's plan at the alert, [n] m2/s2.
+        """Return, for each world at the alert, an upper bound on the harm of the world's plan, [n] m2/s2.
 
         Args:
             plans: [n, L] action of the shielded vehicle at each decision, for each world.
             harm: [n] largest harm of each world's plan in any corner of the world's box, m2/s2; the search stops when
-                its bound is close to this harm.
+                the upper bound that it has computed is close to this harm.
 
         """
         return self.bound(np.arange(len(plans)), plans, NEAR * harm + NEARLY_NOTHING, CELLS_AT_ALERT)
@@ -586,10 +586,10 @@ class Boxes(NamedTuple):
     def bound(
         self, rows: Ints, plans: Floats, enough: Floats, cells: int = CELLS, *, only_enough: bool = False
     ) -> Floats:
-        """Return an upper bound on the harm since the alert, for each plan in all worlds of the plan's box, [m] m2/s2.
+        """Return, for each plan, an upper bound on the harm since the alert in all worlds of the plan's box, [m] m2/s2.
 
         Args:
-            rows: [m] indices of the boxes.
+            rows: [m] indices of the boxes for which the search computes a bound.
             plans: [m, L] action of the shielded vehicle at each decision, for each box.
             enough: [m] the search in a box stops as soon as the bound of the whole box is at most this number, m2/s2.
             cells: largest number of parts of each box that the search examines.
@@ -619,7 +619,7 @@ def _refusal(what: str) -> InvalidInput:
 def checked_robust(robust: object, where: str) -> str:
     """Return ``robust`` if it is ``corners`` or ``interior``; raise ``UnknownName`` otherwise.
 
-    ``where`` is the start of the error message; it names the setting.
+    ``where`` is the start of the error message; it names the setting that is checked.
     """
     if robust not in CERTAINTIES:
         raise unknown_name(f"{where}: robust", robust, CERTAINTIES)

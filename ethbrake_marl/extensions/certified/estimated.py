@@ -3,14 +3,14 @@
 A vehicle is *known* if its message has arrived or it is in sight. The estimate combines these sources:
 
 * A known vehicle: its capacities, mass and own latency, and the newest state that was received from it. The estimate
-  extrapolates this state to the present. If a command was in force at the time of the state, the vehicle is assumed to
-  follow its script from this time on. If not, the vehicle is assumed to coast until the time at which it is expected to
-  react.
-* The scenario, for a vehicle that is not known. Each quantity is the median of its distribution, or a chosen value of
-  its range. The vehicle is assumed to follow its script from the alert on.
-* The scenario, for each quantity that the messages of a known vehicle lack (``v2x: tells``). A received place is used
-  only if the speed was received, too. A received command is used only if place and speed were received, too. A received
-  intent (announced command) is not used, because the script already predicts what the vehicle does.
+  extrapolates this state to the present. If a command was in force at the time of this state, the vehicle is assumed to
+  follow its script from the time of the state on. If no command was in force, the vehicle is assumed to coast until the
+  time at which it is expected to react.
+* The scenario, for a vehicle that is not known. Each quantity of an unknown vehicle is the median of its distribution,
+  or a chosen value of its range. An unknown vehicle is assumed to follow its script from the alert on.
+* The scenario, for each quantity that the messages of a known vehicle lack (``v2x: tells``). A received position is
+  used only if the speed was received, too. A received command is used only if position and speed were received, too. A
+  received intent (announced command) is not used, because the script already predicts what the vehicle does.
 * The estimating vehicle itself: measurements of its own state, its distance since the alert, and its impacts with known
   neighbours.
 
@@ -75,7 +75,8 @@ class Told(NamedTuple):
     def heard(self) -> Floats:
         """Amount of information about each vehicle, [n, N].
 
-        0: nothing is known. 1: something is known, but not both place and speed. 2: place and speed are known.
+        The number 0 means that nothing is known about the vehicle. The number 1 means that something is known, but not
+        both position and speed. The number 2 means that position and speed are known.
         """
         return self.pieces.any(axis=2).astype(np.float64) + self.known
 
@@ -131,7 +132,7 @@ def _places_of(worlds: Worlds, vehicle: int) -> Floats:
     [n, N] m.
 
     Positions ahead are positive, positions behind negative. The position of a direct neighbour is exactly plus or minus
-    the gap.
+    the gap to this neighbour.
     """
     ahead = np.concatenate([np.zeros((worlds.n, 1)), -np.cumsum(worlds.gaps_m, axis=1)], axis=1)
     place: Floats = ahead - ahead[:, [vehicle]]
@@ -148,7 +149,7 @@ class Ranges:
     Keys of the mappings ``middle``, ``low`` and ``high``: ``place`` (position relative to the estimating vehicle at the
     alert, m), ``speeds_mps``, ``braking_capacity_mps2``, ``mass_t``, ``latency_s`` (latency without the delay of the
     alert message, s) and ``news_s`` (time at which a vehicle has received the alert and may react, s; 0 without a
-    channel). For each key, a mapping has an array [N] with one value for each vehicle.
+    channel). Each of the three mappings contains, for each key, an array [N] with one value for each vehicle.
     """
 
     vehicle: int  # index of the estimating vehicle
@@ -160,10 +161,10 @@ class Ranges:
 
     @classmethod
     def of(cls, scenario: Scenario, vehicle: int, others: Mapping[int, Script] | None = None) -> Ranges:
-        """Return the ranges that ``scenario`` declares for all vehicles. The vehicle with index ``vehicle`` uses them
-        for its estimates.
+        """Return the ranges that ``scenario`` declares for the quantities of all vehicles. The vehicle with index
+        ``vehicle`` uses these ranges for its estimates.
 
-        ``others`` has the scripts of the other vehicles; the keys are vehicle indices. If ``others`` is None, the
+        ``others`` contains the scripts of the other vehicles; the keys are vehicle indices. If ``others`` is None, the
         scripts of the scenario are used. Raises ``InvalidInput`` for a mixture of scenarios, because an unknown vehicle
         could belong to any of them.
         """
@@ -197,8 +198,8 @@ class Ranges:
         return cls(vehicle, others, middle, low, high, float(world.obstacle_gap_m[0]))
 
     def at(self, share: Mapping[tuple[str, int], float] | None, key: str) -> Floats:
-        """Return one quantity of every vehicle, [N]: the median of its range, or the value at a selected position in
-        the range.
+        """Return one quantity of every vehicle, [N]: for each vehicle the median of the quantity, or the value at a
+        chosen position in the range of the quantity.
 
         Args:
             share: for some pairs (quantity, vehicle index), the position of the value in its range: 0 is the smallest
@@ -215,9 +216,9 @@ class Ranges:
 
     @property
     def uncertain(self) -> tuple[tuple[str, int], ...]:
-        """The numbers of the other vehicles that are uncertain, as pairs (quantity, vehicle index).
+        """The uncertain quantities of the other vehicles, as pairs (quantity, vehicle index).
 
-        A number is uncertain if the scenario declares a range for it instead of one value.
+        A quantity of a vehicle is uncertain if the scenario declares a range for it instead of one value.
         """
         others = [j for j in range(len(self.middle["place"])) if j != self.vehicle]
         return tuple((key, j) for j in others for key in OF_OTHERS if self.low[key][j] < self.high[key][j])
@@ -229,13 +230,14 @@ class Ranges:
         share: Mapping[tuple[str, int], float] | None = None,
         foretold: tuple[Worlds, Bools] | None = None,
     ) -> Worlds:
-        """Return the estimated worlds of the vehicle at the present time, [n].
+        """Return the estimated worlds of the estimating vehicle at the present time, [n].
 
         Args:
             worlds: the true worlds; only the information that the vehicle received is read.
             way_m: [n] distance that the estimating vehicle has travelled since the alert, m.
             share: for some pairs (quantity, vehicle index), the position of the value in its range: 0 is the smallest
-                value, 1 the largest. All other values are medians. If ``share`` is None, every value is a median.
+                value, 1 the largest. Every other unknown quantity gets its median. If ``share`` is None, every unknown
+                quantity gets its median.
             foretold: the predicted present worlds, including impacts, and a mask [n, N]: True for a vehicle whose
                 predicted state replaces the state in its last message. If ``foretold`` is None, the estimate uses no
                 prediction.
@@ -301,8 +303,8 @@ def _places(ahead_m: Floats, behind_m: Floats, vehicle: int) -> Floats:
     behind negative.
 
     Args:
-        ahead_m: [P] gaps of the pairs, m; the function uses them only in front of ``vehicle``.
-        behind_m: [P] gaps of the pairs, m; the function uses them only behind ``vehicle``.
+        ahead_m: [P] gap of each pair, m; the function uses only the gaps in front of ``vehicle``.
+        behind_m: [P] gap of each pair, m; the function uses only the gaps behind ``vehicle``.
         vehicle: index of the vehicle whose position is 0.
 
     """

@@ -1,11 +1,11 @@
 """Shields that decide in the estimated world: they use only the information that their vehicle received.
 
-The module ``estimated`` explains the *estimated world*. Mode ``step`` certifies every action in the estimated world in
-which every unknown quantity has its median. Mode ``step`` promises nothing about the true world. Mode ``robust`` also
-certifies every action in the corners: the estimated worlds in which every unknown quantity has its smallest or largest
-value. If the true world is one of these corners, the harm in the true world up to the horizon is at most the bound at
-the first decision. Reason: a later message only removes corners that contradict the message, and a new plan replaces
-the present plan only if the new plan is better in the remaining corners.
+The module ``estimated`` explains the *estimated world*. Mode ``step`` certifies every action in one estimated world:
+the world in which every unknown quantity has its median. Mode ``step`` promises nothing about the true world. Mode
+``robust`` also certifies every action in the corners: the estimated worlds in which every unknown quantity has its
+smallest or largest value. If the true world is one of the corners, the harm in the true world up to the horizon is at
+most the bound at the first decision. The reason is that a later message only removes corners that contradict the
+message, and a new plan replaces the present plan only if the new plan is better in the remaining corners.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ SURPRISE = 1e-6  # largest difference (m, m/s) between a measurement and its pre
 
 
 def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
-    """After a restart of the shield in the episodes ``rows``, restore the harm so far, and keep each old plan that is
-    at least as good as the new plan.
+    """After a restart of the shield in the episodes ``rows``, restore the harm so far, and replace each new plan by the
+    rest of the old plan if this rest is at least as good.
 
     ``shield`` has just been restarted; the function changes it in place. ``before`` is a copy of the shield from before
     the restart.
@@ -70,18 +70,19 @@ class EstimatedShield:
     The shield starts at the first decision. The shield restarts when its vehicle learns of a further vehicle, learns
     that another vehicle reacts, or sees a vehicle move otherwise than predicted. After a restart, the shield keeps the
     rest of the previous plan if this rest is at least as good as the new plan. From the first decision on,
-    ``predicted_harm`` [n] is the bound at the first decision. ``predicted_harm`` is infinite if the vehicle had an
-    impact before the first decision, because the harm of that impact is unknown.
+    ``predicted_harm`` [n] contains the bound on harm at the first decision. ``predicted_harm`` is infinite if the
+    vehicle had an impact before the first decision, because the harm of that impact is unknown.
 
     Args:
-        scenario: the scenario of the worlds; a mixture raises ``InvalidInput``.
+        scenario: the scenario of the worlds; a mixture of scenarios raises ``InvalidInput``.
         vehicle: index of the shielded vehicle.
-        harm_count: impacts that count: ``first`` (first impact of each pair) or ``total`` (every impact).
-        robust: worlds in which actions are certified. None: only the world in which every unknown quantity has its
-            median. ``corners``: this world and all corners of the ranges of the unknown quantities; more than
+        harm_count: impacts whose harm is counted: ``first`` (first impact of each pair) or ``total`` (every impact).
+        robust: worlds in which actions are certified. None: only the median world, in which every unknown quantity has
+            its median. ``corners``: the median world and all corners of the ranges of the unknown quantities; more than
             ``MOST_CORNERS`` corners raise ``InvalidInput``. ``interior``: all worlds between the corners that are
-            possible at the first decision; later information then does not restart the shield.
-        others: scripts of the other vehicles; the keys are vehicle indices. None: the scripts of the scenario.
+            possible at the first decision; with ``interior``, later information does not restart the shield.
+        others: scripts of the other vehicles; the keys are vehicle indices. If ``others`` is None, the shield uses the
+            scripts of the scenario.
 
     """
 
@@ -125,8 +126,8 @@ class EstimatedShield:
 
     @property
     def members(self) -> int:
-        """Number of possible worlds in which an action is certified for each true world: the median world and all
-        corners.
+        """Number of possible worlds in which the shield certifies an action, for each true world: the median world and
+        all corners.
         """
         return 1 + len(self._corners())
 
@@ -140,7 +141,7 @@ class EstimatedShield:
         return apart
 
     def take(self, rows: Ints) -> EstimatedShield:
-        """Return an independent shield for the episodes with the indices ``rows``."""
+        """Return an independent copy of the shield for only the episodes with the indices ``rows``."""
         apart = copy.copy(self)
         if self.shield.memory.running is not None:
             apart.shield = self.shield.take(rows)
@@ -169,16 +170,18 @@ class EstimatedShield:
     def decide(
         self, worlds: Worlds, proposed: Floats, proposer: Proposer | None = None, *, only: Bools | None = None
     ) -> Floats:
-        """Return the certified actions, [n], from -1 (full braking) to 1; 0 before the vehicle's latency has elapsed.
+        """Return the certified actions, [n], from -1 (full braking) to 1; the action is 0 until the vehicle's latency
+        has elapsed.
 
-        A repeated call at the same time returns the same actions. Raises ``InvalidInput`` for an episode that was not
-        started with ``begin``.
+        A repeated call at the same time of the episodes returns the same actions. Raises ``InvalidInput`` for an
+        episode that was not started with ``begin``.
 
         Args:
             worlds: the true worlds; only the information that the vehicle received is read.
-            proposed: [n] proposed actions.
-            proposer: the policy and its memory. If no other plan certifies a proposal, the shield also tries the
-                policy's rollout in the estimated worlds. If ``proposer`` is None, the shield tries no rollout.
+            proposed: [n] actions that the policy proposes.
+            proposer: the policy and its memory. If no other plan certifies a proposed action, the shield also tries the
+                policy's rollout (simulated episode) in the estimated worlds. If ``proposer`` is None, the shield does
+                not try this rollout.
             only: [n] True for worlds in which the vehicle decides now; None means all worlds.
 
         """
@@ -203,12 +206,12 @@ class EstimatedShield:
         return self._wanted.copy()
 
     def _begin_anew(self, worlds: Worlds, estimated: Worlds, way_m: Floats, due: Bools) -> None:
-        """Start the inner shield (``self.shield``) in worlds where it has not started; restart it where new information
-        requires this.
+        """Start the inner shield (``self.shield``) in worlds in which it has not started; restart it in worlds in which
+        new information requires a restart.
 
         Args:
-            worlds: the true worlds.
-            estimated: the estimated worlds.
+            worlds: the true worlds at the present time, [n].
+            estimated: the estimated worlds at the present time, [n].
             way_m: [n] distance that the shielded vehicle has travelled since the alert, m.
             due: [n] True for worlds that have a decision now.
 
@@ -242,16 +245,17 @@ class EstimatedShield:
     def _begin_shield(
         self, worlds: Worlds, estimated: Worlds, way_m: Floats, rows: Ints, keeps: Bools, before: StepShield | None
     ) -> None:
-        """Start the inner shield (``self.shield``) in the episodes ``rows``. It certifies actions in the median world
-        and, in mode ``robust``, in the corners of the ranges of unknown quantities.
+        """Start the inner shield (``self.shield``) in the episodes with the indices ``rows``. The inner shield
+        certifies actions in the median world and, in mode ``robust``, in the corners of the ranges of unknown
+        quantities.
 
         Args:
-            worlds: the true worlds of the episodes ``rows``.
-            estimated: the estimated worlds of the episodes ``rows``.
+            worlds: [m] the true worlds of the episodes with the indices ``rows``.
+            estimated: [m] the estimated worlds of the episodes with the indices ``rows``.
             way_m: [m] distance that the shielded vehicle has travelled since the alert, m.
             rows: [m] indices of the episodes in the batch.
             keeps: [m, N] True for vehicles whose predicted state replaces their received state.
-            before: the inner shield before the restart; None at the first start.
+            before: the inner shield as it was before the restart; None if the inner shield starts for the first time.
 
         """
         parts = []
@@ -270,7 +274,7 @@ class EstimatedShield:
         """Return a mask [n, N]: True for each vehicle whose predicted state replaces its received state.
 
         The mask is True if a vehicle is unknown, or if its last message is older than its last predicted impact or
-        contact. ``received`` has the received information; ``time_s`` [n] is the present time.
+        contact. ``received`` is the information that the vehicle has received; ``time_s`` [n] is the present time.
         """
         running = self.shield.memory.running
         if running is None:
@@ -287,8 +291,8 @@ class EstimatedShield:
         return keeps
 
     def _note_impacts(self, worlds: Worlds) -> None:
-        """Store the present time as the time of the last impact for each vehicle that had an impact since the last
-        decision in any possible world.
+        """Store the present time as the time of the last impact for each vehicle that, in any possible world, had an
+        impact since the last decision.
 
         ``worlds`` are the true worlds at the present time.
         """
@@ -309,7 +313,7 @@ class EstimatedShield:
 
         Args:
             estimated: the estimated worlds at the present time, [n].
-            heard: [n, N] True for vehicles whose received state is compared with the predicted states.
+            heard: [n, N] True for each vehicle whose received state is compared with its predicted states.
 
         """
         running = self.shield.memory.running

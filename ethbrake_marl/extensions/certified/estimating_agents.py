@@ -1,4 +1,4 @@
-"""Agents that decide in the estimated world: received information, completed from the scenario's ranges."""
+"""Agents that decide in the estimated world, which is received information, completed from the scenario's ranges."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Odometer(NamedTuple):
         return cls(np.zeros(alert.n), alert.time_s.copy(), alert.speeds_mps[:, vehicle].copy())
 
     def look(self, worlds: Worlds, vehicle: int) -> Odometer:
-        """Return the odometer advanced to the present time; ``worlds`` [n] are the present worlds. The method adds the
+        """Return a new odometer for the present time; ``worlds`` [n] are the present worlds. The method adds the
         distance since the last decision: mean speed times time, or the stopping distance if a braking vehicle stopped.
         The added distance is exact if the command was constant.
         """
@@ -45,7 +45,7 @@ class Odometer(NamedTuple):
 
 
 class Estimating(AgentAround):
-    """Agent that lets another agent, ``policy``, control its vehicle on the basis of the estimated world.
+    """Agent whose vehicle is controlled by another agent, ``policy``, on the basis of the estimated world.
 
     The policy starts at its first decision, with the information received by then. The policy restarts in a world when
     the vehicle learns of a further vehicle, or when a message over a channel says that another vehicle reacts. The
@@ -53,8 +53,9 @@ class Estimating(AgentAround):
     policy expected at its first decision.
 
     Args:
-        policy: any agent that reads the state of the line.
-        scenario: the scenario, which declares the ranges of all unknown quantities; a mixture raises ``InvalidInput``.
+        policy: agent that controls the vehicle; any agent that reads the state of the line is possible.
+        scenario: the scenario, which declares the ranges of all unknown quantities; a mixture of scenarios raises
+            ``InvalidInput``.
         shows: if True, the policy sees the estimated world at every decision; if False, only when the policy starts.
 
     """
@@ -73,7 +74,7 @@ class Estimating(AgentAround):
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         """Return the agent's memory at the start of episodes, as a mapping.
 
-        The policy does not start here, because the vehicle has not received any information yet.
+        This method does not start the policy, because the vehicle has not received any information yet.
 
         Args:
             alert: the worlds at the alert, [n].
@@ -117,9 +118,10 @@ class Estimating(AgentAround):
     def _heard(self, worlds: Worlds, vehicle: int) -> Floats:
         """Return a summary of the information that ``vehicle`` has received about each vehicle, [n, 2 N].
 
-        The first N columns have the amount of information about each vehicle (``Told.heard``). The other N columns have
-        a 1 for each vehicle whose reaction was reported in a message but not predicted, and a 0 for all others. The
-        policy restarts in worlds where this summary changes. ``worlds`` are the true worlds at the present time.
+        The first N columns contain the amount of information about each vehicle (``Told.heard``). The other N columns
+        contain a 1 for each vehicle whose reaction was reported in a message but not predicted, and a 0 for all other
+        vehicles. The policy restarts in worlds in which this summary changes. ``worlds`` are the true worlds at the
+        present time.
         """
         known = Told.to(worlds, vehicle)
         # a received latency predicts the reaction, unless a channel may delay the reaction
@@ -152,7 +154,7 @@ class EstimatingHybrid(Estimating):
     def _shown_at_first(self, estimated: Worlds) -> Worlds:
         """Return the estimated worlds with the present time set to 0 and past impacts removed.
 
-        The rollouts that compare the policy with E-V2X-BM start in these worlds.
+        The rollouts (simulated episodes) that compare the policy with E-V2X-BM start in the returned worlds.
         """
         v, n = estimated.vehicles, estimated.n
         latency = np.maximum(v.latency_s - estimated.time_s[:, np.newaxis], 0.0)

@@ -18,16 +18,17 @@ from ethbrake_marl.shields.factories import shield_episodes
 
 
 def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
-    """Make the shield ``+robust`` or ``+robust:interior`` around ``policy``.
+    """Return the shield ``+robust`` or ``+robust:interior`` around ``policy``.
 
     The uncertainty is an interval around each uncertain quantity; together the intervals form a box of possible worlds.
     The shield certifies actions for the corners of this box, or for its whole interior.
 
     Args:
         policy: the agent to shield.
-        argument: which worlds of the box to certify: ``corners`` or ``interior``; None means ``corners``.
-        settings: settings of the agent: its scenario, uncertainty and harm count, and its spec (the text that asked for
-            the agent) for error messages.
+        argument: worlds of the box in which the shield certifies actions: ``corners`` or ``interior``; None means
+            ``corners``.
+        settings: settings of the agent: its scenario, uncertainty and harm count, and its spec (the text that names the
+            agent), which error messages quote.
 
     """
     where = f"agent {settings.spec!r}"
@@ -39,16 +40,17 @@ def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings
 
 
 def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
-    """Make the shield ``+robust:estimated`` or ``+robust:interior:estimated``.
+    """Return the shield ``+robust:estimated`` or ``+robust:interior:estimated``.
 
     The shield certifies actions in the estimated world, and also for other values of the quantities that its vehicle
     did not receive, within the ranges of these quantities.
 
     Args:
         policy: the agent to shield.
-        argument: which worlds of the box to certify: ``corners`` or ``interior``; None means ``corners``.
-        settings: settings of the agent: its scenario, its harm count, and its spec (the text that asked for the agent)
-            for error messages.
+        argument: worlds of the box in which the shield certifies actions: ``corners`` or ``interior``; None means
+            ``corners``.
+        settings: settings of the agent: its scenario, its harm count, and its spec (the text that names the agent),
+            which error messages quote.
 
     """
     where = f"agent {settings.spec!r}"
@@ -59,15 +61,15 @@ def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: 
 
 
 def shield_steps_as_estimated(policy: Driver, argument: str | None, settings: AgentSettings) -> Driver:
-    """Make the shield ``+step:estimated``, which certifies every action of ``policy`` in the estimated world.
+    """Return the shield ``+step:estimated``, which certifies every action of ``policy`` in the estimated world.
 
     Raises ``InvalidInput`` if ``policy`` is a team or if the scenario has several learners.
 
     Args:
         policy: the agent to shield.
         argument: not used.
-        settings: settings of the agent: its scenario, its harm count, and its spec (the text that asked for the agent)
-            for error messages.
+        settings: settings of the agent: its scenario, its harm count, and its spec (the text that names the agent),
+            which error messages quote.
 
     """
     scenario = settings.needed_scenario()
@@ -79,18 +81,20 @@ def shield_steps_as_estimated(policy: Driver, argument: str | None, settings: Ag
 
 
 def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
-    """Make the shield ``+episode:estimated`` or ``+episode:pairwise:estimated``: the paper's Algorithm 1 on estimates.
+    """Return the shield ``+episode:estimated`` or ``+episode:pairwise:estimated``: the paper's Algorithm 1 on
+    estimates.
 
     At the first decision the shield predicts, in the estimated world, the harm of ``policy`` and of E-V2X-BM (the best
-    constant deceleration). The one with less predicted harm controls the vehicle for the whole episode.
+    constant deceleration). The policy or E-V2X-BM, whichever has less predicted harm, controls the vehicle for the
+    whole episode.
 
     Raises ``InvalidInput`` if ``policy`` already decides on received information.
 
     Args:
         policy: the agent to compare with E-V2X-BM.
         argument: ``pairwise`` for the pairwise form of E-V2X-BM, None for the coupled form.
-        settings: settings of the agent: its scenario, its harm count, and its spec (the text that asked for the agent)
-            for error messages.
+        settings: settings of the agent: its scenario, its harm count, and its spec (the text that names the agent),
+            which error messages quote.
 
     """
     hybrid = shield_episodes(policy, argument, settings)
@@ -103,10 +107,10 @@ def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: 
 
 
 def make_estimating_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
-    """Make the agent ``e_v2x_bm:estimated`` or ``e_v2x_bm:pairwise:estimated``.
+    """Return the agent ``e_v2x_bm:estimated`` or ``e_v2x_bm:pairwise:estimated``.
 
     The agent is E-V2X-BM (the best constant deceleration) in the estimated world. ``argument`` is ``pairwise`` for the
-    pairwise form of E-V2X-BM, or None for the coupled form. ``settings`` has the scenario.
+    pairwise form of E-V2X-BM, or None for the coupled form. ``settings`` contains the scenario of the worlds.
     """
     return Estimating(make_e_v2x_bm(argument, settings), settings.needed_scenario())
 

@@ -19,9 +19,7 @@ from ethbrake_marl.shields.guard import StepGuard
 
 
 class RobustMode(IntEnum):
-    """Number by which the info ``shield_mode`` reports mode ``robust``; ``eb.ShieldMode`` has the numbers of the other
-    modes.
-    """
+    """Value of the info ``shield_mode`` in mode ``robust``. ``eb.ShieldMode`` contains the values for other modes."""
 
     ROBUST = 2
 
@@ -32,8 +30,8 @@ class RobustGuard(StepGuard):
     """
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos of a step as a mapping. The info ``members`` is the number of possible worlds in which an
-        action is certified for each true world.
+        """Return the infos of a step, as a mapping from names to values. The info ``members`` is the number of possible
+        worlds in which an action is certified for each true world.
 
         Args:
             memory: the shield and the policies as they are after the step.
@@ -56,12 +54,13 @@ class EstimatedGuard(ShieldGuard):
         return shield
 
     def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
-        """Return the proposed actions and the actions to apply, which are certified in the estimated worlds.
+        """Return the proposed actions, and the actions to apply; the actions to apply are certified in the estimated
+        worlds.
 
         Args:
-            running: the engine as it is before the step.
+            running: the engine, in its state before the step.
             memory: the shield and the policies as they are before the step.
-            proposed: [n, 1] proposed actions.
+            proposed: [n, 1] actions that the policy proposes.
 
         """
         worlds = running.worlds
@@ -73,10 +72,10 @@ class EstimatedGuard(ShieldGuard):
         return Ruling(proposed, applied, stepped_in, ~running.ended, after.decision, Guarded(after, memories))
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos of a step that is certified in the estimated worlds, as a mapping.
+        """Return the infos of a step (a mapping) whose actions are certified in the estimated worlds.
 
         The info ``trusted`` is true in mode ``robust`` and false in mode ``step``, because only in mode ``robust`` may
-        the bound also hold in the true world. ``memory`` has the shield as it is after the step. ``ruling`` is the
+        the bound also hold in the true world. ``memory`` contains the shield as it is after the step. ``ruling`` is the
         shield's decision in this step, or None at the reset of the environment.
         """
         estimated: EstimatedShield = memory.shield

@@ -1,5 +1,5 @@
-"""Settings of ``robust`` and ``estimated`` shields. The settings object checks its values and makes the shield and its
-guard.
+"""Settings of ``robust`` and ``estimated`` shields. The class ``RobustOptions`` checks the settings, makes the shield,
+and makes the guard that connects the shield with an engine.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ class RobustOptions(ShieldOptions):
 
     Args:
         mode: a mode of ``eb.ShieldOptions``, or ``robust``, which extends mode ``step`` to uncertain worlds. None means
-            ``robust`` if ``uncertainty`` is given, and ``step`` if it is not.
+            ``robust`` if ``uncertainty`` is given, and ``step`` if ``uncertainty`` is not given.
         uncertainty: for mode ``robust``, an interval around each uncertain quantity, such as ``"gaps_m=0.5"``.
-        robust: worlds in which mode ``robust`` certifies actions: only the ``corners`` of the intervals (fast), or the
-            whole ``interior`` of the intervals.
+        robust: worlds in which mode ``robust`` certifies actions: ``corners`` (fast) means only the ends of the
+            intervals, and ``interior`` means all values in the intervals.
         estimated: if True, certify actions in the estimated world, which uses only the information that the vehicle
             received and the scenario's ranges. ``estimated=True`` is possible in modes ``step`` and ``robust`` with one
             learner, and without ``uncertainty``, ``allowance``, ``cap``, ``logging`` and ``shares``.
@@ -72,14 +72,14 @@ class RobustOptions(ShieldOptions):
     def written(self) -> str:
         """Text after the ``+`` in the spec of an agent that has a shield with these settings.
 
-        For instance, this text is ``robust:interior:estimated`` in the spec ``ppo+robust:interior:estimated``.
+        For an agent with the spec ``ppo+robust:interior:estimated``, the text is ``robust:interior:estimated``.
         """
         robust = "" if self.robust == CORNERS else f":{self.robust}"
         return f"{self.mode}{robust}{':estimated' if self.estimated else ''}"
 
     @property
     def adds(self) -> Source:
-        """Source of information that the shield uses in addition to the policy's information."""
+        """Source of the information that the shield uses in addition to the information that the policy uses."""
         return Source.ESTIMATES if self.estimated else super().adds
 
     def shield(
@@ -88,7 +88,7 @@ class RobustOptions(ShieldOptions):
         """Return a new shield for ``vehicle``; no episode has begun in this shield.
 
         ``vehicle`` is the index of the shielded vehicle, or several indices for modes that shield several vehicles.
-        ``others`` has the scripts of the other vehicles; the keys are vehicle indices. If ``others`` is None, the
+        ``others`` contains the scripts of the other vehicles; the keys are vehicle indices. If ``others`` is None, the
         scripts of the scenario are used.
         """
         if self.estimated:
@@ -155,8 +155,8 @@ def checked_uncertainty(given: object) -> Uncertainty | None:
 
 
 def mode_uncertainty(mode: str, given: object, where: str) -> Uncertainty | None:
-    """Return the uncertainty ``given`` as an ``Uncertainty``, after a check that it fits the shield mode ``mode``; None
-    if ``given`` is None.
+    """Check that the uncertainty ``given`` fits the shield mode ``mode``; return it as an ``Uncertainty``, or None if
+    ``given`` is None.
 
     Raises ``InvalidInput`` if mode ``robust`` has no uncertainty, or another mode has one; ``where`` is the beginning
     of the error message. ``given`` is an ``Uncertainty``, a text such as ``"gaps_m=0.5"``, or None.

@@ -1,4 +1,4 @@
-"""Simulate all worlds of a box along paths: where a pair has an impact in some worlds only, a new path branches off.
+"""Simulate all worlds of a box along paths: if a pair has an impact in some worlds only, these worlds form a new path.
 
 A *path* is a set of worlds with the same sequence of impacts (``affine.Path``). A *cell* is a box (all worlds whose
 uncertain numbers lie in given intervals) together with the vehicles' commands over time.
@@ -118,11 +118,12 @@ def keep_rough(cell: Cell, path: Path, worst: float, out: Floats) -> float:
 def branch(
     cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, how: Approach, worst: float, out: Floats
 ) -> float:
-    """Handle the worlds in which pair ``p`` has an impact in this piece; return the largest harm recorded so far.
+    """For the worlds in which pair ``p`` has an impact in this piece, record the harm or put a new path on the stack;
+    return the largest harm recorded so far.
 
-    If no other impact can follow, the harm of these worlds is final and is recorded. If another impact can follow, the
-    worlds become a new path on the stack. If the new path cannot be simulated, a rough bound on its harm
-    (``rough_harm``) is recorded instead.
+    If no other impact can follow, the harm in the worlds with the impact is final and is recorded. If another impact
+    can follow, these worlds become a new path on the stack. If the new path cannot be simulated, a rough bound on its
+    harm (``rough_harm``) is recorded instead.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -170,9 +171,9 @@ def branch(
 
 @compiled(apart=True)
 def keep_with(harm: Floats, rest: float, worst: float, out: Floats) -> float:
-    """Record the affine form ``harm`` [W] plus ``rest``, and return the largest harm recorded so far, m2/s2. ``rest``
-    is an upper bound on the harm of later impacts, m2/s2. ``worst`` is the largest harm recorded before this call. If
-    the function records a new largest harm, it writes the affine form of this harm into ``out`` [W].
+    """Record the sum of the affine form ``harm`` [W] and ``rest``, and return the largest harm recorded so far, m2/s2.
+    ``rest`` is an upper bound on the harm of later impacts, m2/s2. ``worst`` is the largest harm recorded before this
+    call. If the function records a new largest harm, it writes the affine form of this harm into ``out`` [W].
     """
     whole = harm.copy()
     whole[0] += rest
@@ -181,8 +182,8 @@ def keep_with(harm: Floats, rest: float, worst: float, out: Floats) -> float:
 
 @compiled(apart=True)
 def closing_after(cell: Cell, path: Path, motion: Motion, p: int, speed: Floats, time: Floats, length: float) -> Floats:
-    """Return the closing speed (m/s) of the other pair if the other pair may have its impact after the impact of pair
-    ``p`` in the same piece.
+    """Return the closing speed (m/s) of the other pair at an impact that may follow the impact of pair ``p`` in the
+    same piece.
 
     The function is for a line of three vehicles, which has two pairs. The result is an affine form [W] (centre, slopes,
     remainder); it is 0 if the other pair cannot have contact.
@@ -237,7 +238,7 @@ def strike(
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         how: closing speed and time of the contact of pair ``p``, as ``approach`` returns them.
         speed: closing speed at the impact as an affine form [W] (centre, slopes, remainder), m/s.
-        harm: harm including this impact as an affine form [W], m2/s2.
+        harm: harm up to the present impact, including this impact, as an affine form [W], m2/s2.
 
     """
     N, P, width = cell.speed.shape[0], cell.gap.shape[0], cell.speed.shape[1]
@@ -308,7 +309,7 @@ def may_only_touch(cell: Cell, path: Path, motion: Motion, p: int, how: Approach
     """Return whether pair ``p`` may reach gap 0 at closing speed 0, exactly when its vehicles begin to press on each
     other.
 
-    Such a contact at closing speed 0 is possible only if a command changes or an acceleration builds up.
+    A contact at closing speed 0 is possible only if a command changes or an acceleration builds up gradually.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -339,16 +340,17 @@ def may_only_touch(cell: Cell, path: Path, motion: Motion, p: int, how: Approach
 
 @compiled(apart=True)
 def may_turn(cell: Cell, motion: Motion, p: int, piece: int) -> bool:
-    """Return whether accelerations that build up may press the vehicles of pair ``p`` together harder within a piece.
+    """Return whether accelerations that build up gradually may press the vehicles of pair ``p`` together harder within
+    a piece.
 
-    Either the front vehicle's acceleration may fall, or the rear vehicle's acceleration may rise.
+    This is possible if the front vehicle's acceleration may fall, or if the rear vehicle's acceleration may rise.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
         motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
             ``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        piece: index of the piece (time interval of constant command), from 0 to J - 1.
+        piece: index of the piece (time interval of constant command), from 0 to J - 1 if there are J pieces.
 
     """
     return may_move(cell, motion, p, piece, 0) or may_move(cell, motion, p + 1, piece, 1)
@@ -364,8 +366,8 @@ def may_move(cell: Cell, motion: Motion, i: int, piece: int, which: int) -> bool
         motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
             ``move_alone``).
         i: index of the vehicle.
-        piece: index of the piece (time interval of constant command), from 0 to J - 1.
-        which: 0 asks whether the acceleration may fall, 1 whether it may rise.
+        piece: index of the piece (time interval of constant command), from 0 to J - 1 if there are J pieces.
+        which: 0: return whether the acceleration may fall; 1: return whether the acceleration may rise.
 
     """
     if not cell.forces.build[i] or motion.vague[i] > cell.forces.swing[i, piece + 1].max():
@@ -378,9 +380,9 @@ def touch_only(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, len
     """Put a second path on the stack: the worlds in which pair ``p`` came into contact without an impact and stayed in
     contact.
 
-    With brake build-up the pair may separate and have its first impact within the piece. The path just below the second
-    path on the stack covers the worlds in which the pair separates and has this impact. Returns False if the stack is
-    full.
+    With brake build-up the pair may separate and have its first impact within the piece. Worlds in which the pair
+    separates and has this impact belong to the path just below the second path on the stack. Returns False if the stack
+    has no room for the second path.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -444,8 +446,8 @@ MOST_PATHS = 4000  # largest number of paths to simulate in one cell
 
 @compiled(apart=True)
 def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float) -> float:
-    """Return an upper bound on the harm in all worlds of the cell's box, m2/s2. A result above ``most`` is no bound,
-    because the search then stopped early.
+    """Return an upper bound on the harm in all worlds of the cell's box, m2/s2. If the result is above ``most``, the
+    search stopped early, and the harm may be larger than the result.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -482,7 +484,8 @@ def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float
 def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
     """Simulate a path (worlds with the same impacts so far) to its end; return the largest harm recorded so far, m2/s2.
 
-    The function records the harm of the path, and of each path that branches off and needs no further simulation.
+    The function records the harm of the path, and the harm in worlds that leave the path because of an impact and need
+    no further simulation.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -544,10 +547,11 @@ def may_meet_unseen(cell: Cell, path: Path, motion: Motion) -> bool:
 
 @compiled(apart=True)
 def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
-    """Move the pairs in contact through the present piece, and branch off the worlds in which a pair has an impact.
+    """Move the pairs in contact through the present piece, and pass the worlds in which a pair has an impact to
+    ``branch``.
 
-    The vehicles of a pair in contact move as one body, or separate. For worlds with an impact, ``branch`` records the
-    harm or puts the worlds on the stack. Returns the largest harm recorded so far, m2/s2.
+    The vehicles of a pair in contact move as one body, or separate. ``branch`` records the harm in the worlds with an
+    impact, or puts these worlds on the stack as a new path. Returns the largest harm recorded so far, m2/s2.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.

@@ -1,10 +1,10 @@
 """Step shield for uncertain worlds: it certifies plans in the corners of the box of possible worlds, or in the whole
 box.
 
-``StepShield`` certifies each plan in several possible worlds, which are called the *members* of a world. For this
-shield the members are the reported world and the corners of an ``Uncertainty``. With ``robust="interior"`` the shield
-also bounds the harm of every plan over the whole box between the corners (``enclosure.Boxes``), at the alert and at
-every decision.
+``StepShield`` certifies each plan in several possible worlds, which are called the *members* of a world. For a
+``RobustShield`` the members are the reported world and the corners of an ``Uncertainty``. With ``robust="interior"``
+the shield also bounds the harm of every plan over the whole box between the corners (``enclosure.Boxes``), at the alert
+and at every decision.
 """
 
 from __future__ import annotations
@@ -40,8 +40,9 @@ class RobustShield(StepShield):
             possible worlds to ``begin`` (argument ``possible``).
         robust: worlds in which actions are certified: ``corners`` (of the box of possible worlds) or ``interior`` (the
             whole box).
-        harm_count: impacts that count: ``first`` (first impact of each pair) or ``total`` (every impact).
-        others: scripts of the other vehicles; the keys are vehicle indices. None: the scripts of the scenario.
+        harm_count: impacts whose harm is counted: ``first`` (first impact of each pair) or ``total`` (every impact).
+        others: scripts of the other vehicles; the keys are vehicle indices. If ``others`` is None, the shield uses the
+            scripts of the scenario.
         settings: further keyword arguments of ``StepShield``.
 
     Raises ``InvalidInput`` in three cases: if ``StepShield`` raises this error, if an uncertainty is combined with
@@ -92,15 +93,15 @@ class RobustShield(StepShield):
     def _bound_at_alert(
         self, possible: Worlds, problem: ProfileProblem, rows: Ints, plan: Floats, harm: Floats
     ) -> tuple[Floats, Boxes | None]:
-        """Return a bound on the harm of each plan at the alert, [m] m2/s2, and the boxes (of possible worlds) of all
-        episodes.
+        """Return, for each new episode, a bound on the harm of its plan at the alert, [m] m2/s2; also return the boxes
+        (sets of possible worlds) of all episodes.
 
         In interior mode the bound covers all worlds of each box. In corners mode the bound covers only the members (the
         reported world and the corners of its box), and the function returns None instead of boxes.
 
         Args:
             possible: [m * M] members of the new worlds, M consecutive members for each world.
-            problem: table of the worlds in ``possible``, with one row for each world.
+            problem: table with one row for each world in ``possible``.
             rows: [m] indices of the new episodes.
             plan: [m, L] action of the shielded vehicle at each decision, for each new world.
             harm: [m] largest harm of each world's plan in any member of this world, m2/s2.
@@ -114,16 +115,17 @@ class RobustShield(StepShield):
     def _also_certified(
         self, now: Running, memory: StepMemory, budget: Floats, decision: Decision, asked: Bools
     ) -> Decision:
-        """Return ``decision``; in interior mode, only with plans that are certified for all worlds of their box.
+        """Return ``decision``; in interior mode, replace each of its plans that is not certified for all worlds of its
+        box.
 
-        In interior mode, a plan that is not certified for its whole box is replaced by the plan from before the
-        decision.
+        The plan from before the decision takes the place of the plan that is not certified.
 
         Args:
             now: states of the members (the reported worlds and the corners of their boxes) before the decision.
             memory: memory of the shield, which includes the boxes and the plans from before the decision.
             budget: [n] largest harm that a new plan may have, m2/s2.
-            decision: the present decision, whose plans are so far certified only in the members.
+            decision: the present decision; its plans are certified for the members (the reported worlds and the corners
+                of their boxes), but not yet for all worlds of the boxes.
             asked: [n] True for episodes that have a decision now.
 
         """
@@ -132,10 +134,11 @@ class RobustShield(StepShield):
 
     def _leaves_range(self, running: Running) -> Bools:
         """Return a mask [n]: True for each reported world whose box may have a world that leaves the range between the
-        members. The members are the reported world and the corners of its box; ``running`` has the states of the
-        members. The mask is True where ``StepShield`` returns True. In interior mode it is also True where the shielded
-        vehicle's latency is uncertain, because the decisions then have different times in the worlds of a box. The mask
-        is True everywhere if one uncertain number (friction) changes several quantities.
+        members. The members are the reported world and the corners of its box; ``running`` contains the states of the
+        members. The mask is True where the method of the same name in ``StepShield`` returns True. In interior mode the
+        mask is also True where the latency of the shielded vehicle is uncertain, because the worlds of a box then have
+        their decisions at different times. If one uncertain number (friction) changes several quantities, the mask is
+        True for all worlds.
         """
         leaves, boxes = super()._leaves_range(running), self.boxes
         if boxes is not None:
@@ -154,11 +157,13 @@ def certify_inside(
     Args:
         boxes: box of each world: the smallest and the largest value of each of the world's numbers.
         running: states of the members (the reported worlds and the corners of their boxes) before the decision.
-        held: the plans and their bounds from before the decision.
+        held: for each world, the plan from before the decision and the bound on the harm of this plan.
         budget: [n] largest harm that a new plan may have, m2/s2.
-        decision: the present decision, whose plans are so far certified only in the corners.
+        decision: the present decision; its plans are certified for the corners of the boxes (each uncertain number at
+            an end of its interval), but not yet for all worlds of the boxes.
         asked: [n] True for episodes that have a decision now. In interior mode an episode ends only at the horizon,
-            because a box may contain moving worlds when all its corners are at rest.
+            because vehicles may still move in some world of a box when all vehicles are at rest in the corners of the
+            box.
 
     """
     plan, other = decision.backup.plan.copy(), (decision.backup.plan != held.plan).any(axis=1)

@@ -7,11 +7,11 @@ Without impacts, a vehicle reaches at most its present speed, or the speed that 
 closing speed w and restitution e changes the speed of each vehicle by (1 + e) w m / M, where m is the mass of the other
 vehicle and M the sum of both masses. Let u be the largest speed of any vehicle, and assume that no vehicle moves
 backwards yet. An impact slows the rear vehicle, but the new speed is at least -e times the previous speed. An impact
-gives a front vehicle at rest at most (1 + e) times the rear vehicle's speed. So, in a line of three, the speed of the
-middle vehicle stays between -e u and (1 + e) u until both its pairs have had contact. (If three vehicles are in contact
-at once, each vehicle has the speed (1 + e) P - e v after the impact. Here v is the speed of this vehicle before the
-impact, and P is a weighted mean of the three speeds before the impact. The speeds (1 + e) P - e v also lie between -e u
-and (1 + e) u.)
+gives a front vehicle at rest at most (1 + e) times the rear vehicle's speed. So, in a line of three vehicles, the speed
+of the middle vehicle stays between -e u and (1 + e) u until both its pairs have had contact. If three vehicles are in
+contact at once, each vehicle has the speed (1 + e) P - e v after the impact, where v is the speed of this vehicle
+before the impact, and P is a weighted mean of the three speeds before the impact. This speed, too, lies between -e u
+and (1 + e) u.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ def driven(cell: Cell, i: int, speed: float, since: float) -> float:
     """Return the largest speed (m/s) that vehicle ``i`` can reach by driving if its speed at the time ``since`` is at
     most ``speed``.
 
-    ``since`` is in s after the first decision. ``cell`` has the box of worlds and the vehicles' commands over time.
+    ``since`` is a time in s, measured from the first decision. ``cell`` contains the box of worlds and the vehicles'
+    commands over time.
     """
     drive, rest = 0.0, cell.times[-1] - since
     if i == cell.vehicle:

@@ -5,9 +5,9 @@ The state of a pair in contact is the motion of its centre of mass, as affine fo
 vehicles deviate from this motion. While both vehicles move forward, only their commands act on the pair. The centre of
 mass then follows the commands alone, no matter how often the two vehicles collide.
 
-A world *creeps* as soon as one of the two vehicles of the pair stands or moves backwards. The brakes of that vehicle
-then hold the vehicle instead of slowing the pair. For a world that creeps, the state of the pair contains only limits
-on the speeds. A *flight* is the time between two impacts of the pair.
+A world *creeps* as soon as one of the two vehicles of the pair stands or moves backwards. The brakes of this vehicle
+then hold the vehicle itself, instead of slowing the pair. For a world that creeps, the state of the pair contains only
+limits on the speeds. A *flight* is the time between two impacts of the pair.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ UNEVEN = 3.0  # largest ratio of closing to separating speed in a flight, for bo
 
 @compiled(apart=True)
 def common(cell: Cell, p: int, front: Floats, rear: Floats) -> Floats:
-    """Return speed, acceleration or distance of the centre of mass of pair ``p``, as an affine form [W].
+    """Return one quantity (speed, acceleration or distance) of the centre of mass of pair ``p``, as an affine form [W].
 
-    ``front`` and ``rear`` are this quantity for the front and the rear vehicle, as affine forms. ``cell`` has the share
-    of each vehicle in the mass of the pair.
+    ``front`` and ``rear`` are the same quantity for the front and the rear vehicle, as affine forms. ``cell`` contains
+    the share of each vehicle in the mass of the pair.
     """
     out = product(cell.share[p, 1], front)
     add(out, 1.0, product(cell.share[p, 0], rear))
@@ -66,7 +66,7 @@ def pressing_together(motion: Motion, p: int) -> tuple[float, float]:
     """Return the smallest and the largest closing acceleration (m/s2) of pair ``p`` if both vehicles accelerate as
     commanded.
 
-    ``motion`` has the motion of all vehicles in the present piece (time interval of constant command).
+    ``motion`` contains the motion of all vehicles in the present piece (time interval of constant command).
     """
     vague = motion.vague[p] + motion.vague[p + 1]
     least = low(motion.pull[p + 1]) - high(motion.pull[p]) - vague
@@ -85,18 +85,19 @@ def apart(touch: Floats) -> float:
 @compiled(apart=True)
 def faster(cell: Cell, p: int) -> float:
     """Return the largest possible ratio v / u, for an impact of pair ``p``: v is the front vehicle's speed after the
-    impact, and u is the rear vehicle's speed before the impact. The result is at least 1. ``cell`` has the coefficient
-    of restitution and each vehicle's share of the pair's mass.
+    impact, and u is the rear vehicle's speed before the impact. The returned ratio is at least 1. ``cell`` contains the
+    coefficient of restitution and each vehicle's share of the pair's mass.
     """
     return float(max(1.0, (1.0 + cell.restitution) * high(cell.share[p, 0])))
 
 
 @compiled(apart=True)
 def backwards(cell: Cell, p: int) -> float:
-    """Return the largest backward speed of the rear vehicle of pair ``p`` after an impact, as a multiple of its speed
-    before the impact.
+    """Return the largest backward speed of the rear vehicle of pair ``p`` after an impact, as a multiple of this
+    vehicle's speed before the impact.
 
-    The result is at least 0. ``cell`` has the coefficient of restitution and each vehicle's share of the pair's mass.
+    The returned multiple is at least 0. ``cell`` contains the coefficient of restitution and each vehicle's share of
+    the pair's mass.
     """
     return float(max(0.0, (1.0 + cell.restitution) * high(cell.share[p, 1]) - 1.0))
 
@@ -107,9 +108,9 @@ def stray(cell: Cell, touch: Floats, p: int) -> float:
     form.
 
     The result is above 0 only if one of the two vehicles may stand or move backwards. Let c be ``touch[CREEP]``, the
-    largest speed of the rear vehicle in such worlds. The speed in the affine form lies between 0 and c. The rear
-    vehicle's speed lies between ``-backwards(cell, p) * c`` and c. The front vehicle's speed lies between 0 and
-    ``faster(cell, p) * c``. (An impact never makes the rear vehicle faster.)
+    largest speed of the rear vehicle in worlds in which a vehicle stands or moves backwards. The speed in the affine
+    form lies between 0 and c. The rear vehicle's speed lies between ``-backwards(cell, p) * c`` and c. The front
+    vehicle's speed lies between 0 and ``faster(cell, p) * c``. (An impact never makes the rear vehicle faster.)
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -213,7 +214,7 @@ def dip_of(cell: Cell, vague: float, length: float) -> float:
 def own_pulls(motion: Motion, p: int) -> tuple[float, float]:
     """Return the smallest and the largest acceleration (m/s2) that either vehicle of pair ``p`` commands in a piece.
 
-    ``motion`` has the motion of all vehicles in the piece (time interval of constant command).
+    ``motion`` contains the motion of all vehicles in the piece (time interval of constant command).
     """
     weakest = min(low(motion.pull[p]) - motion.vague[p], low(motion.pull[p + 1]) - motion.vague[p + 1])
     return weakest, max(high(motion.pull[p]) + motion.vague[p], high(motion.pull[p + 1]) + motion.vague[p + 1])
@@ -228,8 +229,8 @@ def creep(cell: Cell, touch: Floats, p: int, slowest: float, weakest: float, har
         touch: [TOUCH_WIDTH] state of the pair in contact (a row of ``Path.touch``); the function changes it in place.
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         slowest: smallest speed of the pair's centre of mass in the piece, m/s.
-        weakest: smallest acceleration that either vehicle commands, m/s2.
-        hardest: largest acceleration that either vehicle commands, m/s2.
+        weakest: smallest acceleration that either vehicle of the pair commands in the piece, m/s2.
+        hardest: largest acceleration that either vehicle of the pair commands in the piece, m/s2.
         length: duration of the piece (time interval of constant command), s.
 
     """
@@ -252,8 +253,8 @@ def creep(cell: Cell, touch: Floats, p: int, slowest: float, weakest: float, har
 
 @compiled(apart=True)
 def come_to_rest(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
-    """Update the state of pair ``p``, which is in contact, over a piece in which the affine form of the pair's speed is
-    0.
+    """Update the state of pair ``p``, which is in contact, over a piece in which the pair's speed, as an affine form,
+    is 0.
 
     In each world, either both vehicles stand, or the world *creeps* (one vehicle stands or moves backwards) and the
     brakes slow the other vehicle. The brakes reduce the rear vehicle's speed. The front vehicle's speed is at most
@@ -284,7 +285,7 @@ def come_to_rest(cell: Cell, path: Path, motion: Motion, p: int, length: float) 
 @compiled(apart=True)
 def part(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
     """Separate the vehicles of pair ``p``, which was in contact and whose gap opens in the present piece. After the
-    separation, each vehicle moves by itself.
+    separation, each vehicle moves under its own command.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -322,11 +323,12 @@ def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length:
 
     An impact never increases the relative speed. The relative speed therefore grows at most at the rate of the closing
     acceleration that the commands cause. While the closing acceleration lies between b- (``least``) and b+ (``most``),
-    and b- > 0, the relative speed does not grow. A *flight* (the time between two impacts) that has gap g and relative
-    speed w at some moment has a gap of at most ``h = g + w^2 / (2 b-)`` and ends with a closing speed of at most
-    ``sqrt(2 b+ h)``. The next flight starts with e times this speed, where e is the restitution. So the relative speed
-    decreases from flight to flight if ``e sqrt(b+ / b-) < 1``. (If one vehicle stands or moves backwards, the brakes of
-    this vehicle hold it. Flights are then shorter, and the relative speeds in them are smaller.)
+    and b- > 0, the relative speed does not grow. Consider a *flight* (the time between two impacts), with gap g and
+    relative speed w at some moment. The gap in this flight is at most ``h = g + w^2 / (2 b-)``, and the flight ends
+    with a closing speed of at most ``sqrt(2 b+ h)``. The next flight starts with a relative speed of e times this
+    closing speed, where e is the restitution. So the relative speed decreases from flight to flight if ``e sqrt(b+ /
+    b-) < 1``. If one vehicle stands or moves backwards, its own brakes hold it, so that flights are shorter and the
+    relative speeds in them are smaller.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -366,8 +368,9 @@ def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length:
 def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: float, most: float) -> None:
     """Start a new phase of a contact, because the closing acceleration of the pair has changed.
 
-    The recorded range of closing accelerations covers the old and the new phase if the relative speed then still
-    decreases from impact to impact. If it does not, the recorded range covers only the new phase.
+    The recorded range of closing accelerations covers the old and the new phase if, with this range, the relative speed
+    still decreases from impact to impact. If the relative speed does not decrease, the recorded range covers only the
+    new phase.
 
     Args:
         touch: [TOUCH_WIDTH] state of the pair in contact (a row of ``Path.touch``); the function changes it in place.
@@ -392,7 +395,7 @@ def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: fl
 
 @compiled(apart=True)
 def settle(touch: Floats, e: float) -> None:
-    """Reset the state of a contact if the pair certainly moves as one body by the end of the present piece.
+    """Reset the state of a pair in contact if the pair certainly moves as one body by the end of the present piece.
 
     Let the closing acceleration of the pair lie between ``b-`` and ``b+``, and let e be the restitution. A *flight*
     (the time between two impacts) that begins with separating speed s lasts at most ``2 s / b-``. This flight ends with
@@ -416,7 +419,7 @@ def settle(touch: Floats, e: float) -> None:
 
 @compiled(apart=True)
 def is_blurred(path: Path, motion: Motion, N: int, p: int, length: float) -> bool:
-    """Return whether the gap of pair ``p`` is too uncertain to simulate a further impact in this piece.
+    """Return whether the gap of pair ``p`` is too uncertain to simulate a further impact of the pair in this piece.
 
     The gap is too uncertain if its uncertainty exceeds the largest distance by which the gap can shrink within the
     piece. A pair with such a gap is treated as in contact from the start of the piece.

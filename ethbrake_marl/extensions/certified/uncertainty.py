@@ -2,10 +2,11 @@
 these intervals.
 
 The true value of a quantity with the reported value x lies in [x - h, x + h]. The half-width h is a number in the
-quantity's unit, or a share of x (such as 5 %). Impossible values are cut off from the interval: latencies, speeds and
-gaps below 0, and speeds above the vehicle's limit. The *box* of a world is the set of all combinations of values in its
-intervals. The *members* of a world are the reported world and every corner of its box: 2^d corners for d uncertain
-numbers. The bound of shield mode ``robust`` is proven for the members (``docs/internals/proofs/shield-corners.md``).
+quantity's unit, or a share of x (such as 5 %). Impossible values are cut off from the interval of a quantity:
+latencies, speeds and gaps below 0, and speeds above the speed limit of the vehicle. The *box* of a world is the set of
+all combinations of values in its intervals. The *members* of a world are the reported world and every corner of its
+box: 2^d corners for d uncertain numbers. In shield mode ``robust`` the bound on the harm is proven for the members
+(``docs/internals/proofs/shield-corners.md``).
 """
 
 from __future__ import annotations
@@ -127,9 +128,10 @@ class Uncertainty:
 
     @property
     def moves_together(self) -> bool:
-        """True if one uncertain number (friction) changes several quantities.
+        """True if the friction is uncertain, so that one uncertain number changes several quantities.
 
-        If this property is true, the largest and smallest gaps and speeds may occur in worlds that are no corners.
+        If this property is true, the largest and smallest gaps and speeds may occur in worlds that are not corners of
+        the box.
         """
         return any(each.quantity == "friction" and each.half_width > 0.0 for each in self.intervals)
 
@@ -137,11 +139,11 @@ class Uncertainty:
         """Return the members of worlds at the alert, [n * M]: each world followed by the corners of its box.
 
         The *box* of a world is the set of all combinations of values in its intervals. The corners are in the order of
-        binary numbers, with the first interval as the lowest bit (0: smallest value, 1: largest value). Intervals of
-        width 0 add no corners. For friction, eight values replace the two ends of the interval, because friction
-        changes all capacities together and harm may rise or fall with it. Raises ``InvalidInput`` if an interval names
-        a vehicle that does not exist, if a capacity or mass may be 0, or if there are more than ``MOST_CORNERS``
-        corners.
+        binary numbers, with the first interval as the lowest bit (0: smallest value, 1: largest value). An interval of
+        width 0 does not increase the number of corners. For friction, eight values replace the two ends of the
+        interval, because friction changes all capacities together and harm may rise or fall with it. Raises
+        ``InvalidInput`` if an interval names a vehicle that does not exist, if a capacity or mass may be 0, or if there
+        are more than ``MOST_CORNERS`` corners.
         """
         sides = self._sides(worlds)
         ends = [_OF_FRICTION if name == "friction" else (0.0, 1.0) for name, *_ in reversed(sides)]
@@ -170,7 +172,7 @@ class Uncertainty:
 
         Args:
             worlds: the reported worlds, [n].
-            rng: source of randomness.
+            rng: generator of the random numbers.
             corners: if True, draw one of the corners of the box; if False, draw uniformly from the whole box.
 
         """
@@ -222,7 +224,7 @@ class Uncertainty:
 
 
 def parse_uncertainty(text: str) -> Uncertainty:
-    """Make an uncertainty from a text: entries ``quantity=half-width``, separated by commas, as in
+    """Make an ``Uncertainty`` from a text that consists of entries ``quantity=half-width``, separated by commas, as in
     ``UNCERTAINTY_EXAMPLE``.
 
     A half-width is a number in the quantity's unit, or a percentage of its value. ``.vehicle_2`` or ``.pair_1`` after
@@ -249,8 +251,8 @@ def parse_uncertainty(text: str) -> Uncertainty:
 
 
 def _values(worlds: Worlds, quantity: str) -> Floats:
-    """Return the reported values of one of ``QUANTITIES``. The result has the shape [n, N], for gaps [n, P], for
-    friction [n, 1]. The returned capacities are those on a dry road.
+    """Return the reported values of one of ``QUANTITIES``. The shape of the result is [n, P] for gaps, [n, 1] for
+    friction, and [n, N] for every other quantity. The returned capacities are those on a dry road.
     """
     if quantity.endswith("_rate_mps3"):
         return np.asarray(getattr(worlds.vehicles, quantity), np.float64)
@@ -265,14 +267,15 @@ def _of(quantity: str, place: int) -> str:
 def _placed(worlds: Worlds, sides: list[_Side], share: Callable[[int], Floats | float]) -> Worlds:
     """Return the worlds with each uncertain number at a given position in its interval.
 
-    Without a V2X channel, an uncertain latency also changes when a message arrives. With a V2X channel, an uncertain
-    latency changes only when the vehicle reacts. An uncertain friction limits the capacities of all vehicles together.
+    Without a V2X channel, a changed latency changes both when the vehicle reacts and when a message arrives. With a V2X
+    channel, a changed latency changes only when the vehicle reacts. An uncertain friction limits the capacities of all
+    vehicles together.
 
     Args:
         worlds: the reported worlds, [n].
         sides: the uncertain numbers and their smallest and largest values, as ``_sides`` returns them.
-        share: function that gets the index of an uncertain number and returns its position in the interval, a number or
-            [n]: 0 is the smallest value, 1 the largest.
+        share: function from the index of an uncertain number to the position of this number in its interval; a position
+            is one number for all worlds, or [n]; 0 is the smallest value, 1 the largest.
 
     """
     changed: dict[str, Any] = {}

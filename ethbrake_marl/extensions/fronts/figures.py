@@ -1,4 +1,6 @@
-"""Figures of a front: who bears which share of the harm, and the harm of the line against the largest harm."""
+"""Figures of a front: who bears which share of the harm, and the harm of the line against the largest harm of a
+vehicle.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,8 @@ Json = dict[str, Any]
 
 
 def front_figures(results: Json) -> dict[str, Figure]:
-    """Return the figures of a front, by file name. ``results`` is the content of ``front.json``.
+    """Return a dictionary from the file name to the figure, for all figures of a front. ``results`` is the content of
+    ``front.json``.
 
     The ternary plot is drawn only for a line of three vehicles.
     """
@@ -42,9 +45,10 @@ def front_figures(results: Json) -> dict[str, Figure]:
 
 
 def sum_figure(results: Json) -> Figure:
-    """Draw the mean harm of the line (horizontal) and the mean harm of the vehicle that bears most (vertical).
+    """Draw the mean harm of the line (horizontal axis) and the mean harm of the vehicle that bears the most harm
+    (vertical axis).
 
-    There is one point for each choice of weights. ``results`` is the content of ``front.json``.
+    The figure has one point for each choice of weights. ``results`` is the content of ``front.json``.
     """
     figure, (axes,) = new_panels((WIDTH_IN, 4.6))
     for name, harm, style in _series(results):
@@ -62,7 +66,8 @@ def sum_figure(results: Json) -> Figure:
 
 
 def ternary_figure(results: Json) -> Figure:
-    """Draw the shares of harm that the three vehicles bear. The colour of a point shows the harm of the whole line.
+    """Draw, in a triangle (ternary plot), the shares of the harm that the three vehicles bear. The colour of a point
+    shows the harm of the whole line.
 
     ``results`` is the content of ``front.json``.
     """
@@ -107,8 +112,8 @@ def ternary_figure(results: Json) -> Figure:
 def _places(shares: Floats) -> Floats:
     """Return the positions of k points in the ternary plot, [2, k]: horizontal and vertical coordinates.
 
-    ``shares`` [k, 3] are the shares of the harm that the three vehicles bear. At a corner of the plot, one vehicle
-    bears all harm.
+    ``shares`` [k, 3] are the shares of the harm that the three vehicles bear. A point at a corner of the triangle means
+    that one vehicle bears all harm.
     """
     places: Floats = (shares[:, :, np.newaxis] * _CORNERS).sum(axis=1).T
     return places

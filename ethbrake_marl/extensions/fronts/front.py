@@ -1,7 +1,8 @@
 """The front of a list of worlds: for each choice of weights, the least weighted harm and the harm of each vehicle.
 
-A point of the front is the mean harm of each vehicle over the list, for one choice of weights. The points approximate
-the convex part of the Pareto front. A search computes the points; it is not proven that no better points exist.
+A point of the front consists of the mean harm of each vehicle over the list of worlds, for one choice of weights. The
+points approximate the convex part of the Pareto front. A search computes the points; there is no proof that no better
+points exist.
 """
 
 from __future__ import annotations
@@ -52,7 +53,9 @@ Progress = Callable[[int, int], None]  # called with the number of finished sear
 
 
 class Front(NamedTuple):
-    """Best command profiles in n worlds for each of W choices of weights, and the resulting harm of each vehicle."""
+    """Best profiles (commands over time) in n worlds for each of W choices of weights, and the resulting harm of each
+    vehicle.
+    """
 
     weights: Floats  # [W, N] weights of the vehicles' harm
     harm_count: HarmCount  # harm count that is weighted, ``first`` or ``total``
@@ -79,9 +82,10 @@ class Front(NamedTuple):
         return mean
 
     def nondominated(self) -> Bools:
-        """Return True for each profile that no other profile of the front for the same world dominates, [W, n].
+        """Return a mask [W, n]: True for each profile that no other profile of the front for the same world dominates.
 
-        Profile A dominates profile B if no vehicle bears more harm under A and at least one vehicle bears less.
+        Profile A dominates profile B if no vehicle bears more harm under A than under B, and at least one vehicle bears
+        less harm.
         """
         return nondominated(self.borne[self.harm_count].transpose(1, 0, 2)).T
 
@@ -89,7 +93,7 @@ class Front(NamedTuple):
 def amounts_of(borne: Floats, weights: Floats) -> Floats:
     """Return the weighted harm of each of n worlds, [n] m2/s2, as in ``Front.amounts``.
 
-    ``borne`` is the harm of each vehicle, [n, N] m2/s2. ``weights`` [N] are the weights of the vehicles.
+    ``borne`` is the harm of each vehicle, [n, N] m2/s2. ``weights`` [N] are the weights of the vehicles' harm.
     """
     return weighted_harm(borne, np.broadcast_to(weights, borne.shape))
 
@@ -108,11 +112,12 @@ def search_front(
 ) -> Front:
     """Search every world for the commands with the least weighted harm, for every choice of weights.
 
-    For each choice of weights, the result in a world is at least as good as ``CONSTANTS`` constant commands and as the
-    results for all other weights. With one learner, the result is also at least as good as the profile that is shipped
-    for this world, as ``agents``, and as every shipped policy that can drive the learner. The result for a world
-    depends neither on ``threads`` nor on the other worlds. Raises the exceptions of ``checked_weights``, ``best_harm``
-    and ``make_agents``, and ``InvalidInput`` if ``agents`` are given but the scenario has several learners.
+    For each choice of weights, the result in a world is at least as good as each of ``CONSTANTS`` constant commands,
+    and as the results for all other choices of weights. With one learner, the result is also at least as good as the
+    profile that is shipped for this world, as each of ``agents``, and as every shipped policy that can drive the
+    learner. The result for a world depends neither on ``threads`` nor on the other worlds. Raises the exceptions of
+    ``checked_weights``, ``best_harm`` and ``make_agents``, and ``InvalidInput`` if ``agents`` are given but the
+    scenario has several learners.
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.extensions.fronts.front import search_front
@@ -128,7 +133,7 @@ def search_front(
         harm_count: harm count that is weighted, ``first`` or ``total``.
         budget: number of profiles to try for each world and choice of weights.
         seed: seed of the random search.
-        threads: number of threads.
+        threads: number of threads of the search.
         agents: specs of agents for the one learner, such as ``universal``. For each choice of weights, the agents drive
             every world, in the scenario with these weights as ``harm_weight`` and with the objective ``preference``.
         on_progress: function that is called with the number of finished searches and the number of all searches. There
@@ -164,17 +169,18 @@ def search_front(
 
 
 def least_largest(scenario: Scenario, worlds: Worlds, front: Front, *, budget: int = BUDGET, threads: int = 1) -> Borne:
-    """Search for commands that minimise the largest harm of a vehicle, and return the harm of each vehicle under them.
+    """Search for commands that minimise the largest harm of a vehicle, and return the harm of each vehicle under these
+    commands.
 
-    The result is an array [n, N] in m2/s2 for each harm count. In every world, the largest harm of a vehicle under the
-    resulting commands is at most the largest harm of a vehicle under any profile of ``front``.
+    The result is a dictionary from the harm count to an array [n, N] in m2/s2. In every world, the largest harm of a
+    vehicle under the resulting commands is at most the largest harm of a vehicle under any profile of ``front``.
 
     Args:
         scenario: scenario of the worlds.
         worlds: worlds at t = 0, [n].
         front: front that was searched in the same worlds.
         budget: number of profiles to try in each world.
-        threads: number of threads.
+        threads: number of threads of the search.
 
     """
     count, task = front.harm_count, Task(scenario, scenario.learners, front.harm_count)
@@ -194,7 +200,7 @@ def _joined_borne(parts: Sequence[Borne]) -> Borne:
 
 
 class Preferring(NamedTuple):
-    """Scenario in which one choice of weights of the vehicles' harm is fixed, and agents for this scenario."""
+    """Scenario in which the weights of the vehicles' harm are fixed, and agents for this scenario."""
 
     scenario: Scenario  # scenario with fixed ``harm_weight`` and the objective ``preference``
     agents: Mapping[str, Driver]  # agents that are compared with the front, by spec
@@ -204,7 +210,9 @@ class Preferring(NamedTuple):
     def of(
         cls, scenario: Scenario, weights: Floats, agents: Sequence[str], silent: Sequence[str], harm_count: HarmCount
     ) -> Preferring:
-        """Fix the ``weights`` [N] in ``scenario``, and make the agents that ``agents`` and ``silent`` name."""
+        """Return ``scenario`` with the fixed ``weights`` [N], and the agents whose specs ``agents`` and ``silent``
+        contain.
+        """
         fixed = scenario.replace(harm_weight=weights.tolist(), objective="preference")
         made = (make_agents(specs, fixed, harm_count=harm_count) for specs in (agents, silent))
         return cls(fixed, *made)
@@ -216,7 +224,7 @@ class Preferring(NamedTuple):
 
 
 def _shipped_specs(scenario: Scenario) -> list[str]:
-    """Return the specs of all shipped policies that can drive the one learner of the scenario."""
+    """Return the specs of all shipped policies that can drive the only learner of the scenario."""
     specs = []
     for name in shipped_policies():
         with suppress(InvalidInput):
@@ -235,8 +243,8 @@ def _searched(
 ) -> Front:
     """Search ``worlds`` for every choice of weights, and return the front.
 
-    There are two searches for each choice of weights. The second search starts from the best result of the first
-    searches for all choices of weights.
+    There are two searches for each choice of weights. For each world, the second search starts from the best one of the
+    profiles that the first searches for all choices of weights have found.
 
     Args:
         worlds: worlds at t = 0, [n].
@@ -281,14 +289,16 @@ def _searched(
 def observes_weights(agent: Driver) -> bool:
     """Return False if an agent is a trained policy that does not observe the weights of the vehicles' harm.
 
-    For every other agent the result is True, because its commands may depend on the weights.
+    For every other agent the result is True, because the commands of the agent may depend on the weights.
     """
     manifest = getattr(agent, "manifest", None)
     return manifest is None or any("harm_weight" in name for name in manifest.observation.features)
 
 
 class Pool:
-    """Profiles that were tried in the same worlds; for any weights, the best profile of each world can be chosen."""
+    """Profiles that were tried in the same worlds. For given weights, the methods choose the best profile of each
+    world.
+    """
 
     def __init__(self) -> None:
         self._profiles: list[Profiles] = []
@@ -297,7 +307,7 @@ class Pool:
     def add(self, problem: ProfileProblem, profiles: Profiles) -> Borne:
         """Add ``profiles``, one for each world of ``problem``, to the pool.
 
-        Return the harm of each vehicle under the added profiles, [n, N] m2/s2, by harm count.
+        Return a dictionary from the harm count to the harm of each vehicle under the added profiles, [n, N] m2/s2.
         """
         self._profiles.append(profiles)
         all_borne = problem.borne(profiles)
@@ -306,7 +316,9 @@ class Pool:
         return all_borne
 
     def choice(self, weights: Floats, harm_count: HarmCount) -> Ints:
-        """Return, for each world, the number of the profile with the least weighted harm, [n], in the order of adding.
+        """Return, for each world, the number of the profile with the least weighted harm, [n].
+
+        The profiles are numbered in the order in which they were added.
 
         Among profiles with equal weighted harm, the profile with the least unweighted harm of the line is chosen.
         ``weights`` [N] are the weights of the vehicles' harm, and ``harm_count`` is the count of harm that is weighted.
@@ -331,8 +343,8 @@ class Pool:
     def least(self, weights: Floats, harm_count: HarmCount) -> tuple[Borne, tuple[Profiles, ...]]:
         """Choose the profile with the least weighted harm in each world, for each of W choices of weights.
 
-        The first result is the harm of each vehicle under the chosen profiles, [W, n, N] m2/s2, by harm count. The
-        second result is the chosen profiles, [n] for each choice of weights.
+        The first result is a dictionary from the harm count to the harm of each vehicle under the chosen profiles, [W,
+        n, N] m2/s2. The second result contains the chosen profiles, [n], for each choice of weights.
 
         ``weights`` [W, N] are the choices of weights, and ``harm_count`` is the count of harm that is weighted.
         """

@@ -11,10 +11,11 @@ MOST_DIMENSIONS = 5  # the time grows with the number of points to the power of 
 
 
 def nondominated(points: Floats) -> Bools:
-    """Return, for each of Q points, whether the point is nondominated: no other point dominates it, [..., Q].
+    """Return a mask [..., Q]: True for each of Q points that is *nondominated*, which means that no other point
+    dominates it.
 
-    Smaller coordinates are better. Point A dominates point B if no coordinate of A is larger and at least one
-    coordinate of A is smaller. ``points`` [..., Q, N] contains the N coordinates of the Q points.
+    Smaller coordinates are better. Point A dominates point B if no coordinate of A is larger than that coordinate of B,
+    and at least one is smaller. ``points`` [..., Q, N] contains the N coordinates of the Q points.
     """
     one, other = points[..., :, np.newaxis, :], points[..., np.newaxis, :, :]
     beaten = (other <= one).all(axis=-1) & (other < one).any(axis=-1)
@@ -24,9 +25,9 @@ def nondominated(points: Floats) -> Bools:
 def hypervolume(points: Floats, reference: Floats) -> float:
     """Return the volume of the region that the points dominate, up to the reference point.
 
-    Smaller coordinates are better. A point that is not below the reference point in every coordinate is ignored. The
-    volume is exact: it is cut into slices along the last coordinate (Zitzler 1999, "hypervolume by slicing
-    objectives").
+    Smaller coordinates are better. The function ignores every point of which at least one coordinate is not below the
+    same coordinate of the reference point. The volume is exact; the function cuts the region into slices along the last
+    coordinate (Zitzler 1999, "hypervolume by slicing objectives").
 
     >>> import numpy as np
     >>> from ethbrake_marl.extensions.fronts.hypervolume import hypervolume

@@ -32,16 +32,18 @@ def front_results(
 ) -> Json:
     """Return the content of ``front.json``: the front, full braking, maximin, and the agents.
 
-    All means have 95 % intervals over worlds, or over recordings if the worlds come from recordings. For each choice of
-    weights, ``ratio`` is the mean weighted harm of an agent divided by the mean weighted harm of the front (null if
-    the latter is 0), and ``above`` is the agent's mean weighted harm minus the front's mean weighted harm.
+    All means have 95 % intervals. The intervals are computed over worlds or, if the worlds come from recordings, over
+    recordings. For each choice of weights, ``ratio`` is the mean weighted harm of an agent divided by the mean weighted
+    harm of the front (null if the latter is 0), and ``above`` is the agent's mean weighted harm minus the front's mean
+    weighted harm.
 
     Args:
-        front: front that is written to the file.
+        front: front whose results the function returns.
         scenario: scenario of the worlds.
         sample: worlds for which the front was searched.
-        beside: further results, by name and harm count: harm of each vehicle, [n, N] m2/s2. The name ``full_brake`` is
-            required; others, such as ``maximin``, are optional.
+        beside: results to compare with the front: a mapping from a name to a mapping from the harm count to the harm of
+            each vehicle, [n, N] m2/s2. The name ``full_brake`` is required; further names, such as ``maximin``, are
+            optional.
         seed: seed with which the worlds were drawn; None: the seed is unknown.
 
     """
@@ -94,11 +96,12 @@ def hypervolumes(front: Front, full_brake: Floats, clusters: Texts | None = None
 
     A point consists of the mean harms of all vehicles for one choice of weights.
 
-    With the first reference point, the mean harm of full braking, a point contributes only if it is better than full
-    braking for every vehicle. The second reference point is, for each vehicle, the larger one of its mean harm under
-    full braking and its largest mean harm on the front. ``share`` is an agent's hypervolume divided by the front's
-    hypervolume. The 95 % intervals are percentiles over ``RESAMPLES`` bootstrap samples of the worlds, or of the
-    ``clusters`` if given. Raises ``InvalidInput`` if an agent has the name ``front``.
+    The first reference point is the mean harm of each vehicle under full braking; with this reference point, a point
+    contributes only if it is better than full braking for every vehicle. The second reference point contains, for each
+    vehicle, the larger one of two numbers: its mean harm under full braking, and its largest mean harm on the front.
+    ``share`` is an agent's hypervolume divided by the front's hypervolume. The 95 % intervals are percentiles over
+    ``RESAMPLES`` bootstrap samples of the worlds, or of the ``clusters`` if given. Raises ``InvalidInput`` if an agent
+    has the name ``front``.
 
     Args:
         front: front that also contains the harm of the agents.
@@ -137,9 +140,9 @@ def hypervolumes(front: Front, full_brake: Floats, clusters: Texts | None = None
 
 
 def _interval(values: Floats) -> Json | None:
-    """Return ``values[0]`` and its 95 % interval: the 2.5 % and 97.5 % percentiles of all later values.
+    """Return ``values[0]`` and its 95 % interval: the 2.5 % and 97.5 % percentiles of ``values[1:]``.
 
-    Returns None if one of the values is not finite.
+    Returns None if at least one of ``values`` is not finite.
     """
     if not np.isfinite(values).all():
         return None
@@ -148,7 +151,7 @@ def _interval(values: Floats) -> Json | None:
 
 
 def full_braking(scenario: Scenario, sample: Sample) -> Borne:
-    """Return the harm of each vehicle if all learners brake fully, [n, N] m2/s2, by harm count."""
+    """Return a dictionary from the harm count to the harm of each vehicle if all learners brake fully, [n, N] m2/s2."""
     brakes = scenario.replace(
         roles={**scenario.roles, **{scenario.vehicle_names[i]: "full_brake" for i in scenario.learners}}
     )
@@ -160,8 +163,8 @@ def full_braking(scenario: Scenario, sample: Sample) -> Borne:
 def front_sheet(results: Json) -> Sheet:
     """Return a table with one row for each choice of weights, and one for each further result, such as full braking.
 
-    A row contains the mean harm of each vehicle and, for a choice of weights, the ``ratio`` of each agent. ``results``
-    is the content of ``front.json``.
+    A row contains the mean harm of each vehicle. The row of a choice of weights also contains the ``ratio`` of each
+    agent. ``results`` is the content of ``front.json``.
     """
     count = results["harm_count"]
     columns: list[Column | str] = [

@@ -35,7 +35,7 @@ class Deterministic(BasePolicy):
         raise NotImplementedError
 
     def expect(self, observation: Float32s) -> Floats:
-        """Predict the size of the gradient of the return with respect to the action, [rows].
+        """Return the predicted size of the gradient of the return with respect to the action, [rows].
 
         ``observation`` [rows, F] are the observations from which the gradient is predicted.
         """
@@ -46,9 +46,10 @@ class Deterministic(BasePolicy):
         return np.clip(self.means(observation), -1.0, 1.0)
 
     def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return copies of the averaged weights, by name.
+        """Return a dictionary from names to copies of the averaged weights.
 
-        The weights have the same names as in a policy bundle whose network is ``network``.
+        The weights have the names that they have in a policy bundle; ``network`` is the description of the network in
+        this bundle.
         """
         return tensors_of(self, network)
 
@@ -101,7 +102,7 @@ class AveragedActor(Deterministic):
     def take_over(self, tensors: Mapping[str, Float32s]) -> None:
         """Copy the weights of a policy bundle into both networks, ``learning`` and ``average``.
 
-        ``tensors`` contains the weights of the policy bundle by name.
+        ``tensors`` is a mapping from names to the weights of the policy bundle.
         """
         state = self.state_dict()
         for name, theirs in sb3_names(self._spec).items():

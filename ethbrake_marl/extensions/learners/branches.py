@@ -84,7 +84,7 @@ def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) 
         decide: function that returns the actions of the learners, [m, L]. The three arguments of ``decide`` are the
             observations [m, L, F], the indices of the m worlds, and the number of steps so far.
         gamma: discount factor per time step.
-        at_least: number of steps before which no world ends early because its vehicles are at rest.
+        at_least: number of steps, from the start, in which no world ends early because its vehicles are at rest.
 
     If harm is the only term of the reward, the simulation of a world ends as soon as all its vehicles are at rest and
     will stay at rest. If the simulation of a world fails, its return is NaN.
@@ -112,8 +112,9 @@ def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) 
 def visit(engine: Engine, act: Act) -> tuple[Observations, State]:
     """Simulate all worlds of an engine to the end, and return the observations and states at all decisions.
 
-    ``act`` is the policy of all learners. Returns the observations [m, L, F] and the states of the worlds at the m
-    decisions in all worlds together, ordered by time. L is the number of learners, F the number of features.
+    ``act`` is the policy of all learners. Returns the observations [m, L, F] and the states of the worlds at all
+    decisions, ordered by time. Here m is the number of decisions in all worlds together. L is the number of learners, F
+    the number of features of an observation.
     """
     seen_then, moments = [], []
 
@@ -129,9 +130,9 @@ def visit(engine: Engine, act: Act) -> tuple[Observations, State]:
 def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
     """Return, for each of m worlds, whether all its vehicles are at rest and will stay at rest, [m] bool.
 
-    ``rows`` [m] are the indices of the worlds in the engine; ``before`` [m, columns] is their packed state one step
-    earlier. The result is True only if nothing has changed in this step and if every latency has elapsed. When a
-    latency elapses, the observation may change, so that a policy may move a vehicle again.
+    ``rows`` [m] are the indices of the worlds in the engine; ``before`` [m, columns] is the packed state of these
+    worlds one time step earlier. The result is True only if nothing has changed in this step and if every latency has
+    elapsed. When a latency elapses, the observation may change, so that a policy may move a vehicle again.
     """
     if engine.packed.has_messages or engine.in_pieces:
         return np.zeros(len(rows), np.bool_)  # a message may still change the observation, or a profile the command
@@ -170,7 +171,8 @@ def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, sta
 
 
 def counted_harm(engine: Engine, count: HarmCount) -> Floats:
-    """Return the harm up to now that each of the L learners of an engine should make small, [n, L] m2/s2.
+    """Return, for each of the L learners of an engine, the harm (up to the present time) that this learner should make
+    small, [n, L] m2/s2.
 
     If the reward has objectives, this harm is the value of the learner's objective. If the reward has no objectives,
     this harm is the harm of the whole line. ``count`` is the count of harm: ``first`` (each pair's first impact) or
@@ -184,7 +186,7 @@ def counted_harm(engine: Engine, count: HarmCount) -> Floats:
 
 
 def other_count(count: HarmCount) -> HarmCount:
-    """Return the other one of the two counts of harm: ``total`` for ``first``, and ``first`` for ``total``."""
+    """Return the harm count other than ``count``: ``total`` for ``first``, and ``first`` for ``total``."""
     return "total" if count == "first" else "first"
 
 

@@ -54,13 +54,17 @@ class AveragedGatingNetwork(nn.Module):
         self.register_buffer("compared", torch.zeros(1, dtype=torch.int64))
 
     def remember(self, seen: Float32s, more: Float32s) -> None:
-        """Store m decisions in the memory: observations ``seen`` [m, F], extra costs ``more`` [m, K] of K experts."""
+        """Store m decisions in the memory: their observations ``seen`` [m, F], and the extra costs ``more`` [m, K] of K
+        experts.
+        """
         places = torch.arange(int(self.compared), int(self.compared) + len(seen)) % len(self.seen)
         self.seen[places], self.more[places] = torch.from_numpy(seen), torch.from_numpy(more)
         self.compared += len(seen)
 
     def recall(self, count: int) -> tuple[Tensor, Tensor]:
-        """Draw decisions from the memory; return their observations [count, F] and experts' extra costs [count, K]."""
+        """Draw ``count`` decisions from the memory; return their observations [count, F] and the experts' extra costs
+        [count, K].
+        """
         some = torch.randint(min(int(self.compared), len(self.seen)), (count,))
         return self.seen[some], self.more[some]
 

@@ -33,13 +33,14 @@ def smallest_offset(measured: Floats, least: float, most: float) -> float:
     """Return the smallest offset (change of an action) with which gradients should be measured.
 
     If harm is a smooth function of the action, large and small offsets give similar gradients. If harm is
-    discontinuous, smaller offsets give larger gradients. The result is an offset that is expected to give ``SPREAD``
-    times the gradients (root mean square) that the largest offset ``most`` gives. This offset is limited to the range
-    from ``least`` to ``most / NARROWEST``. If small offsets do not give larger gradients, the result is ``least``.
+    discontinuous, smaller offsets give larger gradients. The result is the offset whose gradients are expected to be
+    ``SPREAD`` times as large (in root mean square) as the gradients with the largest offset, ``most``. The result is
+    limited to the range from ``least`` to ``most / NARROWEST``. If small offsets do not give larger gradients than
+    large offsets, the result is ``least``.
 
     Args:
         measured: [n, 2] absolute gradient, and the offset with which this gradient was measured (0: not measured yet).
-            The gradients of the smaller half of the offsets are compared with those of the larger half.
+            The gradients with the smaller half of the offsets are compared with the gradients with the larger half.
         least: smallest offset that the recipe allows.
         most: largest offset that the recipe allows.
 

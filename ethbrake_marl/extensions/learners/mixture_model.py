@@ -93,12 +93,15 @@ class ExpertsModel(VineModel):
         update_learning_rate(optimizers, rate)
 
     def _enter(self, stage: Stage, number: int) -> None:
-        """Prepare a stage of the training run. The stage begins, or is resumed, at update ``number``.
+        """Prepare a stage of the training run of a mixture of experts. ``number`` is the number of the update at which
+        the stage begins or is resumed.
 
         If the stage trains a second or later expert, this expert first imitates templates (random braking profiles)
-        that do better than the earlier experts. Then the worlds for the training of this expert are selected.
+        that do better than the earlier experts. After the imitation, the worlds for the training of this expert are
+        selected.
 
-        The preparation depends only on the earlier experts, so a resumed training run repeats the preparation exactly.
+        The preparation of a stage depends only on the earlier experts, so a resumed training run repeats the
+        preparation exactly.
 
         Raises ``NoBetterTemplate`` if no template does better than the earlier experts, or if no world can be selected.
         """
@@ -136,17 +139,19 @@ class ExpertsModel(VineModel):
         follow(pupil.average, pupil.learning, 0.0)
 
     def _compare(self, seen: Float32s, moments: State) -> tuple[Float32s, Floats, Float32s]:
-        """Compare the K experts: let each expert drive from B visited decisions to the end, and return its costs.
+        """Compare the K experts: let each expert drive from B visited decisions to the end of the episode, and return
+        its costs.
 
-        The cost of an expert is minus its return, plus ``tie_break`` times its harm. This harm is the total harm if the
-        reward counts first-impact harm, and the first-impact harm if the reward counts total harm. The B decisions are
-        drawn from the visited decisions at which the experts choose different actions.
+        The cost of an expert is minus its return, plus ``tie_break`` times its harm. The harm in this cost is the total
+        harm if the reward counts first-impact harm, and the first-impact harm if the reward counts total harm. The B
+        decisions are drawn from the visited decisions at which the experts choose different actions.
 
         Args:
             seen: [steps, rows, F] observations at the visited decisions.
             moments: states of the worlds at the visited decisions.
 
-        Returns observations [B, F], costs [B, K], and the importance (weight in the loss) of each decision, [B].
+        Returns the observations at the B decisions, [B, F], the cost of each expert, [B, K], and the importance (weight
+        in the loss) of each decision, [B].
 
         """
         engine, members = self.engine, [actor.act for actor in self.policy.actors]
@@ -172,8 +177,8 @@ class ExpertsModel(VineModel):
         the cost of the cheapest expert.
 
         Args:
-            seen: [B, F] observations.
-            costs: [B, K] cost of each expert.
+            seen: [B, F] observations at the B decisions.
+            costs: [B, K] cost of each expert at each of the B decisions.
             importance: [B] weight of each decision in the loss; None: all weights are 1.
 
         """

@@ -11,7 +11,7 @@ from ethbrake_marl.training.recipe import Fraction, Layers, NonNegative, Positiv
 class Shares(FileModel):
     """How the updates of a training run are divided among the four stages that train a mixture of experts.
 
-    Each stage gets a share from 0 to 1. The shares sum to 1.
+    Each stage gets a share of the updates, from 0 to 1. The shares sum to 1.
     """
 
     pretraining_first: Fraction  # share for the first expert, which is trained in all worlds
@@ -35,7 +35,8 @@ class ExpertsPlan(FileModel):
 
     Each expert after the first one is pre-trained in two steps. In the first step, the new expert imitates templates
     (random braking profiles) in worlds in which a template does better than all earlier experts. In the second step,
-    the new expert is trained in the worlds in which it is better than the best earlier expert, or nearly as good.
+    the new expert is trained in the worlds in which it is better than the best earlier expert, or nearly as good as
+    this expert.
     """
 
     networks: int = Field(ge=2, le=16, description="number of experts")

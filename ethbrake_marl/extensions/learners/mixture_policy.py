@@ -40,7 +40,8 @@ class ExpertsPolicy(Deterministic):
         self.gate = AveragedGatingNetwork(flatdim(observation_space), rate, recipe)
 
     def _chosen(self, observation: Float32s, ask: Callable[[AveragedActor, Float32s], NDArray[Any]]) -> Floats:
-        """Let the actor that the gating network chooses compute one number for each observation [rows, F].
+        """Return one number for each observation [rows, F], computed by the actor that the gating network chooses for
+        this observation.
 
         ``ask`` is the method of the actor that computes the numbers, such as ``AveragedActor.means``.
         """

@@ -44,7 +44,8 @@ class Shown(NamedTuple):
 
 
 def explore(engine: Engine, plan: ExpertsPlan, acts: Sequence[Act], gamma: float) -> Explored:
-    """Let every earlier expert drive the first ``plan.worlds`` worlds of the training run; return the best results.
+    """Let every earlier expert drive the first ``plan.worlds`` worlds of the training run; return the best result in
+    each world.
 
     Args:
         engine: engine of the training run; it is not changed.
@@ -84,9 +85,10 @@ def drive_from(
 
 
 def show_templates(engine: Engine, plan: ExpertsPlan, explored: Explored, gamma: float, seed: int) -> Shown:
-    """Draw templates (random braking profiles); return the decisions of templates that do better than all experts.
+    """Draw templates (random braking profiles); return the decisions of templates that do better than all earlier
+    experts.
 
-    In each world ``plan.templates`` templates are drawn, and the best one is simulated. If the return of this
+    In each world ``plan.templates`` templates are drawn, and the best template is simulated. If the return of this
     template exceeds the return of the best earlier expert by more than ``plan.gain``, the observations and actions of
     the template are returned.
 
@@ -155,5 +157,5 @@ def own_worlds(engine: Engine, plan: ExpertsPlan, explored: Explored, act: Act, 
 class NoBetterTemplate(EthBrakeError, ValueError):
     """Raised if no template (random braking profile) does better than the earlier experts.
 
-    A further expert would then be useless.
+    If this error is raised, a further expert would be useless.
     """

@@ -1,4 +1,4 @@
-"""Types of recipe keys that both algorithms, ``vine`` and ``rollout-classification``, use."""
+"""Types of the values of recipe keys that both algorithms, ``vine`` and ``rollout-classification``, use."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ethbrake_marl.training.recipe import Rate
 
 
 class OffsetRange(FileModel):
-    """Range from which a distance between two actions is drawn, such that its logarithm is uniformly distributed.
+    """Range from which a distance between two actions is drawn; the logarithm of the distance is uniformly distributed.
 
     Actions are numbers from -1 (full braking) to 1 (full drive).
     """

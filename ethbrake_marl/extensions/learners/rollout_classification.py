@@ -1,4 +1,5 @@
-"""The algorithm rollout classification: try several actions at a decision, and learn to choose the cheapest of them.
+"""The algorithm rollout classification: try several actions at a decision, and learn to choose the action with the
+least cost.
 
 Source: Lagoudakis and Parr, Reinforcement Learning as Classification, 2003.
 """
@@ -22,7 +23,8 @@ class RolloutClassification(Algorithm):
     def build(self, training: Training, environment: EthBrakeVecEnv) -> RolloutClassificationModel:
         """Return a new model for a training run. The model learns in ``environment``.
 
-        At first the model acts as the first policy of the recipe's key ``policies``; without this key it brakes fully.
+        At first the model acts like the first policy of the recipe's key ``policies``; without this key the model
+        brakes fully.
         """
         recipe = training.recipe
         assert isinstance(recipe, RolloutClassificationRecipe)
@@ -31,9 +33,10 @@ class RolloutClassification(Algorithm):
         return RolloutClassificationModel(environment, recipe, weights)
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return copies of an actor's averaged weights, by name.
+        """Return a dictionary from names to copies of an actor's averaged weights.
 
-        The weights have the same names as in a policy bundle whose network is ``network``.
+        The weights have the names that they have in a policy bundle; ``network`` is the description of the network in
+        this bundle.
         """
         tensors: dict[str, Float32s] = actor.tensors(network)
         return tensors

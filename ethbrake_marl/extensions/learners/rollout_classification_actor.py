@@ -31,7 +31,8 @@ from ethbrake_marl.training.networks import ACTIVATIONS, copy_of, tensors_of_lay
 class _TorchActor(Actor):
     """Copy of the class ``Actor`` (network of a policy) that multiplies matrices with torch instead of numpy.
 
-    ``_TorchActor`` is three times as fast as ``Actor``. The outputs of the two classes differ only by rounding.
+    ``_TorchActor`` is three times as fast as ``Actor``. The outputs of ``_TorchActor`` and ``Actor`` differ only by
+    rounding.
     """
 
     @torch.no_grad()
@@ -48,10 +49,10 @@ class _TorchActor(Actor):
 class ChoosingActor(Deterministic):
     """Actor whose network gives each of several choices a score. The actor takes the choice with the highest score.
 
-    A choice has a number. A choice with a number below ``first`` is a trained policy, which then computes the action. A
-    choice with the number ``first`` or above is an action; these actions are evenly spaced from -1 to 1. The network
-    ``learning`` is trained. The network ``average`` has running averages of the weights of ``learning``; when the actor
-    drives, ``average`` chooses.
+    Each choice has a number. A choice with a number below ``first`` is a trained policy, which then computes the
+    action. A choice with the number ``first`` or above is an action; these actions are evenly spaced from -1 to 1. The
+    network ``learning`` is trained. The network ``average`` has running averages of the weights of ``learning``; when
+    the actor drives, ``average`` chooses.
 
     A memory stores the last M decisions at which C choices were compared. The *extra cost* of a choice is its cost
     minus the cost of the cheapest choice at the same decision. F is the number of features of an observation.
@@ -61,8 +62,9 @@ class ChoosingActor(Deterministic):
         action_space: Gymnasium space of an action.
         rate: learning rate as a function of the share of the training run that remains (1 to 0).
         recipe: recipe of the training run.
-        policies: for each trained policy that the actor can choose, its weights by name.
-        members: number of scenarios in the mixture in which the actor is trained; 1 if the scenario is no mixture.
+        policies: for each trained policy that the actor can choose, a mapping from names to weights.
+        members: number of scenarios in the mixture of scenarios in which the actor is trained; 1 if the scenario is not
+            a mixture.
 
     """
 
@@ -129,7 +131,7 @@ class ChoosingActor(Deterministic):
         """Store m decisions, with the tried choices and their extra costs, in the memory.
 
         Args:
-            seen: [m, F] observations.
+            seen: [m, F] observations at the m decisions.
             tried: [m, C] numbers of the tried choices, as ``choose`` returns them; column 0: the actor's own choice.
             more: [m, C] extra cost of each tried choice.
 
@@ -148,8 +150,8 @@ class ChoosingActor(Deterministic):
         Args:
             batches: number of gradient steps.
             count: number of decisions for each gradient step.
-            focus: share of the draws with probabilities in proportion to a decision's largest extra cost; the other
-                draws are uniform.
+            focus: share of the draws in which the probability of a decision is proportional to its largest extra cost;
+                the other draws are uniform.
 
         """
         known = min(int(self.known), len(self.seen))
@@ -170,7 +172,7 @@ class ChoosingActor(Deterministic):
         the score of every tried choice except the cheapest one, in proportion to its extra cost.
 
         Args:
-            some: indices, in the memory, of the decisions.
+            some: for each decision that enters the loss, its index in the memory.
             importance: weight of each decision in the loss.
             guide: factor on the convex term; the loss is (expected extra cost) + ``guide`` * (convex term).
 

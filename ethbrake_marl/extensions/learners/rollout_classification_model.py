@@ -1,4 +1,6 @@
-"""Model of rollout classification: it tries several actions at a decision, and learns which of them costs least."""
+"""Model of rollout classification: it tries several actions at a decision, and learns which of these actions costs
+least.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,7 @@ class RolloutClassificationModel(VineModel):
     Args:
         environment: environment in which the model is trained.
         recipe: recipe of the training run.
-        policies: for each trained policy that the actor can choose, its weights by name.
+        policies: for each trained policy that the actor can choose, a mapping from names to weights.
 
     """
 
@@ -84,7 +86,7 @@ class RolloutClassificationModel(VineModel):
     def _try_actions(self, seen: Float32s, moments: State) -> tuple[Float32s, Ints, Floats]:
         """Try C choices (actions, or trained policies that act) at each of B visited decisions, and return their costs.
 
-        After each tried choice the episode is simulated to its end.
+        After each tried choice the model simulates the episode to its end.
 
         Args:
             seen: [steps, rows, F] observations at the visited decisions.
@@ -149,12 +151,13 @@ class RolloutClassificationModel(VineModel):
         return observed[rows], tried, costs
 
     def _usual(self, rows: Ints, least: Floats) -> Floats:
-        """Update the mean cost of each scenario of a mixture; return the mean costs for B decisions, [B].
+        """Update the mean cost of the cheapest choice in each scenario of a mixture of scenarios; return, for each of B
+        decisions, the mean cost in its scenario, [B].
 
         A mean cost below ``LEAST_USUAL`` is returned as ``LEAST_USUAL``, because costs are divided by the result.
 
         Args:
-            rows: [B] index of the visited state at which each decision was made.
+            rows: [B] for each of the B decisions, the index of the visited state in which the decision was made.
             least: [B] cost of the cheapest tried choice at each decision.
 
         """

@@ -23,7 +23,7 @@ from ethbrake_marl.training.recipes import BATCH_SIZE, NETWORK
 
 
 class ChoosingShape(Shape):
-    """Network of an actor that gives each of several actions a score. The actions are evenly spaced from -1 to 1."""
+    """Network that gives each of several actions a score. The actions are evenly spaced from -1 to 1."""
 
     policy: Layers = Field(description=ACTOR_LAYERS)
     activation: Activation = "relu"  # activation function of the hidden layers
@@ -32,7 +32,8 @@ class ChoosingShape(Shape):
     )
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
-        """Return the description of the network for a policy bundle; the actor takes the action with the highest score.
+        """Return the description of the network, for a policy bundle. The actor with this network takes the action that
+        has the highest score.
 
         Args:
             observation_size: number of features of an observation.
@@ -46,11 +47,12 @@ PolicyName = Annotated[str, Field(pattern=r"^[a-z-]+(@.+)?$", max_length=4096)]
 
 
 class RolloutClassificationRecipe(TrainingRecipe):
-    """Recipe of rollout classification: at some decisions several actions are tried, each to the end of the episode.
+    """Recipe of rollout classification: at some decisions several actions are tried; after each of them, the episode is
+    simulated to its end.
 
     At each decision the policy chooses one of ``network.choices`` actions, evenly spaced from -1 to 1, or one of the
     trained ``policies``. A round consists of ``n_envs x n_steps`` decisions and an update. At ``tried`` decisions of a
-    round, these choices are tried:
+    round, the following choices are tried:
 
     - the choice of the policy itself;
     - for each range of ``near``, one action below and one action above the action of the policy;
@@ -157,7 +159,7 @@ class RolloutClassificationRecipe(TrainingRecipe):
 
         The policies are loaded when this property is first used.
 
-        If a named policy itself chooses among several policies, these policies take its place.
+        If a named policy itself chooses among several policies, these policies take the place of the named policy.
 
         If a policy cannot be used, an ``InvalidInput`` that names this policy is raised.
         """

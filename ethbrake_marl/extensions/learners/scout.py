@@ -1,4 +1,5 @@
-"""Scout: a small network that predicts at which decisions the action matters. More branches start at such decisions.
+"""Scout: a small network that predicts at which decisions the action matters. More branches start at decisions at which
+the action matters.
 
 A branch is a copy of the episode with another action. Simulating a branch from a decision at which the action has no
 effect is a waste of time. Therefore decisions at which the action matters are drawn with a higher probability, and get
@@ -53,7 +54,7 @@ class Scout(nn.Module):
 
         Args:
             observation: [rows, F] observations at the decisions.
-            size: [rows] measured size of each decision.
+            size: [rows] measured size of each decision (absolute gradient, or difference in cost).
             importance: [rows] weight of each decision in the loss.
 
         """
@@ -67,8 +68,9 @@ def draw_rows(expected: Floats, count: int, focus: float) -> tuple[Ints, Float32
 
     Args:
         expected: [n] size of each decision (predicted gradient, or difference in cost), above 0.
-        count: number of decisions to draw.
-        focus: share of the draws with probabilities in proportion to ``expected``; the other draws are uniform.
+        count: number of decisions that are drawn.
+        focus: share of the draws in which the probability of a decision is proportional to its size in ``expected``;
+            the other draws are uniform.
 
     Returns the indices of the drawn decisions [count], and their importance [count], which is their weight in the loss:
     ``1 / (n p)``, where p is the probability of drawing the decision. The expected value of the importance is 1.
@@ -88,11 +90,12 @@ def choose_rows(
     Decisions at which the action is predicted to matter are drawn more often.
 
     Args:
-        observed: [n, F] observations at all decisions.
-        rows: indices, in ``observed``, of the decisions to draw from.
-        count: number of decisions to draw.
-        focus: share of the draws with probabilities in proportion to the predicted size, with replacement (see
-            ``draw_rows``). If ``focus`` is 0, all decisions are drawn uniformly and without replacement.
+        observed: [n, F] observations at all n decisions.
+        rows: indices (in ``observed``) of the decisions from which the function draws.
+        count: number of decisions that are drawn.
+        focus: share of the draws in which the probability of a decision is proportional to its predicted size;
+            decisions are drawn with replacement (see ``draw_rows``). If ``focus`` is 0, all decisions are drawn
+            uniformly and without replacement.
         expect: function that predicts the size of decisions, [rows], from observations [rows, F]. If ``expect`` is
             None, decisions are drawn as with ``focus`` = 0.
 

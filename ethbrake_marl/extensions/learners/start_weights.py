@@ -14,8 +14,8 @@ def widened(policy: Policy, training: Training) -> dict[str, NDArray[np.float32]
     """Return the weights of ``policy`` by name, as initial weights of a training run that may observe more features.
 
     The weights for features that the policy does not observe are 0. Raises ``InvalidInput`` if the training run does
-    not observe a feature of the policy, if the policy is a mixture of experts, or if the networks differ in layers or
-    output.
+    not observe a feature of the policy, if the policy is a mixture of experts, or if the networks of the policy and of
+    the training run differ in layers or output.
     """
     recipe, wanted = training.recipe, training.recipe.network_spec(training.observation.size)
     network = policy.manifest.network
@@ -34,14 +34,15 @@ def widened(policy: Policy, training: Training) -> dict[str, NDArray[np.float32]
 
 
 def padded(policy: Policy, training: Training, key: str) -> dict[str, NDArray[np.float32]]:
-    """Return the weights of ``policy`` by name, without the critic, for a training run that may observe more features.
+    """Return the weights of ``policy`` by name, except the weights of its critic, for a training run that may observe
+    more features.
 
     The weights for features that the policy does not observe are 0. Raises ``InvalidInput`` if the training run does
     not observe a feature of the policy.
 
     Args:
         policy: trained policy.
-        training: training run that uses the weights.
+        training: training run that will use the returned weights.
         key: key of the recipe that names the policy; it is quoted in the error message.
 
     """

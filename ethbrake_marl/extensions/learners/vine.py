@@ -1,6 +1,7 @@
 """The algorithm ``vine``: try two actions in the same state, and measure the gradient of the return.
 
-The name is from Schulman et al. 2015 (TRPO), who sample branches from visited states with common random numbers.
+The name of the algorithm is from Schulman et al. 2015 (TRPO), who sample branches from visited states with common
+random numbers.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ from ethbrake_marl.training.training import Training
 class Vine(Algorithm):
     """The algorithm vine, which measures gradients of the return and trains an actor with them.
 
-    The same actor drives all learners. A single learner may be driven by a mixture of experts instead.
+    The same actor drives all learners. If there is only one learner, a mixture of experts may drive this learner
+    instead.
     """
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> VineModel:
@@ -47,15 +49,16 @@ class Vine(Algorithm):
         return model
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return copies of an actor's averaged weights, by name.
+        """Return a dictionary from names to copies of an actor's averaged weights.
 
-        The weights have the same names as in a policy bundle whose network is ``network``.
+        The weights have the names that they have in a policy bundle; ``network`` is the description of the network in
+        this bundle.
         """
         tensors: dict[str, Float32s] = actor.tensors(network)
         return tensors
 
     def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:
-        """Return the model's optimisers by name.
+        """Return a dictionary from names to the optimisers of the model.
 
         A model with one actor has one optimiser, ``policy``. A mixture of experts has the optimisers ``network_1``,
         ``network_2``, ... of its experts, and ``gate`` of its gating network.

@@ -28,8 +28,8 @@ from ethbrake_marl.policies.network_spec import Float32s
 class VineModel(BaseAlgorithm):
     """Model that drives with a deterministic actor, tries two actions at some of its decisions, and learns from them.
 
-    One of the two actions is higher than the actor's action, the other is lower. From the difference between the two
-    returns the model computes the gradient of the return with respect to the action.
+    One of the two actions is higher than the actor's action, the other is lower. From the difference between the
+    returns after these two actions the model computes the gradient of the return with respect to the action.
 
     Args:
         environment: environment in which the model is trained.
@@ -82,9 +82,10 @@ class VineModel(BaseAlgorithm):
         return self
 
     def _update(self, callback: BaseCallback, total: int) -> None:
-        """Make one update of the training: collect decisions, and learn from them.
+        """Make one update of the training run: collect decisions, and learn from them.
 
-        ``callback`` is the callback of the training run, and ``total`` the number of decisions in the whole run.
+        ``callback`` is the callback of the training run, and ``total`` is the number of decisions in the whole training
+        run.
         """
         actor = self.policy
         seen, moments = self._visit(callback, actor.act)
@@ -115,12 +116,13 @@ class VineModel(BaseAlgorithm):
         return np.stack(seen), State.join(moments)
 
     def _try_out(self, seen: Float32s, moments: State, actor: Deterministic) -> Tried:
-        """At some visited decisions, try a higher and a lower action, and simulate both to the end of the episode.
+        """At some visited decisions, try a higher and a lower action; after each of them, simulate the episode to its
+        end.
 
         Args:
             seen: [steps, rows, F] observations at the visited decisions.
             moments: states of the worlds at the visited decisions.
-            actor: policy; a tried action is the policy's action plus or minus an offset.
+            actor: policy that drives; a tried action is the action of this policy plus or minus an offset.
 
         Returns the decisions at which the two actions were tried, with the measured gradients.
 

@@ -26,7 +26,7 @@ _RIGHT_START = "must be the name of a shipped policy, for instance ppo, or ppo@P
 
 
 class ActorShape(Shape):
-    """Network of the actor. The algorithm vine has no critic."""
+    """Description of the actor's network. The algorithm vine has no critic."""
 
     policy: Layers = Field(description=ACTOR_LAYERS)
     activation: Activation = "relu"  # activation function of the hidden layers
@@ -36,10 +36,11 @@ class ActorShape(Shape):
 
 
 class VineRecipe(TrainingRecipe):
-    """Recipe of vine: at some decisions, a higher and a lower action are tried, and both are simulated to the end.
+    """Recipe of vine: at some decisions, a higher and a lower action are tried, and each is simulated to the end of the
+    episode.
 
-    A round of the training run has ``n_envs x n_steps`` decisions. At ``tried`` of these decisions the two actions are
-    tried. The policy learns from the difference between the two returns.
+    A round of the training run has ``n_envs x n_steps`` decisions. At ``tried`` of these decisions, a higher and a
+    lower action are tried. The policy learns from the difference between the two returns.
 
     ``start`` names a trained policy, whose weights are the initial weights; without this key, the initial weights are
     random. ``start: ppo`` means the shipped policy ``ppo`` or ``ppo-...`` that was trained on the scenario of this
@@ -130,10 +131,11 @@ class VineRecipe(TrainingRecipe):
         return next((name for name in names if load_shipped(name).manifest.scenario.get("name") == scenario.name), None)
 
     def begins(self, scenario: Scenario) -> str:
-        """Return the origin of the initial weights, for messages: a policy such as ``ppo``, or ``random weights``.
+        """Return a text that names the origin of the initial weights in messages: a policy such as ``ppo``, or ``random
+        weights``.
 
-        If the weights are random because the policy that ``start`` names is not shipped for ``scenario``, the text
-        gives this reason.
+        If the policy that ``start`` names is not shipped for ``scenario``, the text says that the weights are random
+        for this reason.
         """
         why = "" if self.start is None else f", because no {self.start} is shipped for scenario {scenario.name!r}"
         return self.policy_to_start_from(scenario) or f"random weights{why}"
