@@ -50,7 +50,7 @@ def make_agent(
             time step, or 0.1 s.
 
     Raises ``UnknownName`` for an unknown name, with a similar name as a suggestion. Raises ``InvalidInput`` for an
-    invalid argument, harm count or horizon, and if the agent needs a scenario and none is passed.
+    invalid argument, harm count or horizon, or if the agent needs a scenario but no scenario is passed.
 
     >>> import ethbrake_marl as eb
     >>> eb.make_agent("ppo+step", scenario="paper-random").name
@@ -142,7 +142,7 @@ def find_entry(spec: AgentSpec | str) -> Entry:
 def _make(entry: Entry, argument: str | None, settings: AgentSettings, *inside: Driver) -> Driver:
     """Make an agent or a team from its registry entry, and check the result.
 
-    If a factory from outside this package raises an error, the function raises ``InvalidInput`` instead.
+    If a factory from outside this package raises an error, ``_make`` raises ``InvalidInput`` in its place.
 
     Args:
         entry: the registry entry.
@@ -166,7 +166,7 @@ def make_from_file(argument: str | None, settings: AgentSettings) -> Driver:
     """Call the function in a Python file that ``settings.spec`` names (``FILE.py:FUNCTION``), and return its result.
 
     The function is called with ``argument`` (the text after the second colon, or None) and ``settings``. A function
-    without parameters is called without arguments. Raises ``InvalidInput`` if the file cannot be loaded, and if the
+    without parameters is called without arguments. Raises ``InvalidInput`` if the file cannot be loaded, or if the
     function has no parameters but the specification contains an argument or a policy.
     """
     named = parse_spec(settings.spec).file

@@ -43,7 +43,7 @@ class Knowledge(tuple[Source, ...]):
             agents: agents or teams; for an agent without an attribute ``knows``, the source is ``UNSTATED``.
             also: source of knowledge that a shield or search around the agents adds; None: no further source.
 
-        Raises ``InvalidInput`` if ``knows`` of an agent contains an unknown source.
+        Raises ``InvalidInput`` if the attribute ``knows`` of an agent contains an unknown source.
 
         """
         known = set() if also is None else {also}
@@ -106,13 +106,13 @@ class Agent(Script, Protocol):
 
 
 def check_agent(agent: object, where: str, *, alone: bool = True) -> None:
-    """Raise ``InvalidInput`` unless ``agent`` is an agent.
+    """Raise ``InvalidInput`` unless the object ``agent`` implements the interface ``Agent``.
 
     Args:
         agent: any object.
         where: beginning of the error message, for example ``agent 'mine'``.
-        alone: True: only an agent for one vehicle is accepted. False: a team, and an agent behind a shield, are
-            accepted as well.
+        alone: True: only an agent for one vehicle is accepted. False: a team and an agent behind a shield are accepted
+            as well.
 
     """
     if not isinstance(agent, Agent) and (alone or not isinstance(agent, Team | Shielding)):
@@ -148,7 +148,7 @@ def fixed_commands(
         advice: end of the error message about a script whose command is not fixed at the alert.
 
     Raises ``InvalidInput`` for a script whose command is not fixed at the alert, if the braking profiles in ``worlds``
-    differ from the profiles of the scripts, and if the messages do not contain a quantity that the agent needs to look
+    differ from the profiles of the scripts, or if the messages do not contain a quantity that the agent needs to look
     ahead.
 
     """
@@ -248,7 +248,7 @@ class AgentAround(ByPolicy):
 
 @runtime_checkable
 class Shielding(Protocol):
-    """Interface of an agent or team behind a shield. The method ``on`` chooses the vehicles that it drives."""
+    """Interface of an agent or team behind a shield. The method ``on`` chooses the vehicles that the agent or team drives."""
 
     name: str  # name of the agent or team in tables and messages
 
@@ -307,7 +307,7 @@ class Team:
         """Return the team in which ``driver`` drives the vehicles with the indices ``vehicles`` (0 = front).
 
         If ``driver`` is a single agent, it drives all these vehicles. Raises ``InvalidInput`` if ``driver`` is a team
-        that drives other vehicles.
+        that drives other vehicles than ``vehicles``.
         """
         if isinstance(driver, Shielding):
             return driver.on(vehicles)

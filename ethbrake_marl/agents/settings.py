@@ -52,7 +52,7 @@ Wrapper = Callable[[Any, str | None, AgentSettings], Driver]
 
 
 class Variant(NamedTuple):
-    """Variant of an agent or shield. Specifications end with the name of a variant, as in ``step:estimated``."""
+    """Variant of an agent or shield. In a specification the variant is the last word, as in ``step:estimated``."""
 
     make: Factory | Wrapper  # function that makes the agent or wrapper, in place of the original function
     about: str  # description in one line

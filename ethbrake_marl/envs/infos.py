@@ -251,7 +251,7 @@ def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> 
 
 
 class Begun:
-    """Base class of all environments. It starts episodes with a seed and options.
+    """Base class of all environments. This class starts episodes with a seed and options.
 
     A subclass sets ``engine`` in its constructor, and calls ``_restart`` in its ``reset``. The worlds of a seed form a
     *stream*: each new episode takes the next world of this seed. ``np_random`` and ``np_random_seed`` have the same
@@ -270,7 +270,7 @@ class Begun:
         """Random generator that wrappers may use. The worlds depend on ``np_random_seed`` only.
 
         If you set another generator, each ``reset`` without a seed draws a new seed from the generator that you set.
-        This ends with the first ``reset`` with a seed.
+        The next ``reset`` with a seed replaces your generator.
         """
         if self._np_random is None:
             self._set_seed(chosen_seed(None))
@@ -299,16 +299,17 @@ class Begun:
 
         With ``options["initial_state"]``, every world starts in this state, which ``scenario.tables.worlds_from_state``
         reads. With ``options["listed_world"] = {"seed": 7, "number": 3}``, the first world is world 3 of the evaluation
-        list with seed 7, the second one is world 4, and so on. Later episodes, which start without a call of ``reset``,
-        take the next worlds of the stream. For other options a warning ``UnknownResetOption`` is issued, and these
-        options are ignored.
+        list with seed 7, the second world is world 4 of this list, and so on. Later episodes, which start without a
+        call of ``reset``, take the next worlds of the stream. For other options a warning ``UnknownResetOption`` is
+        issued, and these options are ignored.
 
         Args:
             seed: start with the first world of this seed; None: continue with the next world of the stream.
             options: the options of ``reset``; None: there are no options.
 
         Raises ``InvalidInput`` for a seed that is not a whole number >= 0, for an invalid initial state or listed
-        world, and if the options contain both. If this error is raised, the environment stays unchanged.
+        world, or if the options contain both an initial state and a listed world. If this error is raised, the
+        environment stays unchanged.
 
         """
         named = None if seed is None else chosen_seed(seed)
@@ -351,7 +352,7 @@ class Begun:
 
 
 class OneWorld(Begun):
-    """Base class of environments with a single world. It defines ``describe_world``, ``render`` and ``close``.
+    """Base class of environments with a single world. This class defines ``describe_world``, ``render`` and ``close``.
 
     A subclass sets ``viewer`` in its constructor.
     """
@@ -364,7 +365,7 @@ class OneWorld(Begun):
         return {name: column[0].item() for name, column in describe_worlds(self.engine).items()}
 
     def render(self) -> Any:
-        """Return a picture of the present moment. Its type depends on the render mode:
+        """Return a picture of the present moment. The type of the picture depends on the render mode:
 
         ``rgb_array``: a frame [H, W, 3] uint8. ``rgb_array_list``: a list of all frames since the last call of
         ``render``. ``ansi``: a text. ``human``: None, because a window already shows every step.

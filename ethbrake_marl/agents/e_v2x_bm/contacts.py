@@ -117,7 +117,7 @@ def contact_while_both_brake(gap: float, v_l: float, a_l: float, v_f: float, a_f
 
 @compiled
 def contact_leader_first(gap: float, v_l: float, a_l: float, v_f: float, a_f: float, tau: float) -> float:
-    """Return the squared closing speed (m2/s2) at the first contact; 0 without contact. The leader brakes first.
+    """Return the squared closing speed (m2/s2) at the first contact if the leader brakes first; 0 without contact.
 
     Args:
         gap: gap between leader and follower at the start of the motion, m.
@@ -258,8 +258,8 @@ def least_to_spare_front(gap: float, v_l: float, a_l: float, onset_l: float, v_f
     """Return the follower's smallest deceleration (m/s2) that avoids an impact; inf if every deceleration leads to one.
 
     With a larger deceleration the follower is further back at every moment. Therefore every larger deceleration avoids
-    the impact as well. With the smallest such deceleration, the follower stops directly behind the leader, or the two
-    vehicles touch with equal speeds while both move.
+    the impact as well. With the smallest deceleration that avoids an impact, the follower stops directly behind the
+    leader, or the two vehicles touch with equal speeds while both move.
 
     Args:
         gap: gap between leader and follower at the start of the motion, m.

@@ -131,10 +131,10 @@ def minimise_over(
 ) -> tuple[float, float]:
     """Return the deceleration (m/s2) of vehicle ``i`` with the least predicted harm, and this harm (m2/s2).
 
-    Only the six decelerations in ``at`` (m/s2) are compared. If several of them have the least harm, the middle between
-    the smallest and the largest of these is returned, provided that the middle has the least harm as well. The world
-    has the gaps ``gap`` [P] m, the speeds ``speed`` [N] m/s and the braking capacities ``capacity`` [N] m/s2. Vehicle k
-    may brake after ``onset[k]`` seconds.
+    Only the six decelerations in ``at`` (m/s2) are compared. If several of these decelerations have the least harm,
+    consider the middle between the smallest and the largest of them: if the middle has the least harm as well, the
+    middle is returned; if not, the smallest one is returned. The world has the gaps ``gap`` [P] m, the speeds ``speed``
+    [N] m/s and the braking capacities ``capacity`` [N] m/s2. Vehicle k may brake after ``onset[k]`` seconds.
     """
     best, first, last = math.inf, 0.0, 0.0
     for k in range(at.shape[0]):
@@ -197,9 +197,9 @@ def optimise_pairwise(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
 
     ``a*`` minimises ``H(a) = c_front^2 + c_rear^2`` over ``a`` in [0, capacity], where ``c_front`` and ``c_rear`` are
     the closing speeds (m/s) at the first contacts with the two neighbours. If an interval of decelerations avoids both
-    impacts, ``a*`` is the middle of this interval; otherwise ``a*`` is the breakpoint with the least H. For the first
-    and the last vehicle of a line, H contains only the one neighbour. Only gaps, speeds, capacities and latencies of
-    the vehicle and its neighbours are used.
+    impacts, ``a*`` is the middle of this interval; otherwise ``a*`` is the breakpoint with the least H. The first and
+    the last vehicle of a line have one neighbour, so H has only one of the two terms. Only gaps, speeds, capacities and
+    latencies of the vehicle and its neighbours are used.
 
     Raises ``InvalidInput`` if ``vehicle`` is not in the line, if a vehicle moves backward, or if brakes build up
     gradually.
@@ -221,7 +221,7 @@ def pairwise_harm(worlds: Worlds, deceleration_mps2: ArrayLike) -> Floats:
     """Return the predicted harm of each pair, [n, P] m2/s2, as if no pair influenced another pair.
 
     Every vehicle coasts until its latency has elapsed, and then brakes with its constant deceleration to rest. The harm
-    that E-V2X-BM predicts for a vehicle is the sum over the pairs that contain this vehicle.
+    that E-V2X-BM predicts for a vehicle is the sum of the predicted harms of the pairs that contain this vehicle.
 
     Args:
         worlds: n worlds.
