@@ -248,7 +248,7 @@ class AgentAround(ByPolicy):
 
 @runtime_checkable
 class Shielding(Protocol):
-    """Interface of an agent or team behind a shield. The method ``on`` chooses the vehicles that the agent or team drives."""
+    """Interface of an agent or team behind a shield. The method ``on`` chooses which vehicles are driven."""
 
     name: str  # name of the agent or team in tables and messages
 

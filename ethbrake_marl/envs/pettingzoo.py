@@ -57,7 +57,7 @@ class SeededInside:
 
 
 class Ordered(SeededInside, OrderEnforcingWrapper):  # type: ignore[misc]  # PettingZoo is untyped
-    """PettingZoo's ``OrderEnforcingWrapper``, whose ``np_random`` is the generator of the environment inside the wrapper."""
+    """PettingZoo's ``OrderEnforcingWrapper``, whose ``np_random`` is that of the environment inside the wrapper."""
 
     def __str__(self) -> str:
         return str(self.env)

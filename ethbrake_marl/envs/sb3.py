@@ -101,7 +101,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
     episode, the infos contain ``TimeLimit.truncated``, ``terminal_observation``, ``episode`` (return ``r``, number of
     steps ``l``, and ``t``, which is always 0), and all infos of the other environments. In other steps, the infos
     contain only the infos of a shield, unless ``step_infos`` is true. ``get_attr`` and ``env_method`` use this
-    ``EthBrakeVecEnv`` itself, because a row has no environment of its own.
+    ``EthBrakeVecEnv``.
 
     Args:
         engine: the engine that simulates the worlds; ``make_sb3_vec_env`` makes it.
