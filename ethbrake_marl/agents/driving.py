@@ -1,4 +1,4 @@
-"""Let agents drive through whole episodes. Evaluations and rollouts use this loop."""
+"""Let agents drive through whole episodes. Evaluations and rollouts use this module."""
 
 from __future__ import annotations
 
@@ -205,7 +205,7 @@ def write_down(engine: Engine, steps: int, column: Callable[[], Floats]) -> Floa
 
     Args:
         engine: an engine made by ``episode_engine``.
-        steps: number of steps to record.
+        steps: number of steps for which numbers are recorded.
         column: function without arguments that returns the K numbers to record for each of n worlds, [n, K].
 
     Returns the recorded numbers of the n worlds, [n, steps, K]. The numbers of a world after the end of its episode are

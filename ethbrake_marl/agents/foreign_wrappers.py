@@ -149,7 +149,7 @@ def _look(layer: Any, name: str) -> tuple[str | None, list[Any]]:
     """Return the class in ``layer`` that may change observations or actions, and this package's environments in it.
 
     Args:
-        layer: a wrapper or environment, from ``_layers``.
+        layer: a wrapper or environment that ``_layers`` yields.
         name: name of the agent in error messages.
 
     Returns two values. The first value is the name of a class that may change observations or actions, or None. The

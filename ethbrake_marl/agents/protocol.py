@@ -257,7 +257,7 @@ class Shielding(Protocol):
         """Sources of knowledge of the agents and of the shield together."""
 
     def on(self, vehicles: Collection[int]) -> Team:
-        """Return a team behind this shield that drives ``vehicles`` (indices, 0 = front)."""
+        """Return a team that drives ``vehicles`` (indices, 0 = front) behind this shield."""
 
     def guard(self, engine: Engine, policies: Mapping[int, Agent]) -> Guard:
         """Return the guard: the object that checks commands in ``engine`` for the shield.

@@ -38,7 +38,7 @@ class Entry:
 
     @property
     def is_ours(self) -> bool:
-        """Whether the agent is part of this package. For errors in other agents, the message names the agent."""
+        """Whether the agent is part of this package. Errors in other agents are reported with the agent's name."""
         is_from_file = ":" in self.name
         return str(getattr(self.make, "__module__", "")).startswith("ethbrake_marl.") and not is_from_file
 
@@ -55,7 +55,7 @@ class Entry:
     def words(self) -> tuple[str, ...]:
         """All texts that can follow ``+`` to select this wrapper, for example ``("step", "step:estimated")``.
 
-        If ``form`` does not list every allowed argument, the texts with the other arguments are missing.
+        If ``form`` does not list every allowed argument, the texts with the unlisted arguments are missing.
         """
         name, *options = re.findall(r"[^\[\]+]+", self.whole_form)
         words = [name]

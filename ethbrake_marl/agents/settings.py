@@ -1,4 +1,4 @@
-"""Settings that a function gets to make an agent, and the signatures of such functions."""
+"""Settings for functions that make agents, and the signatures of such functions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HORIZON_S = 8.0  # horizon of agents that look ahead, if there is no scenario
 
 @dataclass(frozen=True, slots=True)
 class AgentSettings:
-    """Settings that a function gets to make an agent, in addition to the argument in the agent's specification.
+    """Settings for a function that makes an agent, in addition to the argument in the agent's specification.
 
     >>> import ethbrake_marl as eb
     >>> eb.AgentSettings("planner:64", scenario=eb.load_scenario("paper-random")).needed_scenario().name

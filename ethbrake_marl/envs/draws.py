@@ -58,8 +58,8 @@ def describe_worlds(engine: Engine) -> Columns:
 def _drawn_again(engine: Engine, numbers: Ints) -> Sample:
     """Draw the worlds with these ``numbers`` in the training stream again; return them in the order of ``numbers``.
 
-    Raises ``InvalidInput`` if a drawn world differs from the running world. This happens if the physics failed in the
-    drawn world before its first decision, so that another world replaced the drawn world.
+    Raises ``InvalidInput`` if a drawn world differs from the running world. The two worlds differ if the physics failed
+    in the drawn world before its first decision, so that another world replaced the drawn world.
     """
     ordered, places = np.unique(numbers, return_inverse=True)
     breaks = np.flatnonzero(np.diff(ordered) > _MOST_APART) + 1

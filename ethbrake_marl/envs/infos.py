@@ -57,7 +57,7 @@ _FLOAT32 = np.dtype(np.float32)
 def shield_columns(engine: Engine, rows: Ints | None = None) -> Columns:
     """Return a mapping from ``shield_NAME`` to the shield's info ``NAME``, [n, N]; it is empty without a shield.
 
-    ``rows`` are the indices of the worlds to include; None: all worlds.
+    ``rows`` are the indices of the worlds whose infos are returned; None: all worlds.
     """
     if engine.guard is None or engine.guarded is None:
         return {}
@@ -101,7 +101,7 @@ class Report(NamedTuple):
         Args:
             engine: the engine.
             step: results of the last step; None after a reset.
-            rows: indices of the worlds to include; None: all worlds.
+            rows: indices of the worlds whose infos are returned; None: all worlds.
 
         """
         now, world = engine.state, engine.roster.numbers
@@ -180,10 +180,10 @@ class Report(NamedTuple):
         true for the worlds in which ``time_s`` has a value.
 
         Args:
-            vehicle: index of the vehicle (0 = front).
-            rows: mask of the worlds whose infos have values, [n].
-            stepped: mask of the worlds whose running episode includes the last step, [n]. In all other worlds ``cost``
-                and the reward terms are 0.
+            vehicle: index of the vehicle whose infos are returned (0 = front).
+            rows: mask [n], True for the worlds whose infos have values.
+            stepped: mask [n], True for the worlds whose running episode includes the last step. In all other worlds
+                ``cost`` and the reward terms are 0.
 
         """
         columns: dict[str, NDArray[Any]] = {name: info[:, vehicle] for name, info in self.columns().items()}

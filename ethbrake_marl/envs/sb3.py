@@ -100,8 +100,8 @@ class EthBrakeVecEnv(Begun, VecEnv):
     The rows of one world share one episode. Each new episode takes the next world of the stream. In the last step of an
     episode, the infos contain ``TimeLimit.truncated``, ``terminal_observation``, ``episode`` (return ``r``, number of
     steps ``l``, and ``t``, which is always 0), and all infos of the other environments. In other steps, the infos
-    contain only the infos of a shield, unless ``step_infos`` is true. ``get_attr`` and ``env_method`` use this
-    ``EthBrakeVecEnv``.
+    contain only the infos of a shield, unless ``step_infos`` is true. ``get_attr`` and ``env_method`` act on this
+    ``EthBrakeVecEnv``, not on rows.
 
     Args:
         engine: the engine that simulates the worlds; ``make_sb3_vec_env`` makes it.
@@ -318,7 +318,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
     def _observe(self, worlds: Ints | None = None) -> Observations:
         """Return the observations of all learners as a new array, float32 [rows, F].
 
-        ``worlds`` are the indices of the worlds to include; None: all worlds.
+        ``worlds`` are the indices of the worlds whose learners' observations are returned; None: all worlds.
         """
         every = self.engine.observe_all(self._learners, worlds)
         rows = every.reshape(-1, every.shape[2])

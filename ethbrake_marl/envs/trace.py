@@ -65,7 +65,7 @@ class Motion:
 
         Args:
             engine: the engine whose worlds were recorded.
-            row: index of the world.
+            row: index of the world whose scenes are returned.
             times_s: times within this motion in increasing order, [k] s since the alert; None: only the end of the
                 motion.
 

@@ -69,7 +69,7 @@ def make_line(
         latency: latency of each vehicle (time from the alert until its command takes effect), [N] s.
         mass: mass of each vehicle, [N] t.
         limit: speed limit of each vehicle, [N] m/s.
-        in_force: acceleration of each vehicle at the start, [N] m/s2.
+        in_force: acceleration of each vehicle at the start of the simulations, [N] m/s2.
         brake_rate: rate at which the deceleration of each vehicle rises when it brakes, [N] m/s3.
         release_rate: rate at which the deceleration of each vehicle falls when it releases its brakes, [N] m/s3.
         pieces: braking profile of each vehicle: K intervals with constant commands, in the format of
@@ -137,7 +137,8 @@ def simulate(line: Line, samples: Samples, first: int, end: int, bound: float) -
         first: index of the first sample to simulate.
         end: index after the last sample to simulate.
         bound: a simulation stops when its harm reaches this number, m2/s2. The sample of a stopped simulation has a
-            harm of at least ``bound``, and its ``other`` and ``course`` have no meaning.
+            harm of at least ``bound``, and its ``other`` (harm under the other count) and ``course`` (numbers of
+            impacts) have no meaning.
 
     Returns ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed.
 
@@ -273,7 +274,7 @@ def _way_to_stop(speed: float, acceleration: float) -> float:
 
 @compiled(within=True)
 def _course(line: Line) -> float:
-    """Return one number that encodes, for ``line.table``, how many impacts each pair and the obstacle have had."""
+    """Return one number that encodes how many impacts each pair and the obstacle have had in ``line.table``."""
     course, digit, table = 0.0, 1.0, line.table
     for p in range(line.vehicles, table.shape[1] - 1):
         course += table[ROW.COUNT, p] * digit

@@ -59,11 +59,11 @@ def optimise_coupled(
     """Return, for each world, the constant deceleration of ``vehicle`` with the least harm in a simulation.
 
     If the deceleration that the closed form (``optimise_pairwise``) chooses does no harm in a simulation, this
-    deceleration is the result. If it does harm, the search simulates evenly spaced decelerations and the breakpoints of
-    the closed form. The harm may jump where the number of impacts changes. The jumps and local minima with the least
-    harm are located to 1e-9 m/s2; at a jump the result lies on the side with less harm. If several decelerations have
-    the least harm, those with the least harm under the other harm count remain, and the middle one of these is the
-    result. The result for a world does not depend on the other worlds.
+    deceleration is the result. If this deceleration does harm, the search simulates evenly spaced decelerations and the
+    breakpoints of the closed form. The harm may jump where the number of impacts changes. The jumps and local minima
+    with the least harm are located to 1e-9 m/s2; at a jump the result lies on the side with less harm. If several
+    decelerations have the least harm, those with the least harm under the other harm count remain, and the middle one
+    of these is the result. The result for a world does not depend on the other worlds.
 
     Args:
         worlds: n worlds of N vehicles.
@@ -110,7 +110,7 @@ def _minimise(
             of each braking vehicle except ``vehicle`` is replaced by the deceleration in ``command``.
         command: constant commands of all vehicles, [n, N] m/s2; the controlled vehicle's column is ignored.
         vehicle: index of the controlled vehicle, from 0.
-        rows: indices of the worlds to search, [m].
+        rows: indices of the worlds for which the best deceleration is searched, [m].
         harm_count: harm to minimise: ``first`` (harm of each pair's first impact) or ``total`` (harm of all impacts).
         horizon_s: time at the end of the simulations, s since the alert.
 

@@ -4,7 +4,7 @@ The prediction assumes that the neighbours of the controlled vehicle brake with 
 It also assumes that only the first contact of each pair does harm and that impacts change no speed, so that the pair in
 front and the pair behind do not influence each other. The predicted harm is ``H(a) = c_front(a)^2 + c_rear(a)^2``
 (m2/s2). Here ``a`` is the controlled vehicle's deceleration (m/s2), and ``c_front`` and ``c_rear`` are the closing
-speeds (m/s) at its first contact with the vehicle in front and behind. A formula gives a few decelerations, called
+speeds (m/s) at its first contact with the vehicle in front and behind. A formula yields a few decelerations, called
 *breakpoints*. Between two neighbouring breakpoints H(a) is concave, so H(a) is least at a breakpoint.
 docs/internals/proofs/constant-deceleration.md has the derivation.
 """

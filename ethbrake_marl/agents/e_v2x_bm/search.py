@@ -96,7 +96,7 @@ def search_line(line: Line, room: Room, breakpoints: Floats, capacity: float, ou
         line: the world, as ``make_line`` returns it.
         room: arrays for intermediate results.
         breakpoints: decelerations that are simulated in addition to an even grid, [CANDIDATES] m/s2.
-        capacity: braking capacity of the vehicle, m/s2.
+        capacity: braking capacity of the controlled vehicle, m/s2.
         out: array [3] for the result: best deceleration (m/s2), its harm, and its harm under the other harm count
             (m2/s2).
 
@@ -306,8 +306,8 @@ def step_back(line: Line, around: Samples, best: float, capacity: float, out: Fl
     Args:
         line: the world.
         around: array of samples, which is overwritten with intermediate results.
-        best: best deceleration found, m/s2.
-        capacity: braking capacity of the vehicle, m/s2.
+        best: best deceleration that the earlier steps of the search have found, m/s2.
+        capacity: braking capacity of the controlled vehicle, m/s2.
         out: array [3] for the result: best deceleration (m/s2), its harm, and its harm under the other harm count
             (m2/s2).
 
