@@ -100,8 +100,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
     The rows of one world share one episode. Each new episode takes the next world of the stream. In the last step of an
     episode, the infos contain ``TimeLimit.truncated``, ``terminal_observation``, ``episode`` (return ``r``, number of
     steps ``l``, and ``t``, which is always 0), and all infos of the other environments. In other steps, the infos
-    contain only the infos of a shield, unless ``step_infos`` is true. ``get_attr`` and ``env_method`` act on this
-    ``EthBrakeVecEnv``, not on rows.
+    contain only a shield's infos, unless ``step_infos`` is true. ``get_attr`` and ``env_method`` act on this object.
 
     Args:
         engine: the engine that simulates the worlds; ``make_sb3_vec_env`` makes it.
