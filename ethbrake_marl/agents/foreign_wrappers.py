@@ -67,7 +67,7 @@ class _Changing(metaclass=_WhatChanges):
 
 
 def training_environment(model: Any, name: str, *, ignore_wrappers: bool = False) -> Any:
-    """Return the environment of this package in which a Stable-Baselines3 model was trained, without its wrappers.
+    """Return this package's environment in which a Stable-Baselines3 model was trained, without wrappers around it.
 
     Args:
         model: any policy. The result is None if the policy was not trained in an environment of this package.

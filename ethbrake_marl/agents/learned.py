@@ -18,7 +18,7 @@ TRAINED_TEAM = "trained team"  # name of the team that a run has trained, in tab
 
 
 class LearnedPolicy(Protocol):
-    """Interface of a policy for ``LearnedAgent``; ``ethbrake_marl.policies.policy.Policy`` implements it."""
+    """Interface of a policy for ``LearnedAgent``; ``ethbrake_marl.policies.policy.Policy`` is such a policy."""
 
     @property
     def observation(self) -> ObservationSpec:

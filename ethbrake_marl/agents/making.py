@@ -38,7 +38,7 @@ def make_agent(
             ``ppo+search+step``. ``ethbrake agent list`` lists all agents and wrappers. ``my_file.py:make_agent`` runs
             ``my_file.py`` with all your rights, and calls its function ``make_agent`` with the arguments of a factory
             (see ``register_agent``), or without arguments if the function has no parameters.
-        scenario: scenario, its name, or the path of its file; teams and wrappers need it.
+        scenario: scenario, its name, or the path of its file; teams and wrappers need a scenario.
         harm_count: harm that an optimising agent minimises: ``first`` (each pair's first impact) or ``total`` (all
             impacts).
         horizon_s: time after the alert until which an agent looks ahead, s; None: the scenario's horizon, or 8 s.
@@ -92,7 +92,7 @@ def make_role(scenario: Scenario, vehicle: int, *, most_candidates: int | None =
 
     A script that optimises harm minimises first-impact harm. A script that searches tries at most ``most_candidates``
     plans; None: no limit. Raises the same errors as ``make_agent``. Also raises ``InvalidInput`` for a script with a
-    shield or search around it, and for a team that does not drive exactly this vehicle.
+    shield or search around it, and for a team that does not drive exactly ``vehicle``.
     """
     spec = scenario.scripts[vehicle]
     name, _, argument = spec.partition(":")

@@ -194,7 +194,7 @@ class ByPolicy:
 def policy_sha256(agent: object) -> str | None:
     """Return the SHA-256 hash of an agent's policy, also inside a shield or search; None if there is no policy.
 
-    The hash of a policy bundle is the hash in its manifest, which covers names, network and weights. The hash of a
+    The hash of a policy bundle is the hash in its manifest; this hash covers names, network and weights. The hash of a
     policy of another library covers its weights.
     """
     ask = getattr(agent, "policy_sha256", None)
@@ -306,8 +306,8 @@ class Team:
     def of(driver: Driver, vehicles: Collection[int]) -> Team:
         """Return the team in which ``driver`` drives the vehicles with the indices ``vehicles`` (0 = front).
 
-        If ``driver`` is a single agent, it drives all these vehicles. Raises ``InvalidInput`` if ``driver`` is a team
-        that drives other vehicles than ``vehicles``.
+        If ``driver`` is a single agent, this agent drives all of ``vehicles``. Raises ``InvalidInput`` if ``driver`` is
+        a team that drives other vehicles than ``vehicles``.
         """
         if isinstance(driver, Shielding):
             return driver.on(vehicles)

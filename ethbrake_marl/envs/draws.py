@@ -26,9 +26,9 @@ def describe_worlds(engine: Engine) -> Columns:
     """Return what was drawn for each running world, as columns such as ``{"gap_1_m": [n], "mass_2_t": [n]}``.
 
     There is one column for each quantity of a world at the alert, with the same name as in a table of initial states.
-    If the scenario is a mixture, the column ``scenario`` names the drawn scenario; if it has vehicle types, columns
-    such as ``vehicle_2_type`` name the drawn types. The columns ``world_seed`` and ``world`` are the same as the infos
-    with these names.
+    If the scenario is a mixture, the column ``scenario`` names the drawn scenario; if the scenario has vehicle types,
+    columns such as ``vehicle_2_type`` name the drawn types. The columns ``world_seed`` and ``world`` are the same as
+    the infos with these names.
 
     Raises ``InvalidInput`` if the caller passed the worlds and the environment was later restored from a snapshot,
     because a snapshot does not contain these worlds. Also raises ``InvalidInput`` if the physics failed in a world

@@ -73,7 +73,7 @@ def plain_rows(columns: Columns, vehicles: Ints, count: int) -> list[dict[str, A
     Args:
         columns: mapping from the name of an info to its values, [n, N].
         vehicles: indices of the vehicles whose infos are returned.
-        count: if ``columns`` is empty, this number of empty dictionaries is returned.
+        count: number of empty dictionaries to return if ``columns`` is empty.
 
     """
     values = [column.take(vehicles, axis=1).reshape(-1).tolist() for column in columns.values()]

@@ -264,7 +264,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         setattr(self, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
-        """Call the method ``method_name`` of this environment once; return a list with its result once per row.
+        """Call the method ``method_name`` of this environment once; return a list that repeats the result for each row.
 
         ``args`` and ``kwargs`` are the method's arguments. Raises ``InvalidInput`` if ``indices`` omits a row.
         """

@@ -42,7 +42,7 @@ class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArra
     step added to the whole line: first-impact or total harm, whichever the reward uses.
 
     Args:
-        env: an ``EthBrakeEnv``, or wrappers around one that pass on its infos.
+        env: an ``EthBrakeEnv``, or wrappers that pass on the infos of an ``EthBrakeEnv`` inside.
 
     Raises ``InvalidInput`` if ``env`` is neither an ``EthBrakeEnv`` nor a wrapper around one, or if ``env`` already
     contains a ``CostEnv``.
@@ -107,8 +107,8 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
             episode and returns its first observation; ``infos["final_obs"]`` and ``infos["final_info"]`` contain the
             last observation and infos of the old episode. ``Disabled``: no new episode starts; the caller must reset
             the row before the next step.
-        max_episode_steps: number of steps after which an episode is truncated; None: it is truncated at the horizon
-            only.
+        max_episode_steps: number of steps after which an episode is truncated; None: an episode is truncated at the
+            horizon only.
         actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete, and an action is
             an index from 0 to K - 1. The indices stand for K evenly spaced numbers from -1 (full braking capacity) to 1
             (full driving capacity).

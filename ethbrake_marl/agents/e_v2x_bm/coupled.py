@@ -1,9 +1,9 @@
 """Coupled E-V2X-BM: the constant deceleration of one vehicle with the least harm in a simulation of the whole line.
 
-The closed form in the module ``pairwise`` ignores that pairs influence each other. This module simulates every
-deceleration that it tries up to the horizon, with the speed changes of impacts, later impacts and lasting contact.
-Therefore the predicted harm is the harm that really happens in the engine, and the shield uses the predicted harm as a
-bound. docs/evaluate.md says how close the predicted harm comes to the true minimum.
+The closed form in the module ``pairwise`` ignores that pairs influence each other. For every deceleration that it
+tries, this module simulates the motion up to the horizon, with the speed changes of impacts, later impacts and lasting
+contact. Therefore the predicted harm is the harm that really happens in the engine, and the shield uses the predicted
+harm as a bound. docs/evaluate.md says how close the predicted harm comes to the true minimum.
 """
 
 from __future__ import annotations

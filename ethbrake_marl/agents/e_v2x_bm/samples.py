@@ -107,7 +107,7 @@ def least_harm(samples: Samples, n: int) -> float:
 
 @compiled(bare=True)
 def find_smallest(values: Floats, n: int, places: Ints) -> None:
-    """Write the indices of the smallest of the first ``n`` entries of ``values`` to ``places``, smallest entry first.
+    """Write to ``places`` the indices of the smallest of the first ``n`` entries of ``values``, smallest entry first.
 
     The length of ``places``, at most ``n``, is the number of entries to find. Of equal values, the one with the lower
     index comes first.
@@ -126,7 +126,7 @@ def find_smallest(values: Floats, n: int, places: Ints) -> None:
 
 @compiled(bare=True)
 def find_minima(samples: Samples, n: int, depth: Floats, places: Ints) -> None:
-    """Write the indices of the lowest local minima of the first ``n`` samples to ``places``, lowest harm first.
+    """Write to ``places`` the indices of the lowest local minima among the first ``n`` samples, lowest harm first.
 
     ``depth`` [n or more] is overwritten: with the harm at each local minimum, and with infinity at all other samples.
     If there are fewer local minima than entries in ``places``, the remaining entries are indices of other samples.

@@ -297,7 +297,7 @@ def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, t
 
 @compiled(apart=True, bare=True)
 def step_back(line: Line, around: Samples, best: float, capacity: float, out: Floats) -> int:
-    """Step 5: if ``best`` lies within 1e-9 m/s2 of a jump of the harm, move it to the side of the jump with less harm.
+    """Step 5: if ``best`` lies within 1e-9 m/s2 of a jump of the harm, move ``best`` to the side with less harm.
 
     When the agent drives, the engine simulates the same motion step by step, with other rounding errors than this
     search. If the agent braked with a deceleration directly at a jump, the engine's rounding errors would decide on
