@@ -1,4 +1,4 @@
-"""Let agents drive through whole episodes. Evaluations and rollouts use this loop."""
+"""Let agents drive through whole episodes. Evaluations and rollouts use this module."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Episodes:
         """Let an engine run from the first decision until the episodes in all worlds have ended.
 
         Args:
-            engine: an engine made by ``episode_engine``, before its first step.
+            engine: an engine that ``episode_engine`` has made and that has not made a step yet.
             worlds: the engine's worlds at the alert; the first call of each observer gets these worlds as ``before``.
             watched_by: observers (``Watch``), whose method ``see`` is called after every step.
             summed: names of reward terms to sum over each episode.
@@ -109,7 +109,7 @@ def episode_engine(
 
     Args:
         worlds: n worlds at the alert.
-        agent: an agent that drives ``vehicle``, or a team, which states itself which vehicles it drives.
+        agent: an agent that drives ``vehicle``, or a team, whose attribute ``drivers`` states which vehicles it drives.
         scenario: scenario whose scripts drive the other vehicles.
         vehicle: index of the vehicle that the agent drives (0 = front); None for a team.
         reward: reward whose terms the engine computes in every step.
@@ -152,7 +152,7 @@ def drive(
 
     Args:
         worlds: n worlds at the alert.
-        agent: an agent that drives ``vehicle``, or a team, which states itself which vehicles it drives.
+        agent: an agent that drives ``vehicle``, or a team, whose attribute ``drivers`` states which vehicles it drives.
         scenario: scenario whose scripts drive the other vehicles.
         vehicle: index of the vehicle that the agent drives (0 = front); None for a team.
         watched_by: observers (``Watch``), whose method ``see`` is called after every step.
@@ -187,10 +187,11 @@ def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_m
 
 
 def record_commands(agent: Driver, worlds: Worlds, scenario: Scenario, vehicle: int, steps: int) -> Floats:
-    """Return the commands of ``agent`` for ``vehicle`` (index, 0 = front) in the first steps, [n, steps] m/s2.
+    """Return the commands of ``agent`` for ``vehicle`` (0 = front) in the first ``steps`` steps, [n, steps] m/s2.
 
-    ``worlds`` are n worlds at the alert. If an episode ends earlier, its last command fills the remaining steps. Raises
-    ``PhysicsError``, which names the worlds, if the physics failed in some worlds.
+    ``worlds`` are n worlds at the alert. If an episode has fewer than ``steps`` steps, the last command of the episode
+    is repeated in the remaining steps. Raises ``PhysicsError``, which names the worlds, if the physics failed in some
+    worlds.
     """
     engine = episode_engine(worlds, agent, scenario, vehicle)
     commands = write_down(engine, steps, lambda: engine.wanted_mps2[:, [vehicle]])[:, :, 0]
@@ -204,11 +205,11 @@ def write_down(engine: Engine, steps: int, column: Callable[[], Floats]) -> Floa
 
     Args:
         engine: an engine made by ``episode_engine``.
-        steps: number of steps to record.
+        steps: number of steps for which numbers are recorded.
         column: function without arguments that returns the K numbers to record for each of n worlds, [n, K].
 
-    Returns the recorded numbers, [n, steps, K]. The numbers after the end of an episode are NaN. Raises
-    ``PhysicsError``, which names the worlds, if the physics failed in some worlds.
+    Returns the recorded numbers of the n worlds, [n, steps, K]. The numbers of a world after the end of its episode are
+    NaN. Raises ``PhysicsError``, which names the worlds, if the physics failed in some worlds.
 
     """
     columns = np.full((steps, *column().shape), np.nan)

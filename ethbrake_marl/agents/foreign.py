@@ -47,9 +47,9 @@ def adapt_policy(policy: Any, name: str, features: int, initial_state: Begin | N
         initial_state: for a function or torch module with a memory: function that returns the memory at the start of n
             episodes; None: ``policy`` has no memory, or is a model with ``predict``.
 
-    The first function is ``(observations, state) -> (actions, new state)``. The second function is ``n -> initial
-    state``, for n episodes; it is None for a policy without a memory. Raises ``InvalidInput`` if ``policy`` is of
-    another kind.
+    The first returned function is ``(observations, state) -> (actions, new state)``. The second returned function is
+    ``n -> initial state``, for n episodes; for a policy without a memory, None is returned in its place. Raises
+    ``InvalidInput`` if ``policy`` is of a kind that ``policy_agent`` does not accept.
 
     """
     if isinstance(policy, str | os.PathLike):
@@ -81,8 +81,8 @@ def _without_memory(action: Any) -> Any:
 def _ask_model(model: Any, name: str, features: int) -> tuple[Infer, Begin | None]:
     """Do the same as ``adapt_policy``, for a model with a method ``predict``, such as a Stable-Baselines3 model.
 
-    If ``predict`` also returns a memory, the function calls it for two and for three worlds. The shapes of the returned
-    arrays show which axis has one entry per world.
+    ``predict`` is called once for two worlds and once for three worlds: if ``predict`` also returns a memory, the
+    shapes of the memory's arrays show which axis has one entry per world.
 
     Args:
         model: the model.
@@ -222,7 +222,7 @@ def policy_agent(
     whose ``predict`` also returns a state.
 
     Args:
-        policy: one of the following objects. Copies of the agent use the same object.
+        policy: one of the following objects. Copies of the agent use the same policy object.
 
             - a function that maps observations to actions;
             - a model with a method ``predict``. A Stable-Baselines3 model is called with ``deterministic=True``, with
@@ -244,12 +244,13 @@ def policy_agent(
             (the learner's number) or ``state`` (the true state of the line). If you pass ``appended``, also pass
             ``scenario``. None: the features of the model's training environment, if known; otherwise no features.
         ignore_wrappers: whether to accept a model if wrappers of its training environment may have changed observations
-            or actions, if its actions have other bounds, or if its ``VecNormalize`` statistics are missing.
+            or actions, if its actions have bounds other than -1 and 1, or if its ``VecNormalize`` statistics are
+            missing.
         actions: number of discrete actions, for a policy that returns the index of an action. None: the number in the
             model's training environment, if known; otherwise the policy returns actions in [-1, 1].
 
-    Raises ``InvalidInput`` if ``policy`` is none of these objects, if it takes another number of features than the
-    observation has, and if wrappers of its training environment may have changed observations or actions.
+    Raises ``InvalidInput`` if ``policy`` is of another kind, if it was trained with another number of features than the
+    observation has, or if wrappers of its training environment may have changed observations or actions.
 
     >>> import ethbrake_marl as eb
     >>> agent = eb.policy_agent(lambda observation: -observation[:, :1].clip(0, 1), name="mine")
@@ -296,7 +297,7 @@ def policy_agent(
 
 
 def _check_action_space(policy: Any, name: str, actions: int | None) -> None:
-    """Raise ``InvalidInput`` unless the policy's action space is that of an environment with these ``actions``."""
+    """Raise ``InvalidInput`` if the policy's action space does not fit ``actions``, the number of discrete actions."""
     space = getattr(policy, "action_space", None)
     low, high = (np.asarray(getattr(space, end, np.nan)).tolist() for end in ("low", "high"))
     count, least = getattr(space, "n", None), getattr(space, "start", None)
@@ -417,7 +418,7 @@ class PolicyAgent:
         return to_array(action), checked_memory(state, len(rows))
 
     def _find_failing(self, seen: Observations, state: State) -> int | None:
-        """Find, by bisection, a world for which the policy fails even if called only for this world; None without one.
+        """Return the index of a world for which the policy fails even without the other worlds; None: no such world.
 
         ``seen`` [n, F] are the observations in all n worlds; ``state`` is the policy's memory for all n worlds.
         """
@@ -441,8 +442,8 @@ class PolicyAgent:
     def _checked(self, action: NDArray[Any], seen: Observations, worlds: Worlds, steps: Ints) -> Floats:
         """Check the policy's output ``action``, and return the actions as an array [n] in [-1, 1].
 
-        Raises ``AgentFailed`` for a wrong shape or value. ``seen``, ``worlds`` and ``steps`` [n] (number of steps so
-        far) are used only in the error message.
+        Raises ``AgentFailed`` if ``action`` has a wrong shape or contains an invalid value. ``seen``, ``worlds`` and
+        ``steps`` [n] (number of steps so far) are used only in the error message.
         """
         n, what = worlds.n, f"returned {action.dtype} of shape {action.shape} for observations of shape {seen.shape}"
         if self._actions is not None:

@@ -67,15 +67,15 @@ class _Changing(metaclass=_WhatChanges):
 
 
 def training_environment(model: Any, name: str, *, ignore_wrappers: bool = False) -> Any:
-    """Return the environment of this package in which a Stable-Baselines3 model was trained, without its wrappers.
+    """Return this package's environment in which a Stable-Baselines3 model was trained, without wrappers around it.
 
     Args:
-        model: any policy. The result is None if it was not trained in an environment of this package.
+        model: any policy. The result is None if the policy was not trained in an environment of this package.
         name: name of the agent in error messages.
         ignore_wrappers: whether to return the environment without checking its wrappers.
 
     A model may be trained in several copies of an environment at the same time. Raises ``InvalidInput`` if a wrapper of
-    any copy may change observations or actions, if the copies differ in their features or number of actions, and if the
+    any copy may change observations or actions, if the copies differ in their features or number of actions, or if the
     statistics of ``VecNormalize`` are missing.
 
     """
@@ -122,8 +122,8 @@ def _was_normalised(model: Any) -> bool:
     """Return whether the data saved with a Stable-Baselines3 model show that training normalised the observations.
 
     The result is True if the last saved observation lies outside the observation space, or if the model also saved this
-    observation as it was before normalisation. Off-policy algorithms save the latter in any case; for them only the
-    observation space is checked.
+    observation as it was before normalisation. Models of off-policy algorithms always save the observation before
+    normalisation; for these models only the observation space is checked.
     """
     if getattr(model, "_last_original_obs", None) is not None and not hasattr(model, "replay_buffer"):
         return True
@@ -146,14 +146,15 @@ def _layers(env: Any) -> Iterator[Any]:
 
 
 def _look(layer: Any, name: str) -> tuple[str | None, list[Any]]:
-    """Return which class in a layer may change observations or actions, and which environments of this package it has.
+    """Return the class in ``layer`` that may change observations or actions, and this package's environments in it.
 
     Args:
-        layer: a wrapper or environment, from ``_layers``.
+        layer: a wrapper or environment that ``_layers`` yields.
         name: name of the agent in error messages.
 
-    Returns two values. The first is the name of a class that may change observations or actions, or None. The second is
-    a list of environments of this package: the layer itself, or environments that it runs in other processes.
+    Returns two values. The first value is the name of a class that may change observations or actions, or None. The
+    second value is a list of environments of this package: the layer itself, or environments that the layer runs in
+    other processes.
 
     """
     if changes(type(layer)):

@@ -18,7 +18,7 @@ TRAINED_TEAM = "trained team"  # name of the team that a run has trained, in tab
 
 
 class LearnedPolicy(Protocol):
-    """Interface of a policy for ``LearnedAgent``; ``ethbrake_marl.policies.policy.Policy`` implements it."""
+    """Interface of a policy for ``LearnedAgent``; ``ethbrake_marl.policies.policy.Policy`` is such a policy."""
 
     @property
     def observation(self) -> ObservationSpec:
@@ -26,7 +26,7 @@ class LearnedPolicy(Protocol):
         ...
 
     def __call__(self, observation: Observations, /) -> Observations:
-        """Return one action for each observation: [n, F] -> [n, 1] in [-1, 1]; each depends on its observation only."""
+        """Return, for each observation [n, F], an action [n, 1] in [-1, 1] that depends on this observation only."""
         ...
 
 

@@ -38,7 +38,7 @@ def make_agent(
             ``ppo+search+step``. ``ethbrake agent list`` lists all agents and wrappers. ``my_file.py:make_agent`` runs
             ``my_file.py`` with all your rights, and calls its function ``make_agent`` with the arguments of a factory
             (see ``register_agent``), or without arguments if the function has no parameters.
-        scenario: scenario, its name, or the path of its file; teams and wrappers need it.
+        scenario: scenario, its name, or the path of its file; teams and wrappers need a scenario.
         harm_count: harm that an optimising agent minimises: ``first`` (each pair's first impact) or ``total`` (all
             impacts).
         horizon_s: time after the alert until which an agent looks ahead, s; None: the scenario's horizon, or 8 s.
@@ -50,7 +50,7 @@ def make_agent(
             time step, or 0.1 s.
 
     Raises ``UnknownName`` for an unknown name, with a similar name as a suggestion. Raises ``InvalidInput`` for an
-    invalid argument, harm count or horizon, and if the agent needs a scenario and none is passed.
+    invalid argument, harm count or horizon, or if the agent needs a scenario but no scenario is passed.
 
     >>> import ethbrake_marl as eb
     >>> eb.make_agent("ppo+step", scenario="paper-random").name
@@ -94,7 +94,7 @@ def make_role(scenario: Scenario, vehicle: int, *, most_candidates: int | None =
 
     A script that optimises harm minimises first-impact harm. A script that searches tries at most ``most_candidates``
     plans; None: no limit. Raises the same errors as ``make_agent``. Also raises ``InvalidInput`` for a script with a
-    shield or search around it, and for a team that does not drive exactly this vehicle.
+    shield or search around it, and for a team that does not drive exactly ``vehicle``.
     """
     spec = scenario.scripts[vehicle]
     name, _, argument = spec.partition(":")
@@ -144,7 +144,7 @@ def find_entry(spec: AgentSpec | str) -> Entry:
 def _make(entry: Entry, argument: str | None, settings: AgentSettings, *inside: Driver) -> Driver:
     """Make an agent or a team from its registry entry, and check the result.
 
-    If a factory from outside this package raises an error, the function raises ``InvalidInput`` instead.
+    If a factory from outside this package raises an error, ``_make`` raises ``InvalidInput`` in its place.
 
     Args:
         entry: the registry entry.
@@ -168,7 +168,7 @@ def make_from_file(argument: str | None, settings: AgentSettings) -> Driver:
     """Call the function in a Python file that ``settings.spec`` names (``FILE.py:FUNCTION``), and return its result.
 
     The function is called with ``argument`` (the text after the second colon, or None) and ``settings``. A function
-    without parameters is called without arguments. Raises ``InvalidInput`` if the file cannot be loaded, and if the
+    without parameters is called without arguments. Raises ``InvalidInput`` if the file cannot be loaded, or if the
     function has no parameters but the specification contains an argument or a policy.
     """
     named = parse_spec(settings.spec).file

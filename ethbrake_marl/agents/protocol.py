@@ -43,7 +43,7 @@ class Knowledge(tuple[Source, ...]):
             agents: agents or teams; for an agent without an attribute ``knows``, the source is ``UNSTATED``.
             also: source of knowledge that a shield or search around the agents adds; None: no further source.
 
-        Raises ``InvalidInput`` if ``knows`` of an agent contains an unknown source.
+        Raises ``InvalidInput`` if the attribute ``knows`` of an agent contains an unknown source.
 
         """
         known = set() if also is None else {also}
@@ -106,13 +106,13 @@ class Agent(Script, Protocol):
 
 
 def check_agent(agent: object, where: str, *, alone: bool = True) -> None:
-    """Raise ``InvalidInput`` unless ``agent`` is an agent.
+    """Raise ``InvalidInput`` unless the object ``agent`` implements the interface ``Agent``.
 
     Args:
         agent: any object.
         where: beginning of the error message, for example ``agent 'mine'``.
-        alone: True: only an agent for one vehicle is accepted. False: a team, and an agent behind a shield, are
-            accepted as well.
+        alone: True: only an agent for one vehicle is accepted. False: a team and an agent behind a shield are accepted
+            as well.
 
     """
     if not isinstance(agent, Agent) and (alone or not isinstance(agent, Team | Shielding)):
@@ -148,7 +148,7 @@ def fixed_commands(
         advice: end of the error message about a script whose command is not fixed at the alert.
 
     Raises ``InvalidInput`` for a script whose command is not fixed at the alert, if the braking profiles in ``worlds``
-    differ from the profiles of the scripts, and if the messages do not contain a quantity that the agent needs to look
+    differ from the profiles of the scripts, or if the messages do not contain a quantity that the agent needs to look
     ahead.
 
     """
@@ -194,7 +194,7 @@ class ByPolicy:
 def policy_sha256(agent: object) -> str | None:
     """Return the SHA-256 hash of an agent's policy, also inside a shield or search; None if there is no policy.
 
-    The hash of a policy bundle is the hash in its manifest, which covers names, network and weights. The hash of a
+    The hash of a policy bundle is the hash in its manifest; this hash covers names, network and weights. The hash of a
     policy of another library covers its weights.
     """
     ask = getattr(agent, "policy_sha256", None)
@@ -248,7 +248,7 @@ class AgentAround(ByPolicy):
 
 @runtime_checkable
 class Shielding(Protocol):
-    """Interface of an agent or team behind a shield. The method ``on`` chooses the vehicles that it drives."""
+    """Interface of an agent or team behind a shield. The method ``on`` chooses which vehicles are driven."""
 
     name: str  # name of the agent or team in tables and messages
 
@@ -257,7 +257,7 @@ class Shielding(Protocol):
         """Sources of knowledge of the agents and of the shield together."""
 
     def on(self, vehicles: Collection[int]) -> Team:
-        """Return a team behind this shield that drives ``vehicles`` (indices, 0 = front)."""
+        """Return a team that drives ``vehicles`` (indices, 0 = front) behind this shield."""
 
     def guard(self, engine: Engine, policies: Mapping[int, Agent]) -> Guard:
         """Return the guard: the object that checks commands in ``engine`` for the shield.
@@ -306,8 +306,8 @@ class Team:
     def of(driver: Driver, vehicles: Collection[int]) -> Team:
         """Return the team in which ``driver`` drives the vehicles with the indices ``vehicles`` (0 = front).
 
-        If ``driver`` is a single agent, it drives all these vehicles. Raises ``InvalidInput`` if ``driver`` is a team
-        that drives other vehicles.
+        If ``driver`` is a single agent, this agent drives all of ``vehicles``. Raises ``InvalidInput`` if ``driver`` is
+        a team that drives other vehicles than ``vehicles``.
         """
         if isinstance(driver, Shielding):
             return driver.on(vehicles)

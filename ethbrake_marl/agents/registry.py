@@ -38,7 +38,7 @@ class Entry:
 
     @property
     def is_ours(self) -> bool:
-        """Whether the agent is part of this package. For errors in other agents, the message names the agent."""
+        """Whether the agent is part of this package. Errors in other agents are reported with the agent's name."""
         is_from_file = ":" in self.name
         return str(getattr(self.make, "__module__", "")).startswith("ethbrake_marl.") and not is_from_file
 
@@ -46,8 +46,8 @@ class Entry:
     def whole_form(self) -> str:
         """``form`` followed by each registered variant in brackets, for example ``e_v2x_bm[:pairwise][:estimated]``.
 
-        A variant, such as ``:estimated``, is the last word of a specification. It selects another function that makes
-        the agent or wrapper.
+        A variant, such as ``:estimated``, is the last word of a specification. The variant selects another function
+        that makes the agent or wrapper.
         """
         return self.form + "".join(f"[:{variant}]" for variant in variants_of(self.name))
 
@@ -55,7 +55,7 @@ class Entry:
     def words(self) -> tuple[str, ...]:
         """All texts that can follow ``+`` to select this wrapper, for example ``("step", "step:estimated")``.
 
-        The tuple is complete only if ``form`` lists all arguments of the wrapper.
+        If ``form`` does not list every allowed argument, the texts with the unlisted arguments are missing.
         """
         name, *options = re.findall(r"[^\[\]+]+", self.whole_form)
         words = [name]
@@ -126,8 +126,8 @@ def agents_refused() -> list[str]:
 def around_forms() -> tuple[str, ...]:
     """Return all texts that can follow the ``+`` of a specification to select a shield or search.
 
-    A shield with different arguments or variants appears several times, as in ``("search", "episode",
-    "episode:pairwise")``.
+    A shield appears once for each combination of argument and variant (either may be missing), as in ``("search",
+    "episode", "episode:pairwise")``.
     """
     return tuple(word for entry in SHIELDS.usable().values() for word in entry.words)
 
@@ -135,7 +135,7 @@ def around_forms() -> tuple[str, ...]:
 def shield_forms() -> tuple[str, ...]:
     """Return all texts after ``+`` that select a shield without a variant: ``("episode", "robust:interior", ...)``.
 
-    A shield with different arguments appears several times.
+    A shield with arguments appears once without an argument, and once with each argument.
     """
     return tuple(each for each in around_forms() if not (around_entry(each).inner or is_variant(each)))
 
@@ -159,8 +159,8 @@ def shield_modes() -> dict[str, Any]:
 def variants_of(name: str) -> tuple[str, ...]:
     """Return the variants of the agent or shield called ``name``, for example ``("estimated",)``.
 
-    In a specification the variant is the last word, as in ``episode:pairwise:estimated``. It selects another function
-    that makes the agent or shield.
+    In a specification the variant is the last word, as in ``episode:pairwise:estimated``. The variant selects another
+    function that makes the agent or shield.
     """
     keys = (key.rpartition(".") for key in VARIANTS)
     return tuple(variant for of, _, variant in keys if of == name)
@@ -197,8 +197,8 @@ def agents_of_group(group: str) -> tuple[str, ...]:
     """Return the specifications of all agents in ``group``, a name from ``group_names``.
 
     Extensions can add agents to a group. For example, agents that are registered under a name ``ladder.WORD`` belong to
-    the group ``ladder``. They follow the agents that are registered under ``ladder``, in alphabetical order of the
-    names.
+    the group ``ladder``. In the result the agents registered under ``ladder`` itself come first; the others follow in
+    alphabetical order of ``WORD``.
     """
     return tuple(spec for name in sorted(GROUPS) if name.partition(".")[0] == group for spec in GROUPS[name])
 
@@ -215,16 +215,18 @@ def register_agent(
     """Register an agent, so that ``make_agent`` and every command accept ``name`` and ``name:argument``.
 
     An installed package registers an agent with an entry point of the group ``ethbrake_marl.agents``. The entry point
-    is the factory, or ``Part(factory, about=...)`` with further arguments of ``register_agent``.
+    refers to the factory, or to a ``Part(factory, about=...)``, which can have further arguments of ``register_agent``.
 
     Args:
         name: name of the agent or wrapper in specifications, without an argument.
         factory: function ``factory(argument, settings)`` that makes the agent. ``argument`` is the text after the colon
             of the specification, or None; ``settings`` is an ``AgentSettings``.
         about: description in one line, which ``ethbrake agent list`` shows.
-        knows: sources of the agent's knowledge while it drives, which ``ethbrake agent list`` shows.
+        knows: sources of knowledge (``Source``) that the agent uses while it drives; ``ethbrake agent list`` shows
+            these sources.
         form: syntax of the agent's specification, which ``ethbrake agent list`` shows; None: ``name[:ARGUMENT]``. If
-            ``form`` has no ``:``, an argument is an error. If ``form`` has no ``@``, a policy is an error.
+            ``form`` contains no ``:``, the agent accepts no argument. If ``form`` contains no ``@``, the agent accepts
+            no policy.
         takes_policy: whether the specification ``name@policy`` is allowed; the factory finds the policy in
             ``AgentSettings.policy``.
 
@@ -255,7 +257,8 @@ def register_shield(
     """Register a shield or search, so that ``+name`` may follow every agent in a specification.
 
     An installed package registers a shield with an entry point of the group ``ethbrake_marl.shields``. The entry point
-    is the wrapper, or ``Part(wrapper, about=...)`` with further arguments of ``register_shield``.
+    refers to the wrapper, or to a ``Part(wrapper, about=...)``, which can have further arguments of
+    ``register_shield``.
 
     Args:
         name: name of the agent or wrapper in specifications, without an argument.
@@ -293,8 +296,8 @@ def register_variant(key: str, make: Factory | Wrapper, *, about: str = "a varia
 
     Args:
         key: ``name.variant``; for example, ``step.mine`` registers ``step:mine``, a variant of the shield ``step``.
-        make: function that is called in place of the factory or wrapper ``name``, with the same arguments. Its
-            ``argument`` does not contain the name of the variant.
+        make: function that is called in place of the factory or wrapper ``name``, with the same arguments. The
+            ``argument`` that this function receives does not contain the name of the variant.
         about: description in one line, which ``ethbrake agent list`` shows.
 
     Raises ``AlreadyExists`` if another variant is registered under ``key``.

@@ -1,4 +1,4 @@
-"""Settings that a function gets to make an agent, and the signatures of such functions."""
+"""Settings for functions that make agents, and the signatures of such functions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HORIZON_S = 8.0  # horizon of agents that look ahead, if there is no scenario
 
 @dataclass(frozen=True, slots=True)
 class AgentSettings:
-    """Settings that a function gets to make an agent, in addition to the argument in the agent's specification.
+    """Settings for a function that makes an agent, in addition to the argument in the agent's specification.
 
     >>> import ethbrake_marl as eb
     >>> eb.AgentSettings("planner:64", scenario=eb.load_scenario("paper-random")).needed_scenario().name
@@ -52,7 +52,7 @@ Wrapper = Callable[[Any, str | None, AgentSettings], Driver]
 
 
 class Variant(NamedTuple):
-    """Variant of an agent or shield. Specifications end with the name of a variant, as in ``step:estimated``."""
+    """Variant of an agent or shield. In a specification the variant is the last word, as in ``step:estimated``."""
 
     make: Factory | Wrapper  # function that makes the agent or wrapper, in place of the original function
     about: str  # description in one line

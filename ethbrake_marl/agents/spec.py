@@ -83,9 +83,9 @@ def parse_spec(spec: str) -> AgentSpec:
 def split_names(text: str, is_one: Callable[[str], bool] = os.path.lexists) -> list[str]:
     """Split a comma-separated list of names, some of which may contain commas.
 
-    ``is_one`` is a function that returns whether a text with commas is a single name. The default is that a file or
-    folder with this name exists. Each name is the longest text for which ``is_one`` returns True; if there is no such
-    text, the name ends at the next comma.
+    ``is_one`` is a function that returns whether a text with commas is a single name. By default ``is_one`` returns
+    whether a file or folder with this name exists. Each name is the longest beginning of the remaining text for which
+    ``is_one`` returns True; if there is no such beginning, the name ends at the next comma.
     """
     parts, names = text.split(","), list[str]()
     while parts:
@@ -163,7 +163,7 @@ def _is_meant_around(before: str, core: str, last: str) -> bool:
     Args:
         before: the specification up to the ``+``, without the ``+``.
         core: the specification up to and including the unknown word.
-        last: the unknown word.
+        last: the unknown word after the ``+``.
 
     """
     file = _python_file(core)

@@ -26,13 +26,13 @@ def describe_worlds(engine: Engine) -> Columns:
     """Return what was drawn for each running world, as columns such as ``{"gap_1_m": [n], "mass_2_t": [n]}``.
 
     There is one column for each quantity of a world at the alert, with the same name as in a table of initial states.
-    If the scenario is a mixture, the column ``scenario`` names the drawn scenario; if it has vehicle types, columns
-    such as ``vehicle_2_type`` name the drawn types. The columns ``world_seed`` and ``world`` are the same as the infos
-    with these names.
+    If the scenario is a mixture, the column ``scenario`` names the drawn scenario; if the scenario has vehicle types,
+    columns such as ``vehicle_2_type`` name the drawn types. The columns ``world_seed`` and ``world`` are the same as
+    the infos with these names.
 
-    Raises ``InvalidInput`` in two cases: if the caller passed the worlds, and the environment was later restored from a
-    snapshot, which does not contain these worlds; and if the physics failed in a world before its first decision, so
-    that another world replaced it.
+    Raises ``InvalidInput`` if the caller passed the worlds and the environment was later restored from a snapshot,
+    because a snapshot does not contain these worlds. Also raises ``InvalidInput`` if the physics failed in a world
+    before its first decision, so that another world replaced it.
     """
     numbers, placed = engine.roster.numbers, engine.roster.given
     named = {"world_seed": np.full(engine.n, engine.roster.seed), "world": numbers.copy()}
@@ -58,8 +58,8 @@ def describe_worlds(engine: Engine) -> Columns:
 def _drawn_again(engine: Engine, numbers: Ints) -> Sample:
     """Draw the worlds with these ``numbers`` in the training stream again; return them in the order of ``numbers``.
 
-    If the physics failed in a world before its first decision, another world replaced it. Raises ``InvalidInput`` if a
-    drawn world therefore differs from the running world.
+    Raises ``InvalidInput`` if a drawn world differs from the running world. The two worlds differ if the physics failed
+    in the drawn world before its first decision, so that another world replaced the drawn world.
     """
     ordered, places = np.unique(numbers, return_inverse=True)
     breaks = np.flatnonzero(np.diff(ordered) > _MOST_APART) + 1

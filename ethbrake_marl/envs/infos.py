@@ -57,7 +57,7 @@ _FLOAT32 = np.dtype(np.float32)
 def shield_columns(engine: Engine, rows: Ints | None = None) -> Columns:
     """Return a mapping from ``shield_NAME`` to the shield's info ``NAME``, [n, N]; it is empty without a shield.
 
-    ``rows`` are the indices of the worlds to include; None: all worlds.
+    ``rows`` are the indices of the worlds whose infos are returned; None: all worlds.
     """
     if engine.guard is None or engine.guarded is None:
         return {}
@@ -73,7 +73,7 @@ def plain_rows(columns: Columns, vehicles: Ints, count: int) -> list[dict[str, A
     Args:
         columns: mapping from the name of an info to its values, [n, N].
         vehicles: indices of the vehicles whose infos are returned.
-        count: if ``columns`` is empty, this number of empty dictionaries is returned.
+        count: number of empty dictionaries to return if ``columns`` is empty.
 
     """
     values = [column.take(vehicles, axis=1).reshape(-1).tolist() for column in columns.values()]
@@ -101,7 +101,7 @@ class Report(NamedTuple):
         Args:
             engine: the engine.
             step: results of the last step; None after a reset.
-            rows: indices of the worlds to include; None: all worlds.
+            rows: indices of the worlds whose infos are returned; None: all worlds.
 
         """
         now, world = engine.state, engine.roster.numbers
@@ -180,10 +180,10 @@ class Report(NamedTuple):
         true for the worlds in which ``time_s`` has a value.
 
         Args:
-            vehicle: index of the vehicle (0 = front).
-            rows: mask of the worlds whose infos have values, [n].
-            stepped: mask of the worlds whose running episode includes the last step, [n]. In all other worlds ``cost``
-                and the reward terms are 0.
+            vehicle: index of the vehicle whose infos are returned (0 = front).
+            rows: mask [n], True for the worlds whose infos have values.
+            stepped: mask [n], True for the worlds whose running episode includes the last step. In all other worlds
+                ``cost`` and the reward terms are 0.
 
         """
         columns: dict[str, NDArray[Any]] = {name: info[:, vehicle] for name, info in self.columns().items()}
@@ -251,7 +251,7 @@ def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> 
 
 
 class Begun:
-    """Base class of all environments. It starts episodes with a seed and options.
+    """Base class of all environments. This class starts episodes with a seed and options.
 
     A subclass sets ``engine`` in its constructor, and calls ``_restart`` in its ``reset``. The worlds of a seed form a
     *stream*: each new episode takes the next world of this seed. ``np_random`` and ``np_random_seed`` have the same
@@ -270,7 +270,7 @@ class Begun:
         """Random generator that wrappers may use. The worlds depend on ``np_random_seed`` only.
 
         If you set another generator, each ``reset`` without a seed draws a new seed from the generator that you set.
-        This ends with the first ``reset`` with a seed.
+        The next ``reset`` with a seed replaces your generator.
         """
         if self._np_random is None:
             self._set_seed(chosen_seed(None))
@@ -299,16 +299,17 @@ class Begun:
 
         With ``options["initial_state"]``, every world starts in this state, which ``scenario.tables.worlds_from_state``
         reads. With ``options["listed_world"] = {"seed": 7, "number": 3}``, the first world is world 3 of the evaluation
-        list with seed 7, the second one is world 4, and so on. Later episodes, which start without a call of ``reset``,
-        take the next worlds of the stream. For other options a warning ``UnknownResetOption`` is issued, and these
-        options are ignored.
+        list with seed 7, the second world is world 4 of this list, and so on. Later episodes, which start without a
+        call of ``reset``, take the next worlds of the stream. For other options a warning ``UnknownResetOption`` is
+        issued, and these options are ignored.
 
         Args:
             seed: start with the first world of this seed; None: continue with the next world of the stream.
             options: the options of ``reset``; None: there are no options.
 
         Raises ``InvalidInput`` for a seed that is not a whole number >= 0, for an invalid initial state or listed
-        world, and if the options contain both. If this error is raised, the environment stays unchanged.
+        world, or if the options contain both an initial state and a listed world. If this error is raised, the
+        environment stays unchanged.
 
         """
         named = None if seed is None else chosen_seed(seed)
@@ -351,7 +352,7 @@ class Begun:
 
 
 class OneWorld(Begun):
-    """Base class of environments with a single world. It defines ``describe_world``, ``render`` and ``close``.
+    """Base class of environments with a single world. This class defines ``describe_world``, ``render`` and ``close``.
 
     A subclass sets ``viewer`` in its constructor.
     """
@@ -364,7 +365,7 @@ class OneWorld(Begun):
         return {name: column[0].item() for name, column in describe_worlds(self.engine).items()}
 
     def render(self) -> Any:
-        """Return a picture of the present moment. Its type depends on the render mode:
+        """Return a picture of the present moment. The type of the picture depends on the render mode:
 
         ``rgb_array``: a frame [H, W, 3] uint8. ``rgb_array_list``: a list of all frames since the last call of
         ``render``. ``ansi``: a text. ``human``: None, because a window already shows every step.

@@ -125,7 +125,7 @@ def only_learner(engine: Engine) -> int:
 
 
 def learner_actions(engine: Engine, actions: Mapping[str, Any], count: int | None) -> Floats | dict[int, Floats]:
-    """Return the actions of the L learners in the form that ``Engine.step`` takes for one world: [1, L].
+    """Return the actions of the L learners as an array [1, L], which ``Engine.step`` accepts for one world.
 
     If the engine has a shield, actions may be missing. If actions are missing, the result is a mapping from the index
     of each learner that has an action to this action [1].
@@ -136,8 +136,8 @@ def learner_actions(engine: Engine, actions: Mapping[str, Any], count: int | Non
             action.
         count: number of discrete actions; None: the actions are not discrete, but numbers in [-1, 1].
 
-    Raises ``InvalidInput``, which names the vehicle, if an action has the wrong shape, or is missing without a shield.
-    This function does not check the range of the actions, because ``Engine.step`` checks it.
+    Raises ``InvalidInput``, which names the vehicle, if an action has the wrong shape, or if an action is missing and
+    the engine has no shield. This function does not check the range of the actions, because ``Engine.step`` checks it.
 
     """
     names, columns = engine.scenario.vehicle_names, np.empty((1, len(engine.learners)))
@@ -168,7 +168,7 @@ class UnknownResetOption(UserWarning):
 
 
 class IgnoredAction(UserWarning):
-    """Warning that an action for a vehicle that follows a script was passed. Such an action is ignored."""
+    """Warning: an action was passed for a vehicle that follows a script. The environment ignores this action."""
 
 
 def chosen_seed(seed: int | None) -> int:
@@ -190,7 +190,7 @@ def wanted_worlds(engine: Engine, options: Mapping[str, Any]) -> Worlds | None:
 
     With the key ``initial_state``, all worlds start in this state. With the key ``listed_world``, the worlds are
     consecutive worlds of an evaluation list. Without these keys the result is None: the stream supplies the worlds.
-    Raises ``InvalidInput`` if both keys are present, or if a value is invalid.
+    Raises ``InvalidInput`` if ``options`` contains both keys, or if the value of a key is invalid.
     """
     if LISTED_WORLD not in options:
         if INITIAL_STATE not in options:

@@ -57,7 +57,7 @@ class SeededInside:
 
 
 class Ordered(SeededInside, OrderEnforcingWrapper):  # type: ignore[misc]  # PettingZoo is untyped
-    """PettingZoo's ``OrderEnforcingWrapper`` with the ``np_random`` of the environment inside the wrapper."""
+    """PettingZoo's ``OrderEnforcingWrapper``, whose ``np_random`` is that of the environment inside the wrapper."""
 
     def __str__(self) -> str:
         return str(self.env)
@@ -148,7 +148,8 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
             the features that belong to the scenario.
         agents: which vehicles are agents: ``all`` vehicles or only the ``learners``. Choose ``learners`` for training
             libraries that train every agent.
-        max_cycles: number of steps after which an episode is truncated; None: it is truncated at the horizon only.
+        max_cycles: number of steps after which an episode is truncated; None: an episode is truncated at the horizon
+            only.
         actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete, and an action is
             an index from 0 to K - 1. The indices stand for K evenly spaced numbers from -1 (full braking capacity) to 1
             (full driving capacity).

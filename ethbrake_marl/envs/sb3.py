@@ -63,14 +63,14 @@ def make_sb3_vec_env(
         observation: features that the learners observe; None: the features that belong to the scenario
             (``observation_for``).
         horizon_is_end: True: an episode that reaches the horizon is reported as ended, not as truncated. Therefore the
-            algorithm does not add an estimate of the return after the horizon. This estimate could grow without limit,
-            because harm after the horizon is not counted (see docs/train.md). False: ``TimeLimit.truncated`` is true
-            for episodes that ended at the horizon.
+            algorithm does not add an estimate of the return after the horizon. An estimate of this return could grow
+            without limit, because harm after the horizon is not counted (see docs/train.md). False: an episode that
+            reaches the horizon is reported as truncated (``TimeLimit.truncated`` is true).
         appended: numbers to append to each observation. ``number``: the learner's number, counted among the learners of
             its world from the front, from 0. ``state``: the full state of the line (``game.full_state.full_state``),
             for a central critic. None: no numbers.
-        step_infos: True: every step returns all infos, as in the other environments, which is slower. False: only the
-            last step of an episode returns all infos.
+        step_infos: True: every step returns all infos, as the other environments do; steps are then slower. False: only
+            the last step of an episode returns all infos.
         render_mode: ``rgb_array`` or None. ``render`` and ``VecVideoRecorder`` show all worlds side by side.
         actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete, and an action is
             an index from 0 to K - 1. The indices stand for K evenly spaced numbers from -1 (full braking capacity) to 1
@@ -100,7 +100,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
     The rows of one world share one episode. Each new episode takes the next world of the stream. In the last step of an
     episode, the infos contain ``TimeLimit.truncated``, ``terminal_observation``, ``episode`` (return ``r``, number of
     steps ``l``, and ``t``, which is always 0), and all infos of the other environments. In other steps, the infos
-    contain only those of a shield, unless ``step_infos`` is true. ``get_attr`` and ``env_method`` use this object.
+    contain only a shield's infos, unless ``step_infos`` is true. ``get_attr`` and ``env_method`` act on this object.
 
     Args:
         engine: the engine that simulates the worlds; ``make_sb3_vec_env`` makes it.
@@ -170,8 +170,8 @@ class EthBrakeVecEnv(Begun, VecEnv):
     def reset(self) -> Observations:
         """Start an episode in every world, and return the observations, float32 [rows, F].
 
-        To choose the worlds, call ``seed`` or ``set_options`` before ``reset``. Options apply to one reset only.
-        Invalid options raise ``InvalidInput``; they, too, are ignored in later resets.
+        To choose the worlds, call ``seed`` or ``set_options`` before ``reset``. Options apply to the next reset only,
+        even if this reset raises ``InvalidInput`` because the options are invalid.
         """
         try:
             worlds = self._read_options()
@@ -264,7 +264,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         setattr(self, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
-        """Call the method ``method_name`` of this environment once; return a list with its result once per row.
+        """Call the method ``method_name`` of this environment once; return a list that repeats the result for each row.
 
         ``args`` and ``kwargs`` are the method's arguments. Raises ``InvalidInput`` if ``indices`` omits a row.
         """
@@ -298,7 +298,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         self._return[rows], self._steps[rows] = 0.0, 0
 
     def _rows(self, worlds: Ints) -> Ints:
-        """Return the numbers of the rows that belong to the worlds with the indices ``worlds``, in order."""
+        """Return the indices of the rows that belong to the worlds with the indices ``worlds``, world by world."""
         width = len(self.engine.learners)
         return (worlds[:, np.newaxis] * width + np.arange(width)).reshape(-1)
 
@@ -317,7 +317,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
     def _observe(self, worlds: Ints | None = None) -> Observations:
         """Return the observations of all learners as a new array, float32 [rows, F].
 
-        ``worlds`` are the indices of the worlds to include; None: all worlds.
+        ``worlds`` are the indices of the worlds whose learners' observations are returned; None: all worlds.
         """
         every = self.engine.observe_all(self._learners, worlds)
         rows = every.reshape(-1, every.shape[2])

@@ -1,7 +1,7 @@
 """``Trace``: object that records how the vehicles of an engine move, so that pictures can show any moment.
 
-A ``Trace`` records the state and the commands at the beginning of each step. From these it computes the exact state at
-any moment within the step.
+A ``Trace`` records the state and the commands at the beginning of each step. From this state and these commands the
+``Trace`` computes the exact state at any moment within the step.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Motion:
 
         Args:
             engine: the engine whose worlds were recorded.
-            row: index of the world.
+            row: index of the world whose scenes are returned.
             times_s: times within this motion in increasing order, [k] s since the alert; None: only the end of the
                 motion.
 
@@ -174,8 +174,9 @@ class Trace:
     def stepped(self, memory: Memory, before: Engine, after: Engine) -> Memory:
         """Return the recorded motions after a step.
 
-        If the constructor's argument ``whole`` is true, these are all motions of the episode so far, and only the last
-        one is open. If ``whole`` is false, this is only the motion of the new step.
+        If the constructor's argument ``whole`` is true, the result contains all motions of the episode so far, of which
+        only the last one is open (its end is not yet known). If ``whole`` is false, the result contains only the motion
+        of the new step.
 
         Args:
             memory: the motions recorded before this call.

@@ -42,9 +42,10 @@ class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArra
     step added to the whole line: first-impact or total harm, whichever the reward uses.
 
     Args:
-        env: an ``EthBrakeEnv``, or wrappers around one that pass on its infos.
+        env: an ``EthBrakeEnv``, or wrappers that pass on the infos of an ``EthBrakeEnv`` inside.
 
-    Raises ``InvalidInput`` if ``env`` is not such an environment, or if it already contains a ``CostEnv``.
+    Raises ``InvalidInput`` if ``env`` is neither an ``EthBrakeEnv`` nor a wrapper around one, or if ``env`` already
+    contains a ``CostEnv``.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.CostEnv(eb.EthBrakeEnv("paper-random"))
@@ -84,7 +85,7 @@ class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArra
 
 
 class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
-    """Many worlds like the one of ``EthBrakeEnv`` (``gymnasium.make_vec("EthBrake-v1", num_envs=4096)``).
+    """Environment with many worlds, each as in ``EthBrakeEnv`` (``gymnasium.make_vec("EthBrake-v1", num_envs=4096)``).
 
     All arrays have one row per world. After ``reset(seed=s)``, row k is world k of seed s. Each later episode, in any
     row, takes the next world of seed s. Later steps do not change the arrays that a step has returned.
@@ -102,12 +103,12 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
             (``observation_for``).
         autoreset_mode: Gymnasium's autoreset mode: what happens in a row whose episode ends. ``NextStep`` (default):
             the step returns the last observation of the episode. The next step ignores the row's action, starts a new
-            episode in the row, and returns the reward 0 for it. ``SameStep``: the step itself starts the new episode
-            and returns its first observation; ``infos["final_obs"]`` and ``infos["final_info"]`` contain the last
-            observation and infos of the old episode. ``Disabled``: no new episode starts; the caller must reset the row
-            before the next step.
-        max_episode_steps: number of steps after which an episode is truncated; None: it is truncated at the horizon
-            only.
+            episode in the row, and returns the reward 0 for the row. ``SameStep``: the step itself starts the new
+            episode and returns its first observation; ``infos["final_obs"]`` and ``infos["final_info"]`` contain the
+            last observation and infos of the old episode. ``Disabled``: no new episode starts; the caller must reset
+            the row before the next step.
+        max_episode_steps: number of steps after which an episode is truncated; None: an episode is truncated at the
+            horizon only.
         actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete, and an action is
             an index from 0 to K - 1. The indices stand for K evenly spaced numbers from -1 (full braking capacity) to 1
             (full driving capacity).
@@ -222,7 +223,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         """Return ``actions`` with the action 0 in each world whose action is ignored.
 
         In the autoreset mode ``NextStep``, the action of a world is ignored if its episode had ended before the step.
-        The mask ``before`` [n] is true for these worlds.
+        The mask ``before`` [n] is true for the worlds whose episode had ended before the step.
         """
         if self.autoreset_mode is not AutoresetMode.NEXT_STEP or not before.any():
             return actions
@@ -232,7 +233,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         return heeded
 
     def _rows_to_reset(self, options: Any) -> Bools:
-        """Return ``options["reset_mask"]``, the mask [n] of the rows to reset, or a mask of all rows if it is missing.
+        """Return ``options["reset_mask"]``, the mask [n] of the rows to reset; without this key, a mask of all rows.
 
         Raises ``InvalidInput`` if the mask is not a bool array [n], or has no True.
         """

@@ -22,11 +22,11 @@ class Viewer:
     Args:
         engine: the engine whose worlds are shown, from the engine's next reset on.
         mode: render mode: ``human``, ``rgb_array``, ``rgb_array_list`` or ``ansi``; None: the viewer draws no pictures.
-        batch: True: the environment has many worlds, all of which are shown. In this case only the modes ``rgb_array``
-            and ``ansi`` are allowed. False: the environment has one world.
+        batch: True: the environment has many worlds, all of which are shown. With many worlds only the modes
+            ``rgb_array`` and ``ansi`` are allowed. False: the environment has one world.
 
-    Raises ``InvalidInput`` for any other mode. Raises ``MissingExtra`` for the mode ``human`` if pygame is not
-    installed.
+    Raises ``InvalidInput`` for a mode that is not allowed. Raises ``MissingExtra`` for the mode ``human`` if pygame is
+    not installed.
 
     """
 
@@ -53,7 +53,7 @@ class Viewer:
         return {"render_modes": list(self.modes), "render_fps": round(fps) if abs(fps - round(fps)) < 1e-9 else fps}
 
     def began(self) -> None:
-        """Show the motion up to the first decision, and empty the list of frames. Call it at an episode's start."""
+        """Show the motion up to the first decision, and empty the list of frames. Call this when an episode starts."""
         self._shown = 0
         if self._window is not None:
             self._window.closed_by_user = False

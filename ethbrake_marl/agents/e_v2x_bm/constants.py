@@ -1,7 +1,7 @@
 """Simulate many constant decelerations of one vehicle in one world, for the agent ``e_v2x_bm``. Compiled.
 
 The simulated harm has the same bits as the harm that ``physics.advance`` computes for the same constant commands. Three
-methods save time:
+methods save computing time:
 
 - The motion until the vehicle's command takes effect is the same for all decelerations, so it is simulated only once.
 - A simulation ends as soon as no pair can have another impact (``will_stay_apart``).
@@ -34,7 +34,7 @@ _DIGIT = 1_000.0  # base in which ``_course`` encodes the number of impacts of e
 
 
 class Line(NamedTuple):
-    """One world in which constant decelerations of one vehicle are simulated, as tables of ``physics.rows``.
+    """Tables (``physics.rows``) of one world in which constant decelerations of one vehicle are simulated.
 
     A table has a row for each quantity and a column for each vehicle, front to rear. If the world has an obstacle ahead
     of Vehicle 1, column 0 is the obstacle.
@@ -69,7 +69,7 @@ def make_line(
         latency: latency of each vehicle (time from the alert until its command takes effect), [N] s.
         mass: mass of each vehicle, [N] t.
         limit: speed limit of each vehicle, [N] m/s.
-        in_force: acceleration of each vehicle at the start, [N] m/s2.
+        in_force: acceleration of each vehicle at the start of the simulations, [N] m/s2.
         brake_rate: rate at which the deceleration of each vehicle rises when it brakes, [N] m/s3.
         release_rate: rate at which the deceleration of each vehicle falls when it releases its brakes, [N] m/s3.
         pieces: braking profile of each vehicle: K intervals with constant commands, in the format of
@@ -132,12 +132,13 @@ def simulate(line: Line, samples: Samples, first: int, end: int, bound: float) -
 
     Args:
         line: the world, for which ``share_start`` was called before; ``line.table`` is overwritten.
-        samples: samples with the decelerations to simulate in ``samples.at``; the results are written to the other
-            arrays of ``samples``.
+        samples: samples whose decelerations ``samples.at`` are simulated; the results are written to the other arrays
+            of ``samples``.
         first: index of the first sample to simulate.
         end: index after the last sample to simulate.
-        bound: a simulation stops when its harm reaches this number, m2/s2. The harm of such a sample is at least
-            ``bound``, and the sample's ``other`` and ``course`` have no meaning.
+        bound: a simulation stops when its harm reaches this number, m2/s2. The sample of a stopped simulation has a
+            harm of at least ``bound``, and its ``other`` (harm under the other count) and ``course`` (numbers of
+            impacts) have no meaning.
 
     Returns ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed.
 
@@ -157,7 +158,7 @@ def simulate(line: Line, samples: Samples, first: int, end: int, bound: float) -
 
 @compiled(within=True)
 def _simulate_one(line: Line, command: float, bound: float) -> int:
-    """Simulate the controlled vehicle's ``command`` (m/s2) in ``line.table``; stop at the harm ``bound`` (m2/s2).
+    """Simulate the controlled vehicle's ``command`` (m/s2) in ``line.table`` until the harm reaches ``bound`` (m2/s2).
 
     Returns ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed.
     """
@@ -221,11 +222,11 @@ def will_stay_apart(table: Floats) -> bool:
 
     * Vehicle r is at rest, or both vehicles move as one body.
     * ``w <= 0`` and ``d_r >= d_f``, so w stays at most 0 until r is at rest.
-    * Three statements are true together, with margins for rounding errors. First, f and r do not touch, or the gap
-      grows. Second, the stopping point of r is behind the stopping point of f: ``g + v_f^2 / (2 d_f) > v_r^2 / (2
+    * The following three statements are all true, with margins for rounding errors. First, f and r do not touch, or the
+      gap grows. Second, the stopping point of r is behind the stopping point of f: ``g + v_f^2 / (2 d_f) > v_r^2 / (2
       d_r)``. Third, if r closes in and brakes harder than f, the smallest gap is positive: ``w^2 < 2 (d_r - d_f) g``.
-      (If r brakes less hard, the gap is smallest now or at the end, because the gap is a concave function of time until
-      f is at rest, and decreases afterwards.)
+      (If r brakes less hard than f, the gap is smallest now or at the end of the motion: until f is at rest, the gap is
+      a concave function of time; after that, the gap decreases.)
     """
     vehicles, hardest = table.shape[1], 0.0
     if pieces_to_come(table):
@@ -266,14 +267,14 @@ def will_stay_apart(table: Floats) -> bool:
 def _way_to_stop(speed: float, acceleration: float) -> float:
     """Return the distance (m) in which a vehicle with ``speed`` (m/s) and ``acceleration`` (m/s2, at most 0) stops.
 
-    The distance is infinite for a moving vehicle with acceleration 0.
+    For a moving vehicle with acceleration 0 the distance is infinite.
     """
     return speed * speed / (2.0 * abs(acceleration)) if speed > 0.0 else 0.0
 
 
 @compiled(within=True)
 def _course(line: Line) -> float:
-    """Return one number that encodes the number of impacts of each pair, and with the obstacle, in ``line.table``."""
+    """Return one number that encodes how many impacts each pair and the obstacle have had in ``line.table``."""
     course, digit, table = 0.0, 1.0, line.table
     for p in range(line.vehicles, table.shape[1] - 1):
         course += table[ROW.COUNT, p] * digit

@@ -6,7 +6,7 @@ The following table defines the symbols. docs/internals/proofs/constant-decelera
 l, f           leader (front vehicle), follower (rear vehicle)
 gap            bumper to bumper at the start [m], >= 0
 v_l, v_f       speeds at the start [m/s], >= 0
-a_l, a_f       decelerations [m/s2], >= 0, held to standstill
+a_l, a_f       decelerations [m/s2], >= 0, constant to standstill
 onset_l/_f     time from the start until the vehicle brakes [s]; before, it coasts
 tau            time from the leader's onset to the follower's [s], >= 0
 lead           time from the follower's onset to the leader's [s], > 0
@@ -62,7 +62,7 @@ def contact_while_coasting(gap: float, v_l: float, a_l: float, v_f: float, tau: 
     Args:
         gap: gap between leader and follower at the start of the motion, m.
         v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
-        a_l: the leader's deceleration, held from the start of the motion to standstill, m/s2, >= 0.
+        a_l: the leader's constant deceleration from the start of the motion to standstill, m/s2, >= 0.
         v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
         tau: time for which the follower coasts before it brakes, s.
 
@@ -91,9 +91,9 @@ def contact_while_both_brake(gap: float, v_l: float, a_l: float, v_f: float, a_f
     Args:
         gap: gap between leader and follower at the start of the motion, m.
         v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
-        a_l: the leader's deceleration, held from the start of the motion to standstill, m/s2, >= 0.
+        a_l: the leader's constant deceleration from the start of the motion to standstill, m/s2, >= 0.
         v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
-        a_f: the follower's deceleration, held from ``tau`` to standstill, m/s2, >= 0.
+        a_f: the follower's constant deceleration from the time ``tau`` to standstill, m/s2, >= 0.
         tau: time for which the follower coasts before it brakes, s.
 
     """
@@ -117,14 +117,14 @@ def contact_while_both_brake(gap: float, v_l: float, a_l: float, v_f: float, a_f
 
 @compiled
 def contact_leader_first(gap: float, v_l: float, a_l: float, v_f: float, a_f: float, tau: float) -> float:
-    """Return the squared closing speed (m2/s2) at the first contact; 0 without contact. The leader brakes first.
+    """Return the squared closing speed (m2/s2) at the first contact if the leader brakes first; 0 without contact.
 
     Args:
         gap: gap between leader and follower at the start of the motion, m.
         v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
-        a_l: the leader's deceleration, held from the start of the motion to standstill, m/s2, >= 0.
+        a_l: the leader's constant deceleration from the start of the motion to standstill, m/s2, >= 0.
         v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
-        a_f: the follower's deceleration, held from ``tau`` to standstill, m/s2, >= 0.
+        a_f: the follower's constant deceleration from the time ``tau`` to standstill, m/s2, >= 0.
         tau: time for which the follower coasts before it brakes, s.
 
     """
@@ -150,7 +150,7 @@ def contact_before_leader_brakes(gap: float, w: float, a_f: float, lead: float) 
     Args:
         gap: gap between leader and follower at the start of the motion, m.
         w: closing speed at the start of the motion: the follower's speed minus the leader's, m/s.
-        a_f: the follower's deceleration, held from the start of the motion, m/s2, >= 0.
+        a_f: the follower's constant deceleration from the start of the motion, m/s2, >= 0.
         lead: time for which the leader coasts before it brakes, s.
 
     """
@@ -169,10 +169,10 @@ def closing_speed_squared(
     Args:
         gap: gap between leader and follower at the start of the motion, m.
         v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
-        a_l: the leader's deceleration, held from ``onset_l`` to standstill, m/s2, >= 0.
+        a_l: the leader's constant deceleration from the time ``onset_l`` to standstill, m/s2, >= 0.
         onset_l: time for which the leader coasts before it brakes, s.
         v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
-        a_f: the follower's deceleration, held from ``onset_f`` to standstill, m/s2, >= 0.
+        a_f: the follower's constant deceleration from the time ``onset_f`` to standstill, m/s2, >= 0.
         onset_f: time for which the follower coasts before it brakes, s.
 
     """
@@ -203,7 +203,7 @@ def least_behind_braking(gap: float, v_l: float, a_l: float, v_f: float, tau: fl
     Args:
         gap: gap between leader and follower at the start of the motion, m.
         v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
-        a_l: the leader's deceleration, held from the start of the motion to standstill, m/s2, > 0.
+        a_l: the leader's constant deceleration from the start of the motion to standstill, m/s2, > 0.
         v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
         tau: time for which the follower coasts before it brakes, s, >= 0.
 
@@ -234,7 +234,7 @@ def least_behind_coasting(gap: float, v_l: float, a_l: float, v_f: float, lead: 
     Args:
         gap: gap between leader and follower at the start of the motion, m.
         v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
-        a_l: the leader's deceleration, held from ``lead`` to standstill, m/s2, > 0.
+        a_l: the leader's constant deceleration from the time ``lead`` to standstill, m/s2, > 0.
         v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
         lead: time for which the leader coasts before it brakes, s, > 0.
 
@@ -258,13 +258,13 @@ def least_to_spare_front(gap: float, v_l: float, a_l: float, onset_l: float, v_f
     """Return the follower's smallest deceleration (m/s2) that avoids an impact; inf if every deceleration leads to one.
 
     With a larger deceleration the follower is further back at every moment. Therefore every larger deceleration avoids
-    the impact as well. With the smallest such deceleration, the follower stops directly behind the leader, or the two
-    vehicles touch with equal speeds while both move.
+    the impact as well. With the smallest deceleration that avoids an impact, the follower stops directly behind the
+    leader, or the two vehicles touch with equal speeds while both move.
 
     Args:
         gap: gap between leader and follower at the start of the motion, m.
         v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
-        a_l: the leader's deceleration, held from ``onset_l`` to standstill, m/s2, > 0.
+        a_l: the leader's constant deceleration from the time ``onset_l`` to standstill, m/s2, > 0.
         onset_l: time for which the leader coasts before it brakes, s.
         v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
         onset_f: time for which the follower coasts before it brakes, s.
@@ -291,7 +291,7 @@ def most_ahead_of_coasting(gap: float, v_l: float, v_f: float, a_f: float, tau: 
         gap: gap between leader and follower at the start of the motion, m.
         v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
         v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
-        a_f: the follower's deceleration, held from ``tau`` to standstill, m/s2, > 0.
+        a_f: the follower's constant deceleration from the time ``tau`` to standstill, m/s2, > 0.
         tau: time for which the follower coasts before it brakes, s, >= 0.
 
     """
@@ -322,7 +322,7 @@ def most_to_spare_rear(gap: float, v_l: float, onset_l: float, v_f: float, a_f: 
         v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
         onset_l: time for which the leader coasts before it brakes, s.
         v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
-        a_f: the follower's deceleration, held from ``onset_f`` to standstill, m/s2, > 0.
+        a_f: the follower's constant deceleration from the time ``onset_f`` to standstill, m/s2, > 0.
         onset_f: time for which the follower coasts before it brakes, s.
 
     """

@@ -1,9 +1,9 @@
 """Coupled E-V2X-BM: the constant deceleration of one vehicle with the least harm in a simulation of the whole line.
 
-The closed form in the module ``pairwise`` ignores that pairs influence each other. This module simulates every
-deceleration that it tries up to the horizon, with the speed changes of impacts, later impacts and lasting contact.
-Therefore the predicted harm is the harm that really happens in the engine, and the shield uses the predicted harm as a
-bound. docs/evaluate.md says how close the predicted harm comes to the true minimum.
+The closed form in the module ``pairwise`` ignores that pairs influence each other. For every deceleration that it
+tries, this module simulates the motion up to the horizon, with the speed changes of impacts, later impacts and lasting
+contact. Therefore the predicted harm is the harm that really happens in the engine, and the shield uses the predicted
+harm as a bound. docs/evaluate.md says how close the predicted harm comes to the true minimum.
 """
 
 from __future__ import annotations
@@ -58,12 +58,12 @@ def optimise_coupled(
 ) -> CoupledOptimum:
     """Return, for each world, the constant deceleration of ``vehicle`` with the least harm in a simulation.
 
-    If the deceleration that the closed form (``optimise_pairwise``) chooses does no harm in a simulation, it is the
-    result. If it does harm, evenly spaced decelerations and the breakpoints of the closed form are simulated. The harm
-    may jump where the number of impacts changes. The jumps and local minima with the least harm are located to 1e-9
-    m/s2; at a jump the result lies on the side with less harm. If several decelerations have the least harm, those with
-    the least harm under the other harm count remain, and the middle one of these is the result. The result for a world
-    does not depend on the other worlds.
+    If the deceleration that the closed form (``optimise_pairwise``) chooses does no harm in a simulation, this
+    deceleration is the result. If this deceleration does harm, the search simulates evenly spaced decelerations and the
+    breakpoints of the closed form. The harm may jump where the number of impacts changes. The jumps and local minima
+    with the least harm are located to 1e-9 m/s2; at a jump the result lies on the side with less harm. If several
+    decelerations have the least harm, those with the least harm under the other harm count remain, and the middle one
+    of these is the result. The result for a world does not depend on the other worlds.
 
     Args:
         worlds: n worlds of N vehicles.
@@ -102,16 +102,16 @@ def optimise_coupled(
 def _minimise(
     worlds: Worlds, told: Worlds, command: Floats, vehicle: int, rows: Ints, harm_count: HarmCount, horizon_s: float
 ) -> Floats:
-    """Return an array [3, m] with the best deceleration in m worlds, its harm, and its harm under the other harm count.
+    """Return, for each of m worlds, the best deceleration, its harm, and its harm under the other harm count, [3, m].
 
     Args:
         worlds: n worlds.
-        told: the same worlds for the closed form, which assumes full braking: the braking capacity of each vehicle
-            except ``vehicle`` is replaced by the deceleration that it commands.
+        told: the same worlds with other braking capacities, because the closed form assumes full braking: the capacity
+            of each braking vehicle except ``vehicle`` is replaced by the deceleration in ``command``.
         command: constant commands of all vehicles, [n, N] m/s2; the controlled vehicle's column is ignored.
         vehicle: index of the controlled vehicle, from 0.
-        rows: indices of the worlds to search, [m].
-        harm_count: harm to minimise: ``first`` or ``total``.
+        rows: indices of the worlds for which the best deceleration is searched, [m].
+        harm_count: harm to minimise: ``first`` (harm of each pair's first impact) or ``total`` (harm of all impacts).
         horizon_s: time at the end of the simulations, s since the alert.
 
     """
@@ -155,11 +155,11 @@ def _search_worlds(
 ) -> None:  # fmt: skip
     """Search for the best deceleration of ``vehicle`` (index) in the worlds with the indices ``rows`` [m].
 
-    The best deceleration, its harm, and its harm under the other harm count are written to ``found`` [3, m].
-    ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed is written to ``status`` [m].
-    ``capacity`` [n, N] are the braking capacities (m/s2), and ``onset`` [n, N] are the times from now until each
-    vehicle may brake (s). The other arguments have the same meaning as in ``make_line``, with a new first axis for the
-    n worlds.
+    For each of these m worlds, ``found`` [3, m] receives the best deceleration (m/s2), its harm, and its harm under the
+    other harm count (m2/s2). ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed is
+    written to ``status`` [m]. ``capacity`` [n, N] are the braking capacities (m/s2), and ``onset`` [n, N] are the times
+    from now until each vehicle may brake (s). The other arguments have the same meaning as in ``make_line``, with a new
+    first axis for the n worlds.
     """
     room, at, best = make_room(), np.empty(CANDIDATES), np.empty(3)
     for m in range(rows.shape[0]):

@@ -4,9 +4,9 @@ The prediction assumes that the neighbours of the controlled vehicle brake with 
 It also assumes that only the first contact of each pair does harm and that impacts change no speed, so that the pair in
 front and the pair behind do not influence each other. The predicted harm is ``H(a) = c_front(a)^2 + c_rear(a)^2``
 (m2/s2). Here ``a`` is the controlled vehicle's deceleration (m/s2), and ``c_front`` and ``c_rear`` are the closing
-speeds (m/s) at its first contact with the vehicle in front and behind. A formula gives a few decelerations, called
-*breakpoints*. Between two neighbouring breakpoints H(a) is concave, so H(a) is least at a breakpoint.
-docs/internals/proofs/constant-deceleration.md has the derivation.
+speeds (m/s) at its first contact with the vehicle in front and with the vehicle behind. A formula yields a few
+decelerations, called *breakpoints*. Between two neighbouring breakpoints H(a) is concave, so H(a) is least at a
+breakpoint. docs/internals/proofs/constant-deceleration.md has the derivation.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ def early_breakpoints(gap: float, w: float, onset_l: float, onset_f: float) -> t
     - Kink, at ``2 (w lead - gap) / lead^2``: with this deceleration, the contact happens exactly when the leader begins
       to brake.
     - Jump, at ``w^2 / (2 gap)``: with a slightly smaller deceleration, the follower strikes the coasting leader
-      lightly. With a larger deceleration, the follower does not reach the coasting leader, but may strike it harder
-      once the leader brakes. The returned deceleration lies just below the jump, where the impact is lightest.
+      lightly. With a larger deceleration, the follower does not reach the coasting leader, but may strike the leader
+      harder once the leader brakes. The returned deceleration lies just below the jump, where the impact is lightest.
 
     Args:
         gap: gap at the present time, m.
@@ -100,7 +100,7 @@ def rear_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, on
 def find_breakpoints(
     at: Floats, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats
 ) -> tuple[float, float]:
-    """Write the decelerations (m/s2) of vehicle ``i`` at which its predicted harm may be least to ``at`` [6].
+    """Write to ``at`` [6] the decelerations (m/s2) of vehicle ``i`` at which its predicted harm may be least.
 
     All decelerations in ``at`` are in [0, braking capacity]. Returns two more decelerations (m/s2), which may be
     infinite: the smallest one without an impact in front, and the largest one without an impact behind. The world has
@@ -131,10 +131,10 @@ def minimise_over(
 ) -> tuple[float, float]:
     """Return the deceleration (m/s2) of vehicle ``i`` with the least predicted harm, and this harm (m2/s2).
 
-    Only the six decelerations in ``at`` (m/s2) are compared. If several of them have the least harm, the middle between
-    the smallest and the largest of these is returned, provided that the middle has the least harm as well. The world
-    has the gaps ``gap`` [P] m, the speeds ``speed`` [N] m/s and the braking capacities ``capacity`` [N] m/s2. Vehicle k
-    may brake after ``onset[k]`` seconds.
+    Only the six decelerations in ``at`` (m/s2) are compared. If several of these decelerations have the least harm,
+    consider the middle between the smallest and the largest of them: if the middle has the least harm as well, the
+    middle is returned; if not, the smallest one is returned. The world has the gaps ``gap`` [P] m, the speeds ``speed``
+    [N] m/s and the braking capacities ``capacity`` [N] m/s2. Vehicle k may brake after ``onset[k]`` seconds.
     """
     best, first, last = math.inf, 0.0, 0.0
     for k in range(at.shape[0]):
@@ -178,7 +178,7 @@ def optimise_worlds(
 
 @compiled
 def contacts_of_worlds(gaps: Floats, speeds: Floats, deceleration: Floats, onset: Floats, out: Floats) -> None:
-    """Write the squared closing speed at each pair's first impact to ``out`` [n, P] m2/s2, or 0 if there is no impact.
+    """Write to ``out`` [n, P] the squared closing speed (m2/s2) at each pair's first impact, or 0 without an impact.
 
     It is assumed that impacts change no speed, so that pairs do not influence each other. The worlds have the gaps
     ``gaps`` [n, P] m and the speeds ``speeds`` [n, N] m/s. In world k, vehicle j brakes with the constant
@@ -197,9 +197,9 @@ def optimise_pairwise(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
 
     ``a*`` minimises ``H(a) = c_front^2 + c_rear^2`` over ``a`` in [0, capacity], where ``c_front`` and ``c_rear`` are
     the closing speeds (m/s) at the first contacts with the two neighbours. If an interval of decelerations avoids both
-    impacts, ``a*`` is the middle of this interval; otherwise ``a*`` is the breakpoint with the least H. For the first
-    and the last vehicle of a line, H contains only the one neighbour. Only gaps, speeds, capacities and latencies of
-    the vehicle and its neighbours are used.
+    impacts, ``a*`` is the middle of this interval; otherwise ``a*`` is the breakpoint with the least H. The first and
+    the last vehicle of a line have one neighbour, so H has only one of the two terms. Only gaps, speeds, capacities and
+    latencies of the vehicle and its neighbours are used.
 
     Raises ``InvalidInput`` if ``vehicle`` is not in the line, if a vehicle moves backward, or if brakes build up
     gradually.
@@ -221,7 +221,7 @@ def pairwise_harm(worlds: Worlds, deceleration_mps2: ArrayLike) -> Floats:
     """Return the predicted harm of each pair, [n, P] m2/s2, as if no pair influenced another pair.
 
     Every vehicle coasts until its latency has elapsed, and then brakes with its constant deceleration to rest. The harm
-    that E-V2X-BM predicts for a vehicle is the sum over the pairs that contain this vehicle.
+    that E-V2X-BM predicts for a vehicle is the sum of the predicted harms of the pairs that contain this vehicle.
 
     Args:
         worlds: n worlds.

@@ -76,8 +76,8 @@ def put_in_order(samples: Samples, n: int) -> None:
 def bound_cells(samples: Samples, n: int, bounds: Floats) -> None:
     """Estimate the least harm in each interval between two neighbouring samples; write it to ``bounds`` [n - 1], m2/s2.
 
-    The first ``n`` samples are used; they must be sorted by deceleration. If the harm falls from outside an interval
-    towards it, the harm is assumed to fall on inside the interval, at most ``STEEPER`` times as steeply.
+    The first ``n`` samples are used; they must be sorted by deceleration. If the harm falls towards an interval from
+    one side, the harm is assumed to go on falling inside the interval, at most ``STEEPER`` times as steeply as outside.
     """
     before, slope = 0.0, _slope(samples, 0)
     for k in range(n - 1):
@@ -107,7 +107,7 @@ def least_harm(samples: Samples, n: int) -> float:
 
 @compiled(bare=True)
 def find_smallest(values: Floats, n: int, places: Ints) -> None:
-    """Find the smallest of the first ``n`` entries of ``values``; write their indices, smallest first, to ``places``.
+    """Write to ``places`` the indices of the smallest of the first ``n`` entries of ``values``, smallest entry first.
 
     The length of ``places``, at most ``n``, is the number of entries to find. Of equal values, the one with the lower
     index comes first.
@@ -126,7 +126,7 @@ def find_smallest(values: Floats, n: int, places: Ints) -> None:
 
 @compiled(bare=True)
 def find_minima(samples: Samples, n: int, depth: Floats, places: Ints) -> None:
-    """Write the indices of the lowest local minima of the first ``n`` samples to ``places``, lowest harm first.
+    """Write to ``places`` the indices of the lowest local minima among the first ``n`` samples, lowest harm first.
 
     ``depth`` [n or more] is overwritten: with the harm at each local minimum, and with infinity at all other samples.
     If there are fewer local minima than entries in ``places``, the remaining entries are indices of other samples.

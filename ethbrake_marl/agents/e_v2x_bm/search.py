@@ -1,9 +1,9 @@
 """The coupled search for the best constant deceleration in one world, in five steps. Compiled.
 
-The search simulates evenly spaced decelerations, then more decelerations where the harm may be least. Then it simulates
-decelerations around local minima and around *borders*, at which the number of impacts changes. If the result lies close
-to a jump of the harm, the search finally moves the result away from the jump. docs/evaluate.md gives the reasons for
-these steps.
+The search simulates evenly spaced decelerations, then more decelerations where the harm may be least. Then the search
+simulates decelerations around local minima and around *borders*, at which the number of impacts changes. If the result
+lies close to a jump of the harm, the search finally moves the result away from the jump. docs/evaluate.md gives the
+reasons for these steps.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def search_line(line: Line, room: Room, breakpoints: Floats, capacity: float, ou
         line: the world, as ``make_line`` returns it.
         room: arrays for intermediate results.
         breakpoints: decelerations that are simulated in addition to an even grid, [CANDIDATES] m/s2.
-        capacity: braking capacity of the vehicle, m/s2.
+        capacity: braking capacity of the controlled vehicle, m/s2.
         out: array [3] for the result: best deceleration (m/s2), its harm, and its harm under the other harm count
             (m2/s2).
 
@@ -142,10 +142,10 @@ def look_evenly(line: Line, room: Room, breakpoints: Floats, capacity: float) ->
 def look_inside(line: Line, room: Room) -> int:
     """Step 2: simulate more decelerations in some cells (intervals between neighbouring decelerations of the grid).
 
-    These are the cells in which the number of impacts changes, and the cells whose estimated least harm is below the
-    harm of all samples so far. All samples so far are written to ``room.one``; the last sample is repeated until there
-    are ``_LOOKED`` samples. Returns ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that
-    failed.
+    The search simulates more decelerations in a cell if the number of impacts changes in this cell, or if the estimated
+    least harm of the cell is below the harm of all samples so far. All samples, with the new ones, are written to
+    ``room.one``; the last sample is repeated until there are ``_LOOKED`` samples. Returns ``FLAG.DONE`` or, if a
+    simulation failed, the code of the physics check that failed.
     """
     grid, looked, new, cells, bounds = room.one, room.two, room.new, room.cells, room.values
     best = least_harm(looked, GRID + CANDIDATES)
@@ -186,10 +186,10 @@ def _put_in_order(places: Ints, n: int) -> None:
 def locate_borders(line: Line, room: Room) -> int:
     """Step 3: locate borders (decelerations at which the number of impacts changes) near which the harm may be least.
 
-    Between two borders the harm has no jumps. If the harm falls towards a border, it is therefore least directly at the
-    border. For each located border, two samples that are at most 1e-9 m/s2 apart are found, one on each side. All
-    samples so far are written to ``room.two``. Returns ``FLAG.DONE`` or, if a simulation failed, the code of the
-    physics check that failed.
+    Between two borders the harm has no jumps. Therefore, if the harm falls towards a border, the harm is least directly
+    at this border. For each located border, two samples that are at most 1e-9 m/s2 apart are found, one on each side.
+    All samples, with the new ones, are written to ``room.two``. Returns ``FLAG.DONE`` or, if a simulation failed, the
+    code of the physics check that failed.
     """
     looked, new, few, places, bounds = room.one, room.new, room.few, room.borders, room.values
     best = least_harm(looked, _LOOKED)
@@ -214,9 +214,9 @@ def locate_borders(line: Line, room: Room) -> int:
 
 @compiled(bare=True)
 def _cut(line: Line, few: Samples) -> int:
-    """Move samples 0 and 5 of ``few``, between which a border lies, towards it until they are at most 1e-9 m/s2 apart.
+    """Move samples 0 and 5 of ``few`` towards the border between them until these samples are at most 1e-9 m/s2 apart.
 
-    A border is a deceleration at which the number of impacts changes. Each round divides the distance of the two
+    A border is a deceleration at which the number of impacts changes. Each round divides the distance between the two
     samples by five. Returns ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed.
     """
     while few.at[5] - few.at[0] > NARROWEST_MPS2:
@@ -264,12 +264,12 @@ def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, t
 
     Args:
         line: the world.
-        few: samples for intermediate results.
-        low: lower end of the interval at first, m/s2.
-        high: upper end of the interval at first, m/s2.
-        found: samples, of which sample ``to`` has the least harm in the interval so far. It is overwritten whenever a
-            deceleration with less harm is found.
-        to: index of the sample with the least harm so far.
+        few: array of samples, which is overwritten with intermediate results.
+        low: lower end of the initial interval, m/s2.
+        high: upper end of the initial interval, m/s2.
+        found: samples, of which sample ``to`` has the least harm in the interval so far. Sample ``to`` is overwritten
+            whenever a deceleration with less harm is found.
+        to: index in ``found`` of the sample with the least harm so far.
 
     """
     while high - low > NARROWEST_MPS2:
@@ -297,16 +297,17 @@ def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, t
 
 @compiled(apart=True, bare=True)
 def step_back(line: Line, around: Samples, best: float, capacity: float, out: Floats) -> int:
-    """Step 5: if ``best`` lies within 1e-9 m/s2 of a jump of the harm, move it to the side of the jump with less harm.
+    """Step 5: if ``best`` lies within 1e-9 m/s2 of a jump of the harm, move ``best`` to the side with less harm.
 
-    The engine simulates the same motion step by step, with other rounding errors. If the agent braked with a
-    deceleration directly at a jump, these rounding errors would decide on which side of the jump the harm lies.
+    When the agent drives, the engine simulates the same motion step by step, with other rounding errors than this
+    search. If the agent braked with a deceleration directly at a jump, the engine's rounding errors would decide on
+    which side of the jump the harm lies.
 
     Args:
         line: the world.
-        around: samples for intermediate results.
-        best: best deceleration found, m/s2.
-        capacity: braking capacity of the vehicle, m/s2.
+        around: array of samples, which is overwritten with intermediate results.
+        best: best deceleration that the earlier steps of the search have found, m/s2.
+        capacity: braking capacity of the controlled vehicle, m/s2.
         out: array [3] for the result: best deceleration (m/s2), its harm, and its harm under the other harm count
             (m2/s2).
 
