@@ -282,8 +282,8 @@ def policy_agent(
     seen = spec if trained is None or ignore_wrappers else trained.engine.observation
     if [f.name for f in spec.features] != [f.name for f in seen.features]:
         raise InvalidInput(
-            f"agent {named!r}: the model was trained with the observation {seen}, not with {spec}; leave the"
-            " argument observation out, and pass the training scenario or no scenario"
+            f"agent {named!r}: the model was trained with the observation {seen}, not with {spec}; leave"
+            " out observation=, and pass the scenario in which the model was trained, or leave out scenario="
         )
     actions = getattr(trained, "actions", None) if actions is None else actions
     if not ignore_wrappers:

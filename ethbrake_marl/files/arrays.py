@@ -213,8 +213,8 @@ def _check_directory(data: bytes) -> None:
         )
     if members > _MEMBERS_LIMIT or size > _DIRECTORY_LIMIT_BYTES or start + size != len(data) - 22:
         raise ValueError(
-            f"not a plain .npz archive: its directory ({members} entries, {size:,} bytes) must be small and stand at"
-            " the end of the file"
+            f"not a plain .npz archive: its zip directory has {members} entries and {size:,} bytes; must have at most"
+            f" {_MEMBERS_LIMIT} entries and {_DIRECTORY_LIMIT_BYTES:,} bytes, and be at the end of the file"
         )
 
 

@@ -72,7 +72,7 @@ def check_target(path: str | Path, *, force: bool = False) -> Path:
             raise InvalidInput(f"{target}: the folder {target.parent} does not exist; create it first")
         if os.path.lexists(target) and not force:
             raise AlreadyExists(
-                f"{target}: already exists; give another name, or replace the file with force (--force)"
+                f"{target}: already exists; give another name, or pass force=True (--force) to overwrite the file"
             )
         check_writable(target.parent)
     except (InvalidInput, AlreadyExists):

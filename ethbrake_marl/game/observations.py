@@ -86,7 +86,8 @@ class ObservationSpec:
             )
         if self.chosen and _reach(self.chosen) != (self.front, self.rear, self.role, self.obstacle, self.contact):
             raise InvalidInput(
-                "observation: the fields front, rear, role, obstacle and contact contradict the features in chosen;"
+                "observation: the fields front, rear, role, obstacle and contact contradict the list of features in the"
+                " field 'chosen';"
                 " make the observation with eb.choose_observation([...])"
             )
 

@@ -216,8 +216,8 @@ def refuse_bad(worlds: Worlds, command: Floats, until: Floats, in_time: Bools) -
     k = int(np.argmin(in_time & in_range.all(axis=1)))
     if not in_time[k]:
         raise InvalidInput(
-            f"advance: world {k} is at t = {worlds.time_s[k]:g} s, and must be advanced to {until[k]:g} s; the end time"
-            " must be finite and not before the present time"
+            f"advance: world {k} is at t = {worlds.time_s[k]:g} s, but the requested end time is {until[k]:g} s; the"
+            " end time must be finite and not before the present time"
         )
     i = int(np.argmin(in_range[k]))
     raise InvalidInput(f"command_mps2[{k}, {i}] = {command[k, i]:g}: must be in [{low[k, i]:g}, {high[k, i]:g}] m/s2")

@@ -182,7 +182,7 @@ def test_run__needs_a_learner(refuse: Refuse) -> None:
 def test_file_that_is_there__is_not_replaced_unasked(file: str, line: str, refuse: Refuse) -> None:
     Path(file).parent.mkdir(exist_ok=True)
     Path(file).write_text("precious")
-    refuse(line, f"{file}: already exists; give another name, or replace the file with force")
+    refuse(line, f"{file}: already exists; give another name, or pass force=True (--force) to overwrite the file")
 
 
 @pytest.mark.parametrize(

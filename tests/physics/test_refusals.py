@@ -53,11 +53,11 @@ ADVANCES: dict[str, Callable[[], object]] = {
     ),
     "command_mps2[0, 0] = nan: must be in [-10, 10] m/s2": lambda: advance(PAIR, [nan, 0.0], 1.0),
     "command_mps2: has shape (3,); must have shape (1, 2)": lambda: advance(PAIR, [0.0, 0.0, 0.0], 1.0),
-    "advance: world 0 is at t = 0 s, and must be advanced to -1 s; the": lambda: advance(PAIR, 0.0, -1.0),
-    "advance: world 1 is at t = 0 s, and must be advanced to -1 s; the": lambda: advance(
+    "advance: world 0 is at t = 0 s, but the requested end time is -1 s": lambda: advance(PAIR, 0.0, -1.0),
+    "advance: world 1 is at t = 0 s, but the requested end time is -1 s": lambda: advance(
         FOUR, 0.0, until_s=[1.0, -1.0, 1.0, 1.0]
     ),
-    "advance: world 0 is at t = 0 s, and must be advanced to inf s; the": lambda: advance(PAIR, 0.0, until_s=inf),
+    "advance: world 0 is at t = 0 s, but the requested end time is inf s": lambda: advance(PAIR, 0.0, until_s=inf),
     "advance: pass either duration_s or until_s": lambda: advance(PAIR, 0.0),
     "threads = 0: must be a whole number, at least 1": lambda: advance(PAIR, 0.0, 1.0, threads=0),
     "threads = True: must be a whole number, at least 1": lambda: advance(PAIR, 0.0, 1.0, threads=True),

@@ -350,7 +350,7 @@ def plan_ablation(
         check_whole_number(name, getattr(plan, name), 1)
     called = [recipe.name for recipe in loaded]
     if len(set(called)) < len(called):
-        raise InvalidInput(f"recipes {', '.join(called)}: two recipes have the same name; give each recipe once")
+        raise InvalidInput(f"recipes {', '.join(called)}: two recipes have the same name; all names must differ")
     if plan.shield not in (None, "step"):
         raise InvalidInput(
             f"shield {plan.shield!r}: the shield must be 'step', because other shields can control only one vehicle"

@@ -67,7 +67,9 @@ def check_folder(path: Path, *, force: bool = False) -> None:
         raise InvalidInput(f"{path}: the folder of a Minari dataset must be named NAME-vNUMBER, for instance brakes-v0")
     if path.is_symlink() or path.exists():
         if not force:
-            raise AlreadyExists(f"{path}: already exists; give another name, or replace it with force (--force)")
+            raise AlreadyExists(
+                f"{path}: already exists; give another name, or pass force=True (--force) to overwrite it"
+            )
         if path.is_symlink() or not (path / DATA / "metadata.json").is_file():
             raise InvalidInput(
                 f"{path}: this is not a Minari dataset, so force (--force) does not replace it; give another name"

@@ -19,7 +19,9 @@ def from_data_command(
     ],
     format: Annotated[
         Literal["highd", "exid", "ngsim", "openacc", "table"],
-        typer.Option(help="Format of the recordings; table: CSV or Parquet files, described by --columns."),
+        typer.Option(
+            help="Format of the recordings. 'table' is a CSV or Parquet file whose columns --columns describes."
+        ),
     ],
     output: Annotated[
         Path,

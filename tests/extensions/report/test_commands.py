@@ -96,5 +96,5 @@ def test_film__is_refused(line: str, message: str, refuse: Refuse) -> None:
 
 def test_film__that_is_there_is_not_replaced_unasked(refuse: Refuse) -> None:
     Path("film.gif").write_text("precious")
-    told = "film.gif: already exists; give another name, or replace the file with force (--force)"
+    told = "film.gif: already exists; give another name, or pass force=True (--force) to overwrite the file"
     refuse("watch --agents full_brake --output film.gif", told)

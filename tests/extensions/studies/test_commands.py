@@ -148,7 +148,7 @@ TUNING = "scenario: paper-random\nrecipe: ppo\nsearch: {%s: {low: 1, high: 4}}\n
         (
             TUNING % "n_epochs",
             "tune --export plan.yaml",
-            "plan.yaml: already exists; give another name, or replace the file with force",
+            "plan.yaml: already exists; give another name, or pass force=True (--force) to overwrite the file",
         ),
     ],
     ids=lambda value: value[:30],
@@ -162,7 +162,7 @@ def test_plan_of_a_study__is_refused(plan: str, line: str, message: str, refuse:
 def test_file_of_worlds__that_is_there_is_not_replaced_unasked(refuse: Refuse) -> None:
     Path("worst.yaml").write_text("precious")
     line = "study falsify --agent coast --budget 100000 --output worst.yaml"
-    refuse(line, "worst.yaml: already exists; give another name, or replace the file with force (--force)")
+    refuse(line, "worst.yaml: already exists; give another name, or pass force=True (--force) to overwrite the file")
 
 
 STORY = Path(__file__).parent / "printed" / "searches.txt"
