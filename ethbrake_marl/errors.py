@@ -190,7 +190,7 @@ class PhysicsError(EthBrakeError, ArithmeticError):
     failed worlds (``physics.left_out.leaving_out_failed``).
 
     Args:
-        worlds: row of each failed world in the batch -> reason of the failure.
+        worlds: mapping from the row (in the batch) of each failed world to the reason of its failure.
 
     """
 
@@ -204,7 +204,7 @@ class PhysicsError(EthBrakeError, ArithmeticError):
         return one_line("; ".join([*named, f"and {count_of(more, 'more world')}"] if more else named))
 
     def renumbered(self, rows: Sequence[int] | NDArray[np.int64]) -> PhysicsError:
-        """Return this error with the row numbers of a larger batch, in which world k of this batch is ``rows[k]``."""
+        """Return this error with its rows in a larger batch, whose row ``rows[k]`` is row k of this batch."""
         return PhysicsError({int(rows[row]): reason for row, reason in self.worlds.items()})
 
 
@@ -212,8 +212,8 @@ class AgentFailed(InvalidInput):
     """A user's agent raised an exception or returned no valid actions; the message names the agent, world and step.
 
     Args:
-        agent: name of the agent.
-        row: row of the world in the batch; None if it is unknown.
+        agent: name of the agent that failed.
+        row: row of the world in the batch in which the agent failed; None if the row is unknown.
         reason: what went wrong, and at which step.
 
     """
@@ -227,7 +227,7 @@ class AgentFailed(InvalidInput):
         return one_line(f"agent {self.agent!r}{where}, {self.reason}")
 
     def renumbered(self, rows: Sequence[int] | NDArray[np.int64]) -> AgentFailed:
-        """Return this error with the row number of a larger batch, in which world k of this batch is ``rows[k]``."""
+        """Return this error with its row in a larger batch, whose row ``rows[k]`` is row k of this batch."""
         return AgentFailed(self.agent, None if self.row is None else int(rows[self.row]), self.reason)
 
     @staticmethod
@@ -263,7 +263,7 @@ def renumbered(rows: Sequence[int] | NDArray[np.int64]) -> Iterator[None]:
 
 
 class UncertifiedStep(EthBrakeError):
-    """The engine's step differs from the step that the shield certified; the engine did not make the step."""
+    """The engine's step differs from the step that the shield certified, so the step is undone."""
 
 
 def new_name(name: object, known: Collection[str]) -> str | None:
@@ -279,9 +279,9 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
     """Return the error for an unknown name; its message shows the new name, a similar name, or all known names.
 
     Args:
-        kind: what the name should be a name of, for example ``scenario``.
+        kind: kind of thing that is searched, for example ``scenario``.
         name: the unknown name.
-        known: the known names.
+        known: all names that exist, among which a similar name is searched.
         may_be_own: true if users can register names of this kind. The message then says that a name of the user's own
             must first be registered or installed.
 

@@ -158,7 +158,7 @@ def tell_compilation(folder: Path, empty: bool) -> None:
 
     Args:
         folder: folder in which compiled kernels are stored; a temporary folder is deleted at the end.
-        empty: whether the folder was empty before.
+        empty: True if this process has not loaded any kernel from this folder.
 
     """
     once = "the physics for the first time, which takes minutes" if empty else "parts of the physics for the first time"

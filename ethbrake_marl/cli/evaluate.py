@@ -198,7 +198,7 @@ def _evaluate_group(
     Args:
         out: object that prints the output of the command.
         output: folder for the results as JSON; None: do not write them.
-        group: the scenarios, each with its controlled vehicles.
+        group: the scenarios in which the agents are evaluated, each with its controlled vehicles.
         agents: names of agents, with commas between them.
         episodes: number of worlds of each scenario; None: ``GROUP_EPISODES``.
         seed: seed of the evaluation lists; None: the default seed.
@@ -316,7 +316,7 @@ def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: f
 
 
 def _moving(rows: Sequence[evaluation.SummaryRow]) -> dict[str, int]:
-    """Return the number of worlds in which some vehicle still moves at the horizon, for each agent with a shield.
+    """Return, for each agent with a shield, in how many worlds at least one vehicle still moves at the horizon.
 
     ``rows``: rows of the results table, one per agent.
     """
@@ -367,9 +367,10 @@ def shield_command(
 
     Each agent runs in the same worlds without a shield, with the shield in episode mode, and with the shield in step
     mode. A team of several learners runs without a shield, with the shield in step mode, and with that shield plus
-    caps. Name the agents without a shield: full_brake, not full_brake+step. The shield bounds first-impact harm, or
-    total harm with --set harm_count=total. For each action that step mode replaced, the table says what harm the
-    replaced action would have caused: more (the replacement was needed), the same (harmless) or less (costly).
+    caps. Write the names of the agents without a shield: full_brake, not full_brake+step. The shield bounds
+    first-impact harm, or total harm with --set harm_count=total. For each action that step mode replaced, the table
+    says what harm the replaced action would have caused: more (the replacement was needed), the same (harmless) or less
+    (costly).
     """
     with Out(as_json=as_json) as out:
         task = read_task(scenario, settings)

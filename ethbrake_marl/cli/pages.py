@@ -16,9 +16,10 @@ def register_page(shows: str, write: Callable[..., None]) -> None:
 
     Args:
         shows: subject of the page: ``"evaluation"`` (``evaluate --report``) or ``"worlds"`` (``scenario sample``).
-        write: function that writes the page. Its arguments are, for ``"evaluation"``, the path of the file, the
-            evaluation, the results table and the agents by name; for ``"worlds"``, the path of the file, the scenario
-            and the sample. The calls in ``cli.evaluate`` and ``cli.scenario`` show the keyword arguments of ``write``.
+        write: function that writes the page. The arguments of ``write`` are, for ``"evaluation"``, the path of the
+            file, the evaluation, the results table and the agents by name; for ``"worlds"``, the path of the file, the
+            scenario and the sample. The calls in ``cli.evaluate`` and ``cli.scenario`` show the keyword arguments of
+            ``write``.
 
     """
     PAGES.add(shows, write, lambda other: other is write)

@@ -175,7 +175,7 @@ class Sheet:
         return replace(self, columns=[self.columns[k] for k in names], rows=rows)
 
     def filled(self) -> list[int]:
-        """Return the indices of the columns in which some row has a value; all indices if there are no rows."""
+        """Return the indices of the columns in which some row has a value; all indices if the table has no rows."""
         rows = [row for row in self.rows if not isinstance(row, str)]
         return [
             k for k in range(len(self.columns)) if not rows or any(k < len(row) and row[k] is not None for row in rows)
@@ -347,7 +347,8 @@ def parquet_file(
 
     Args:
         path: path of the new file.
-        told: function that is called at the end of the block and returns metadata for the file; None: no metadata.
+        told: function that is called at the end of the ``with`` block and returns metadata (key -> text) for the
+            Parquet file; None: no metadata.
         **options: options of ``pyarrow.parquet.ParquetWriter``.
 
     """

@@ -54,7 +54,7 @@ class Actor:
         return chosen
 
     def take(self, number: NDArray[np.int64], x: Float32s) -> Float32s:
-        """Return the action of the choice ``number`` for each observation, [1, rows].
+        """Return for each observation the action that belongs to the index in ``number``, [1, rows].
 
         Args:
             number: index of the choice for each observation, [rows]. The first indices (0, 1, ...) choose a policy in

@@ -82,7 +82,7 @@ class Policy:
 
     @property
     def drivers(self) -> dict[str, Policy]:
-        """The policy itself, by the name of each vehicle that it learned to control: ``{"vehicle_2": policy}``."""
+        """Mapping from each vehicle that this policy learned to control to the policy: ``{"vehicle_2": policy}``."""
         return dict.fromkeys(self.manifest.learners, self)
 
     @classmethod
@@ -94,7 +94,7 @@ class Policy:
         Args:
             tensors: weights and biases by name, see ``NetworkSpec.tensors``.
             observation: the observation that is the input of the networks.
-            **manifest: the other fields of ``Manifest``; ``versions`` defaults to the installed versions.
+            **manifest: values of the other fields of ``Manifest``; ``versions`` defaults to the installed versions.
 
         Raises ``InvalidInput`` naming the invalid tensor or field.
 

@@ -12,15 +12,15 @@ message periods during which a burst of losses destroys every message. In each p
 p, and an ongoing burst ends with probability r. In the stationary state of this Gilbert-Elliott channel ``P(k >= m) =
 (p / (p + r)) (1 - r)^(m - 1)`` for m = 1, 2, ... With probability ``lost`` no message ever arrives on a link. A
 vehicle's sensors see its direct neighbours after a delay, called a *hop*, which is drawn from the range ``sensing_s``.
-Vehicle i can react to the emergency from this time on:
+Vehicle i can react to the emergency from the time ``latency_i`` (in s after the alert) on:
 
     latency_i = max(own latency_i, min(tau_i1, latency_(i-1) + hop_(i, i-1)))
 
-Before this time vehicle i has neither received the message of Vehicle 1 nor seen the vehicle ahead brake. Vehicle i
-knows the state of vehicle j from ``max(latency_i, tau_ij)`` on. If vehicle i also sees vehicle j, it knows the state of
-vehicle j from ``max(latency_i, min(tau_ij, hop_ij))`` on. If a vehicle observes another vehicle's latency, it observes
-the *own* latency of that vehicle, which does not include delays of the channel. Under the preset ``paper`` a vehicle
-knows everything as soon as its own latency has elapsed.
+At the time ``latency_i`` the own latency of vehicle i has elapsed, and vehicle i has received the message of Vehicle 1
+or seen the vehicle ahead brake. Vehicle i knows the state of vehicle j from ``max(latency_i, tau_ij)`` on. If vehicle i
+also sees vehicle j, it knows the state of vehicle j from ``max(latency_i, min(tau_ij, hop_ij))`` on. If a vehicle
+observes another vehicle's latency, it observes the *own* latency of that vehicle, which does not include delays of the
+channel. Under the preset ``paper`` a vehicle knows everything as soon as its own latency has elapsed.
 
 With ``persistence: first``, vehicle i knows the present state of vehicle j after the first message. With ``persistence:
 periodic``, vehicle j sends a message in every period T, and the same Gilbert-Elliott channel may lose it. Vehicle i
@@ -91,7 +91,7 @@ class Equipped(NamedTuple):
 
     @property
     def unheard(self) -> Bools:
-        """Whether vehicle i (second axis) never receives a message from vehicle j (third axis), [n, N, N]."""
+        """Mask [n, N, N]: True where vehicle i (second axis) never receives a message from vehicle j (third axis)."""
         receiver, sender = np.indices((self.sends.shape[1],) * 2)
         hears = self.hears[:, :, np.newaxis]
         unheard: Bools = ~self.sends[:, np.newaxis] | (hears == 2) | ((hears == 1) & (sender >= receiver))
@@ -119,7 +119,7 @@ class Channel(NamedTuple):
     tells: Tells | None = None  # items of PIECES that a message contains; None: USUAL_PIECES
 
     def contents(self, vehicles: int) -> Bools | None:
-        """Return whether the messages of each vehicle contain each item of ``PIECES``, [N, len(PIECES)].
+        """Return a mask [N, len(PIECES)]: True where the messages of a vehicle contain an item of ``PIECES``.
 
         Return None if ``tells`` is not given; messages then contain the items in ``USUAL_PIECES``.
         """
@@ -181,7 +181,7 @@ Preset = Annotated[str, AfterValidator(_known_preset), _PresetSchema]
 
 
 def _pieces(value: Any) -> Tells | None:
-    """Check the value of ``tells``, and return its items in the order of ``PIECES``.
+    """Check the value of the key ``tells`` (what messages contain); return its items in the order of ``PIECES``.
 
     ``value``: list of the items that messages contain (for all vehicles), or a mapping from vehicle names to such
     lists.
@@ -316,7 +316,7 @@ class V2X(FileModel):
 
     @property
     def channel(self) -> Channel:
-        """The channel: the values of the preset, replaced by the settings that are given."""
+        """The channel that ``v2x`` describes: the values of the preset, except where ``v2x`` gives another value."""
         values = {name: getattr(self, name) for name in Channel._fields[1:] if getattr(self, name) is not None}
         base = CHANNELS[self.preset]
         return base._replace(timing="fixed" if self.link_latency_s is not None else base.timing, **values)
@@ -333,7 +333,7 @@ class V2X(FileModel):
 
     @property
     def drawn(self) -> bool:
-        """Whether the channel is random: what vehicles know, and when, differs from world to world."""
+        """True if random numbers determine what vehicles know, or when they know it."""
         channel = self.channel
         low, high = channel.sensing_s
         by_messages = channel.timing == "messages" and channel.hears != "none"
@@ -346,7 +346,7 @@ class V2X(FileModel):
 
         Args:
             own_latency_s: upper bounds of the vehicles' own latencies, without delays of the channel, [N] s.
-            equipped: least V2X equipment of the vehicles in any world, [1, N].
+            equipped: for each vehicle, the least V2X equipment that the vehicle has in any world, [1, N].
 
         """
         channel, latest = self.channel, own_latency_s.copy()
@@ -372,7 +372,7 @@ class V2X(FileModel):
 
         Args:
             vehicles: parameters of the vehicles in n worlds.
-            u: uniform numbers in [0, 1) for the links, [n, N * N * PER_LINK].
+            u: uniform numbers in [0, 1) that draw the random values of all links, [n, N * N * PER_LINK].
             equipped: V2X equipment, one row per world or one row for all worlds.
 
         """
@@ -387,12 +387,13 @@ class V2X(FileModel):
         return replace(vehicles, latency_s=latency, known_from_s=known)
 
     def heard_and_seen(self, u: Floats, equipped: Equipped) -> tuple[Floats, Floats]:
-        """Return (heard, seen): when vehicle i can use the first message of vehicle j, and the delay of seeing j.
+        """Return (heard, seen): the time from which i can use the first message of j, and the delay until i sees j.
 
-        Both arrays have the shape [n, N, N] (world, i, j) and the unit s. Infinite means never.
+        Here i and j are vehicles; ``heard`` and ``seen`` have the shape [n, N, N] (world, i, j) and the unit s.
+        Infinite means never.
 
         Args:
-            u: uniform numbers in [0, 1) for the links, [n, N * N * PER_LINK].
+            u: uniform numbers in [0, 1) that draw the random values of all links, [n, N * N * PER_LINK].
             equipped: V2X equipment, one row per world or one row for all worlds.
 
         """
@@ -412,9 +413,10 @@ class V2X(FileModel):
         """Return ``worlds`` with the times from which each vehicle knows the others, and the data of periodic messages.
 
         Args:
-            worlds: worlds without a channel, at the alert (time 0).
-            u: uniform numbers in [0, 1) for the links, [n, N * N * PER_LINK].
-            key: seed of the losses of all messages after the first one, a number in [0, 1) for each world, [n].
+            worlds: worlds at the alert (time 0) that do not contain data of a channel yet.
+            u: uniform numbers in [0, 1) that draw the random values of all links, [n, N * N * PER_LINK].
+            key: number in [0, 1) for each world, [n], from which the random losses of all messages after the first one
+                are computed.
             time_step_s: time between two decisions (s); vehicles sample their states at each decision.
             equipped: V2X equipment, one row per world or one row for all worlds.
 
@@ -436,7 +438,7 @@ class V2X(FileModel):
         """Return the user's ``worlds`` with this channel's data added; raise ``InvalidInput`` if the channel is random.
 
         Args:
-            worlds: worlds without a channel.
+            worlds: worlds that do not contain data of a channel yet.
             time_step_s: time between two decisions (s).
             where: beginning of the error message, which says where the user gave the worlds.
             equipped: V2X equipment of the vehicles, one row for all worlds; None if the equipment is random.
@@ -456,9 +458,9 @@ class V2X(FileModel):
 def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
     """Return the number k of message periods that a burst of losses lasts, in the shape of ``u``.
 
-    The result k is at least m exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``. This rule is the inverse of the
-    distribution function of k in the stationary Gilbert-Elliott channel. k is computed without logarithms, so every
-    machine gets the same k.
+    For m = 1, 2, ..., the result k is at least m exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``. This rule is the
+    inverse of the distribution function of k in the stationary Gilbert-Elliott channel. k is computed without
+    logarithms, so every machine gets the same k.
 
     Args:
         u: uniform numbers in [0, 1).

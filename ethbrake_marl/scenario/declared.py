@@ -242,7 +242,7 @@ class ScenarioFields(FileModel):
     @field_validator(*QUANTITY.declared)
     @classmethod
     def _entries(cls, value: Any, info: ValidationInfo) -> Any:
-        """Check that all possible values of a quantity are in range, and that a list has the required length."""
+        """Check that all possible values of a quantity are in range, and that a list has one per vehicle or pair."""
         rule, vehicles = QUANTITY.declared[str(info.field_name)], info.data.get("vehicles")
         if value is None:
             return value
@@ -323,7 +323,7 @@ class ScenarioFields(FileModel):
         return {i: role for i, role in enumerate(roles) if role != LEARNER}
 
     def play_pieces(self, worlds: Worlds, driven: Sequence[int] = ()) -> Worlds:
-        """Return ``worlds`` with the fixed command sequence of each vehicle that follows a ``profile`` script.
+        """Return ``worlds`` with the commands over time of each vehicle that follows a ``profile`` script.
 
         ``driven``: indices (from 0) of controlled vehicles, which follow no script.
         """
@@ -367,14 +367,14 @@ class ScenarioFields(FileModel):
 
     @property
     def recordings(self) -> TableColumn | None:
-        """Table column with the name of each row's recording; None without such a column, and for a mixture."""
+        """Column of the table that names each row's recording; None for a mixture, or without such a column."""
         return self._recordings
 
     @property
     def by_link(self) -> bool:
         """Whether ``v2x`` differs from the paper's rule (a vehicle knows everything once its own latency has elapsed).
 
-        For a mixture: whether ``v2x`` differs from this rule in at least one of the scenarios.
+        For a mixture: whether ``v2x`` differs from the paper's rule in at least one of the scenarios.
         """
         return any(member.by_link for member in self.members) or self.v2x.by_link
 
@@ -508,8 +508,8 @@ def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]
 def on_road(found: Mapping[str, Floats]) -> dict[str, Floats]:
     """Return ``found`` with all braking and driving capacities limited to friction times gravity.
 
-    ``found`` maps keys such as ``"friction"`` and ``"braking_capacity_mps2"`` to values, [k, entries]. If the key
-    ``"friction"`` is missing, the capacities are not limited.
+    ``found`` maps keys such as ``"friction"`` and ``"braking_capacity_mps2"`` to values, [k, entries]. If ``found`` has
+    no key ``"friction"``, the capacities are not limited.
     """
     return as_road_allows(found, found["friction"]) if "friction" in found else dict(found)
 

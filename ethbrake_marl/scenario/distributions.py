@@ -117,7 +117,7 @@ class Normal(_Distribution):
         return self
 
     def _bounds(self) -> tuple[float, float]:
-        """Return the probabilities that a value of the untruncated distribution is below low, and below high."""
+        """Return the probabilities that a value before truncation is below ``low``, and that it is below ``high``."""
         shape = self.normal
         low, high = (normal_probability((end - shape.mean) / shape.sd) for end in (shape.low, shape.high))
         return low, high
@@ -130,9 +130,9 @@ class Normal(_Distribution):
     def value(self, u: Floats) -> Floats:
         """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
 
-        A value is ``mean + sd Q(p_low + (p_high - p_low) u)``. Q is the quantile function of the standard normal
-        distribution; p_low and p_high are the probabilities that the untruncated distribution gives a value below low,
-        and below high.
+        A value is ``mean + sd Q(p_low + (p_high - p_low) u)``, where Q is the quantile function of the standard normal
+        distribution. p_low and p_high are the probabilities that a value before truncation is below ``low``, and below
+        ``high``.
         """
         shape = self.normal
         below, above = self._bounds()
@@ -230,7 +230,7 @@ class TableColumn:
 
     @property
     def middle(self) -> TableColumn:
-        """A column with a single row, which contains the weighted median of this column."""
+        """This column reduced to a single row, the weighted median of all rows."""
         order = np.argsort(self.rows, kind="stable")
         shares = np.cumsum(np.diff(self.cumulative, prepend=0.0)[order])
         return replace(self, rows=self.rows[order][[np.searchsorted(shares, 0.5)]], cumulative=np.ones(1))

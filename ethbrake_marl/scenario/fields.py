@@ -83,7 +83,7 @@ class QuantityRule:
         return {"vehicle": vehicles, "pair": vehicles - 1, "world": 1}[self.per]
 
     def place(self, index: int) -> Place:
-        """Return (stream, column) of the uniform number that draws the value of vehicle or pair ``index`` (from 0)."""
+        """Return (stream, column) of the random number that draws the value of vehicle or pair ``index`` (from 0)."""
         return self.stream, BLOCK * (self.block + index) + self.slot
 
     def column_of(self, index: int) -> str:
@@ -267,7 +267,7 @@ Entry = tuple[str, int]  # quantity and index (from 0) of the vehicle or pair
 
 
 def columns_of_table(rules: Mapping[str, QuantityRule], vehicles: int) -> dict[str, Entry]:
-    """Return the columns of a table with these quantities: name -> (quantity, index).
+    """Return the columns of a table that has the quantities in ``rules``: column name -> (key of the quantity, index).
 
     An example is ``{"gap_1_m": ("gaps_m", 0), ...}``.
 

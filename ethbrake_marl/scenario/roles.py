@@ -93,7 +93,7 @@ class ScriptSpec(NamedTuple):
     def is_state_free(self) -> bool:
         """Return whether the script does not need the state: ``full_brake``, ``coast``, ``constant:a`` or a profile.
 
-        Raises ``InvalidInput`` if the argument of one of these scripts is missing, invalid or not allowed.
+        Raises ``InvalidInput`` if the argument of such a script is missing, invalid or not allowed.
         """
         if self.name == _PROFILE:
             return len(self.pieces) > 0

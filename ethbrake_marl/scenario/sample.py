@@ -28,7 +28,7 @@ def clusters_of(kinds: Mapping[str, _Texts], index: Ints) -> _Texts | None:
     if they show different vehicles. In a mixture, a world without a recording is a cluster of its own.
 
     Args:
-        kinds: texts about the worlds by name, [n] each, such as ``Sample.kinds``.
+        kinds: texts about each world, such as ``Sample.kinds``: name of the column -> texts, [n].
         index: number of each world in its list, [n].
 
     """
@@ -70,8 +70,8 @@ class Sample:
     def join(parts: Sequence[Sample], rejected: int) -> Sample:
         """Join samples into one, in the order of their world numbers.
 
-        Vehicle types must be given in all of ``parts`` or in none, and so must scenarios and recordings. ``rejected``:
-        number of rejected draws, which becomes ``Sample.rejected``.
+        Either all samples in ``parts`` or none must have vehicle types; the same applies to scenarios and to
+        recordings. ``rejected``: number of rejected draws, which becomes ``Sample.rejected``.
         """
         index = np.concatenate([part.index for part in parts])
         order = np.argsort(index)

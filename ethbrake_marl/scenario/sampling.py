@@ -108,7 +108,7 @@ def middle_world(scenario: ScenarioFields) -> Worlds:
 
 
 def sample_by(scenario: ScenarioFields, numbers: Callable[[int, tuple[int, ...]], Floats], index: Ints) -> Sample:
-    """Return the worlds drawn with uniform numbers from ``numbers``; worlds with early impacts are not rejected.
+    """Return the worlds drawn with the random numbers that ``numbers`` returns; keep worlds with early impacts.
 
     Args:
         scenario: the scenario to draw from; it must not be a mixture.
@@ -223,7 +223,7 @@ def _draw_numbers(scenario: ScenarioFields, index: Ints, seed: int, channel: Cha
 
 
 def early_impact(scenario: ScenarioFields, worlds: Worlds) -> Bools:
-    """Return whether each world has an impact no later than the time at which the first learner can act, [n].
+    """Return for each world whether an impact happens no later than the time at which the first learner can act, [n].
 
     No learner can prevent such an impact: until that time learners coast and the other vehicles follow their scripts.
     Raises ``InvalidInput`` if a script depends on the state. The scenario must have a learner.
@@ -253,7 +253,7 @@ def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, drawn: Sample
         seed: seed of the list.
         channel: ``"list"`` or ``"training"``.
         drawn: all worlds as drawn in the first attempt.
-        early: whether each world in ``drawn`` is rejected for an early impact, [n].
+        early: mask [n]: True for each world in ``drawn`` that is rejected because of an early impact.
 
     """
     parts, pending, rejected = [drawn.take(~early)], drawn.index[early], int(early.sum())
@@ -293,10 +293,10 @@ def _unusable(scenario: ScenarioFields, world: int) -> InvalidInput:
 
 
 def _draw(scenario: ScenarioFields, seed: int, channel: Channel, attempt: int, index: Ints) -> Sample:
-    """Draw the worlds whose numbers are ``index`` (ascending, [n]) once; early impacts are not rejected.
+    """Draw each world whose number is in ``index`` (ascending, [n]) once; keep worlds that have an early impact.
 
-    ``attempt``: number of the draw, from 0; every attempt uses other random numbers. ``seed`` and ``channel`` have the
-    same meaning as in ``sample``.
+    ``attempt``: number of earlier draws of these worlds; every attempt uses other random numbers. ``seed`` and
+    ``channel`` have the same meaning as in ``sample``.
     """
     first, last = int(index[0]), int(index[-1])
 

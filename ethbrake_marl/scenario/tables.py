@@ -65,7 +65,7 @@ def _worlds(given: Mapping[Entry, Floats], scenario: ScenarioFields, naming: _Na
     Raises ``InvalidInput`` for a value out of range, and for a random quantity without a column.
 
     Args:
-        given: values of each column, [n], by (key of the quantity, index of the vehicle or pair).
+        given: mapping from (key of the quantity, index of the vehicle or pair) to the values in the n worlds, [n].
         scenario: the scenario that the worlds belong to.
         naming: whether error messages name a value by column and row, or by key and index.
 
