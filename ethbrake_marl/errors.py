@@ -214,7 +214,7 @@ class AgentFailed(InvalidInput):
     Args:
         agent: name of the agent that failed.
         row: row of the world in the batch in which the agent failed; None if the row is unknown.
-        reason: what went wrong, and at which step.
+        reason: what the agent did wrong, and at which step.
 
     """
 
@@ -282,8 +282,8 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
         kind: kind of thing that is searched, for example ``scenario``.
         name: the unknown name.
         known: all names that exist, among which a similar name is searched.
-        may_be_own: true if users can register names of this kind. The message then says that a name of the user's own
-            must first be registered or installed.
+        may_be_own: true if users can register names of this kind. If ``may_be_own`` is true, the message says that a
+            name of the user's own must first be registered or installed.
 
     """
     names = sorted(known)

@@ -174,7 +174,7 @@ class Out:
         Args:
             path: path of the file; None: no file was requested, and nothing is checked.
             endings: allowed endings of the file's name, such as ``.csv``; if none is given, every ending is allowed.
-            what: words in the error message for the content of the file.
+            what: name of the file's content in the error message, for example ``worlds``.
 
         """
         if path is None:

@@ -220,7 +220,7 @@ def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str
     a message.
 
     Args:
-        training: whether to call also ``ethbrake run``, which needs torch.
+        training: True: also call ``ethbrake run``, which needs torch.
         run_alone: True: call only the single command that compiles nearly all kernels of ``ethbrake run``.
 
     """

@@ -107,9 +107,10 @@ def evaluate_command(
 
     `ethbrake agent list` shows all agents; the name ladder is short for all agents from coast to best_harm in this
     list. A name can be followed by +search and by one shield, +episode or +step; for instance full_brake+step or
-    ppo@PATH+search+episode, where PATH is a run or a policy bundle. The shield +robust needs an uncertainty, which can
-    be set only in Python; +robust:estimated does not need one. With --set harm_count=total, agents minimise total harm
-    instead of first-impact harm. --set measures=injury,my_file.py:worst adds these measures to the results.
+    ppo@PATH+search+episode, where PATH is a run or a policy bundle. The shield +robust needs the description of an
+    uncertainty, which can be given only in Python; +robust:estimated needs no description. With --set harm_count=total,
+    agents minimise total harm instead of first-impact harm. --set measures=injury,my_file.py:worst adds these measures
+    to the results.
     """
     from ethbrake_marl.agents.spec import split_specs
 
@@ -168,7 +169,7 @@ def _evaluate_long_list(
 
     Args:
         out: object that prints the output of the command.
-        lineup: the agents to evaluate, and the scenario.
+        lineup: the agents to evaluate, and the scenario whose evaluation list is used.
         episodes: number of worlds in the evaluation list.
         seed: seed of the evaluation list.
         jobs: number of parallel processes; None: one process.
@@ -298,12 +299,12 @@ def _json_text(content: object) -> str:
 
 
 def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: float) -> None:
-    """Print in how many worlds some vehicle still moves at the horizon, if there are such worlds.
+    """Print in how many worlds at least one vehicle still moves at the horizon, if there are such worlds.
 
     Args:
         out: object that prints the output of the command.
-        moving: number of worlds in which some vehicle still moves at the horizon, by name of each agent with a shield.
-        worlds: number of all worlds.
+        moving: for each agent with a shield, number of worlds in which at least one vehicle still moves at the horizon.
+        worlds: number of all evaluated worlds.
         horizon_s: time of the horizon (s).
 
     """

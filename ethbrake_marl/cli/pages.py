@@ -1,4 +1,4 @@
-"""Registry of the functions that draw pages and pictures for commands. Extensions register these functions."""
+"""Registry of the functions that draw pages and pictures for commands. Extensions register such functions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from ethbrake_marl.registry import Registry
 def register_page(shows: str, write: Callable[..., None]) -> None:
     """Register the function that a command calls to write its page (a report) or its picture.
 
-    An installed package registers such a function with an entry point of the group ``ethbrake_marl.pages``.
+    An installed package registers a function that writes pages with an entry point of the group
+    ``ethbrake_marl.pages``.
 
     Args:
         shows: subject of the page: ``"evaluation"`` (``evaluate --report``) or ``"worlds"`` (``scenario sample``).

@@ -25,14 +25,14 @@ WIDE = 120  # smallest width of a terminal (characters) in which every column is
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """An estimate and its confidence interval; the interval is None if it cannot be computed (a single world)."""
+    """An estimate and its confidence interval; the interval is None if it cannot be computed (from one world)."""
 
     value: float  # estimated value
     interval: tuple[float, float] | None  # low and high end of the confidence interval
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Low and high end of the interval; both equal the value if there is no interval."""
+        """Low and high end of the confidence interval; both equal the value if there is no interval."""
         return self.interval or (self.value, self.value)
 
     def in_words(self, *, digits: int = 2, scale: float = 1.0, unit: str = "") -> str:
@@ -54,7 +54,7 @@ class Estimate:
     def side_by_side(estimates: Mapping[str, Estimate | None]) -> dict[str, Any]:
         """Convert estimates to a dictionary for JSON: ``{"x": 1.5, "x_interval": [1.0, 2.0]}``.
 
-        If the estimate ``x`` is None, ``x`` and ``x_interval`` are None.
+        If the estimate ``x`` is None, both ``x`` and ``x_interval`` are None in the dictionary.
         """
         cells: dict[str, Any] = {}
         for name, estimate in estimates.items():
@@ -184,8 +184,8 @@ class Sheet:
     def rich(self, width: int = WIDE) -> RenderableType:
         """Return the table, with the note below, as an object of ``rich`` for a terminal of ``width`` characters.
 
-        In a cell with several lines of text, all but the first line are dim. Columns marked ``wide`` are omitted if
-        ``width`` is below ``WIDE``.
+        In a cell with several lines of text, all but the first line are dim. Columns whose field ``wide`` is True are
+        omitted if ``width`` is below ``WIDE``.
         """
         from rich import box
         from rich.console import Group

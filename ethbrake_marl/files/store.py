@@ -55,10 +55,11 @@ def check_writable(folder: Path) -> None:
 
 
 def check_target(path: str | Path, *, force: bool = False) -> Path:
-    """Check that a file can be written to ``path``; return ``path`` as a ``Path``. For use before a long computation.
+    """Check that a file can be written to ``path``; return ``path`` as a ``Path``.
 
-    Raises ``AlreadyExists`` if the file exists and ``force`` is False. Raises ``InvalidInput`` if the file cannot be
-    written, or if ``path`` is a folder, device, pipe or symbolic link, which ``force`` does not replace.
+    Call this function before a long computation, so that the result can be written afterwards. Raises ``AlreadyExists``
+    if the file exists and ``force`` is False. Raises ``InvalidInput`` if the file cannot be written, or if ``path`` is
+    a folder, device, pipe or symbolic link, which ``force`` does not replace.
     """
     target = Path(path)
     try:

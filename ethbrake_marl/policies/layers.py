@@ -61,8 +61,8 @@ def dense(weight: Float32s, bias: Float32s, x: Float32s, y: Float32s) -> None:
     Args:
         weight: weights of K inputs and O outputs, [O, K].
         bias: bias of each output, [O].
-        x: inputs, [K, rows].
-        y: receives the outputs, [O, rows].
+        x: inputs of the layer, one column per observation, [K, rows].
+        y: array to which the outputs of the layer are written, [O, rows].
 
     """
     inputs = weight.shape[1]

@@ -1,4 +1,4 @@
-"""The channel between vehicles: V2X messages on each link, losses, and sensors that see the neighbours.
+"""The channel between vehicles: V2X messages on each link, losses of messages, and sensors that see the neighbours.
 
 A link is the direction from a sending vehicle j to a receiving vehicle i. A message contains the sender's place, speed,
 acceleration, braking capacity, latency and mass, or the items listed in ``tells``. Vehicle i can use the first message
@@ -24,7 +24,7 @@ channel. Under the preset ``paper`` a vehicle knows everything as soon as its ow
 
 With ``persistence: first``, vehicle i knows the present state of vehicle j after the first message. With ``persistence:
 periodic``, vehicle j sends a message in every period T, and the same Gilbert-Elliott channel may lose it. Vehicle i
-then knows the state of vehicle j in the newest message that arrived (``physics.messages``).
+then knows that state of vehicle j which the newest message that arrived contains (``physics.messages``).
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class Equipage(FileModel):
 class Equipped(NamedTuple):
     """V2X equipment of the vehicles in n worlds.
 
-    The arrays have a single row (n = 1) if all worlds have the same equipment, or if the row describes the least
+    The arrays have a single row (n = 1) if all worlds have the same equipment, or if the row contains the least
     equipment that each vehicle has in any world.
     """
 
@@ -365,10 +365,10 @@ class V2X(FileModel):
         return PER_LINK * vehicles * vehicles
 
     def with_news(self, vehicles: Vehicles, u: Floats, equipped: Equipped) -> Vehicles:
-        """Return ``vehicles`` with the channel's effect on latencies, and the times from which each knows the others.
+        """Return ``vehicles`` with the channel's delays in the latencies, and times from which each knows the others.
 
-        The latencies in the argument ``vehicles`` must not include delays of a channel; they become ``own_latency_s``
-        of the result.
+        The argument ``vehicles`` must contain latencies without delays of a channel; these latencies become
+        ``own_latency_s`` of the result.
 
         Args:
             vehicles: parameters of the vehicles in n worlds.
@@ -410,7 +410,7 @@ class V2X(FileModel):
         return heard, np.where(in_sight[channel.senses], hop, np.inf)
 
     def with_channel(self, worlds: Worlds, u: Floats, key: Floats, time_step_s: float, equipped: Equipped) -> Worlds:
-        """Return ``worlds`` with the times from which each vehicle knows the others, and the data of periodic messages.
+        """Return ``worlds`` with the times from which each vehicle knows the others, and with the periodic messages.
 
         Args:
             worlds: worlds at the alert (time 0) that do not contain data of a channel yet.
@@ -441,7 +441,8 @@ class V2X(FileModel):
             worlds: worlds that do not contain data of a channel yet.
             time_step_s: time between two decisions (s).
             where: beginning of the error message, which says where the user gave the worlds.
-            equipped: V2X equipment of the vehicles, one row for all worlds; None if the equipment is random.
+            equipped: V2X equipment of the vehicles, in one row for all worlds; None if the equipment differs randomly
+                between worlds.
 
         """
         if not self.by_link:

@@ -318,7 +318,7 @@ class ScenarioFields(FileModel):
 
     @property
     def scripts(self) -> dict[int, str]:
-        """Scripts of the vehicles that do not learn: vehicle index (from 0) -> script."""
+        """Scripts of the vehicles that do not learn: index of the vehicle (from 0) -> name of its script."""
         roles = [self.roles[name] for name in self.vehicle_names]
         return {i: role for i, role in enumerate(roles) if role != LEARNER}
 
@@ -405,7 +405,7 @@ class ScenarioFields(FileModel):
         return Equipped(np.stack(sends, axis=1), np.stack(hears, axis=1))
 
     def possible_quantities(self, field: str) -> tuple[dict[int, AnyTypeQuantity], ...]:
-        """Return the declarations of a quantity by vehicle type, one mapping for each vehicle, pair or world.
+        """Return for each vehicle, pair or world a mapping from vehicle type to the declaration of the quantity.
 
         An example is ``({0: 2.0, 1: 9.5}, ...)`` for ``mass_t``. The keys of a mapping are the indices of the vehicle's
         possible types; without vehicle types the only key is 0. If a vehicle type does not declare the quantity, the
@@ -520,8 +520,8 @@ def obstacle_gap(
     """Return the distance from Vehicle 1 to the obstacle ahead in k worlds, [k] m; None without an obstacle.
 
     A scenario declares either this distance or a margin, the distance from the point where Vehicle 1 stops by full
-    braking to the obstacle. With a margin ``distance = margin + v_1 tau_1 + v_1^2 / (2 a_1)``. Vehicle 1 has the speed
-    v_1, the latency tau_1 and the braking capacity a_1, and its brakes act at once.
+    braking to the obstacle. If a margin is declared, ``distance = margin + v_1 tau_1 + v_1^2 / (2 a_1)``. Vehicle 1 has
+    the speed v_1, the latency tau_1 and the braking capacity a_1, and its brakes act at once.
 
     Args:
         scenario: the scenario that declares the obstacle.

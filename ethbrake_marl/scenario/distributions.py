@@ -205,7 +205,8 @@ class Choice(_Distribution):
     def value(self, u: Floats) -> Floats:
         """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
 
-        A value is the first entry of ``choice`` whose cumulative weight, normalised to a total of 1, is above u.
+        The value for ``u`` is the first entry of ``choice`` whose cumulative weight, normalised to a total of 1, is
+        above ``u``.
         """
         cumulative = np.cumsum(np.asarray(self.weights or (1.0,) * len(self.choice)))
         cumulative /= cumulative[-1]
@@ -230,7 +231,7 @@ class TableColumn:
 
     @property
     def middle(self) -> TableColumn:
-        """This column reduced to a single row, the weighted median of all rows."""
+        """Copy of this column with a single row, which contains the weighted median of all rows."""
         order = np.argsort(self.rows, kind="stable")
         shares = np.cumsum(np.diff(self.cumulative, prepend=0.0)[order])
         return replace(self, rows=self.rows[order][[np.searchsorted(shares, 0.5)]], cumulative=np.ones(1))
@@ -238,7 +239,7 @@ class TableColumn:
     def value(self, u: Floats) -> NDArray[Any]:
         """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
 
-        A value comes from the first row whose cumulative weight, normalised to a total of 1, is above u.
+        The value for ``u`` stands in the first row whose cumulative weight, normalised to a total of 1, is above ``u``.
         """
         return self.rows[np.searchsorted(self.cumulative, u, side="right")]
 

@@ -131,9 +131,9 @@ class Quantities(NamedTuple):
     def of(self, worlds: Worlds) -> dict[str, QuantityRule]:
         """Return the quantities that ``worlds`` have: key -> ``QuantityRule``.
 
-        Of the optional quantities, friction is included if all worlds have it, the distance to an obstacle if some
-        world has an obstacle, brake and release rates if some rate is finite, and the weights of harm if some weight is
-        not 1.
+        The result contains friction only if all worlds have it, the distance to an obstacle only if at least one world
+        has an obstacle, brake and release rates only if at least one rate is finite, and the weights of harm only if at
+        least one weight is not 1.
         """
         there = {"obstacle_gap_m": worlds.obstacle_ahead.any(), "friction": np.isfinite(worlds.friction).all()}
         there["harm_weight"] = (worlds.vehicles.harm_weight != 1.0).any()
@@ -283,7 +283,8 @@ def columns_of_table(rules: Mapping[str, QuantityRule], vehicles: int) -> dict[s
 def is_tabled(data: Mapping[str, Any], key: str) -> bool:
     """Return whether a scenario's table has columns of the quantity ``key`` for every vehicle, pair or world.
 
-    ``data``: scenario fields that have been checked already, by name; only ``table`` and ``vehicles`` are used.
+    ``data``: scenario fields that have been checked already: name of the field -> value; only ``table`` and
+    ``vehicles`` are used.
     """
     table, rule = data.get("table"), QUANTITY.declared[key]
     if table is None or "vehicles" not in data or not rule.column:

@@ -37,7 +37,7 @@ def with_follower(document: Document, build: Callable[[Document], Any]) -> Docum
 
     Args:
         document: parsed file with a key ``follower``.
-        build: function that builds a scenario from a document.
+        build: function that builds a scenario from a document (the parsed content of a file).
 
     """
     content, where = dict(document.content), f"{document.where(('follower',))}: follower"

@@ -79,7 +79,7 @@ def _of_quantities(scenario: ScenarioFields) -> dict[str, Place]:
 
 
 def _of_types(scenario: ScenarioFields) -> dict[str, Place]:
-    """Return which uniform numbers draw vehicle types and loads: name -> (stream of random numbers, column).
+    """Return which uniform numbers draw types and loads: name -> (stream of random numbers, column of the stream).
 
     Random numbers without effect are left out: the number that draws a vehicle's type if only one type is possible, and
     the number that draws its load if no quantity depends on the load.

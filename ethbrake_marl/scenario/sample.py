@@ -41,7 +41,7 @@ def clusters_of(kinds: Mapping[str, _Texts], index: Ints) -> _Texts | None:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """Worlds at the alert (time 0), with their numbers in the list of worlds.
+    """Worlds at the alert (time 0), each with its number in the list of worlds.
 
     >>> import ethbrake_marl as eb
     >>> sample = eb.load_scenario("paper-random").sample(2, seed=7)
@@ -84,7 +84,7 @@ class Sample:
 
     @property
     def kinds(self) -> dict[str, _Texts]:
-        """Columns of text about the worlds, by name: ``scenario``, ``recording``, ``vehicle_1_type`` ..., [n] each.
+        """Columns of text about the worlds: name (``scenario``, ``recording``, ``vehicle_1_type``, ...) -> texts, [n].
 
         The column ``scenario`` exists for a mixture, ``recording`` for a table that names recordings, and
         ``vehicle_1_type`` and so on for a scenario with vehicle types.
@@ -102,8 +102,8 @@ class Sample:
     def count_kinds(self) -> str:
         """Return a text with the number of worlds for each scenario of a mixture and each vehicle type.
 
-        An example is ``"; vehicle_1_type: car 7, truck 3"``. For recordings the text contains only the number of
-        different recordings. The text is empty if the sample has no ``kinds``.
+        An example is ``"; vehicle_1_type: car 7, truck 3"``. For the column ``recording``, the text contains only the
+        number of different recordings. The text is empty if the sample has no ``kinds``.
         """
         text = ""
         for kind, column in self.kinds.items():

@@ -60,7 +60,7 @@ def sample(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, chann
             lists are independent.
 
     Raises ``InvalidInput`` for a negative ``seed`` or ``first``, and for ``n < 1``. If the scenario rejects early
-    impacts, also raises it for a world that has an early impact in each of ``MOST_ATTEMPTS`` draws.
+    impacts, ``InvalidInput`` is also raised for a world that has an early impact in each of ``MOST_ATTEMPTS`` draws.
 
     """
     for name, value, least in (("number of worlds", n, 1), ("seed of the list", seed, 0), ("first world", first, 0)):
@@ -252,7 +252,7 @@ def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, drawn: Sample
         scenario: the scenario to draw from.
         seed: seed of the list.
         channel: ``"list"`` or ``"training"``.
-        drawn: all worlds as drawn in the first attempt.
+        drawn: the sample of all worlds, as drawn in the first attempt.
         early: mask [n]: True for each world in ``drawn`` that is rejected because of an early impact.
 
     """
@@ -272,7 +272,7 @@ def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, drawn: Sample
 
 
 def _redraw_one(scenario: ScenarioFields, seed: int, channel: Channel, index: Ints) -> None:
-    """Raise ``InvalidInput`` if world number ``index`` [1] is rejected in every remaining attempt to draw it.
+    """Raise ``InvalidInput`` if the world with the number ``index`` [1] has an early impact in all remaining attempts.
 
     If a scenario has no acceptable worlds, trying a single world shows this sooner than drawing the whole list.
     ``seed`` and ``channel`` have the same meaning as in ``sample``.
