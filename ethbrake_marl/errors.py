@@ -54,8 +54,8 @@ RENAMED: dict[str, str] = {  # old name -> new name, for messages
 def plain_text(text: str, keep: str = "") -> str:
     """Return ``text`` with unprintable characters written as Python escapes, safe to show in a terminal.
 
-    Control, direction and separator characters are escaped, except the space and the characters in ``keep``. Names and
-    paths from files could otherwise move the cursor or print a line backwards.
+    Control characters, separators and characters that set the direction of text are escaped, except the space and the
+    characters in ``keep``. Names and paths from files could otherwise move the cursor or print a line backwards.
     """
     if text.isprintable():
         return text
@@ -77,7 +77,7 @@ def one_line(text: str) -> str:
 def count_of(n: int, thing: str) -> str:
     """Return the number ``n`` and its noun as text, for example ``1 world`` or ``10,000 worlds``.
 
-    ``thing``: the noun in the singular.
+    ``thing``: the noun in the singular, for example ``world``.
     """
     return f"{n:,} {thing}{'' if n == 1 else 's'}"
 

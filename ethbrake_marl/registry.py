@@ -183,7 +183,7 @@ class Registry(Mapping[str, T]):
             )
 
     def usable(self) -> dict[str, T]:
-        """Load all parts (such as agents) and return those that could be loaded, by name."""
+        """Load all parts of this kind (such as all agents) and return those that could be loaded: name -> part."""
         return {name: self.loaded[name] for name in self if self.why_not(name) is None and name in self.loaded}
 
     def why_not(self, name: str) -> str | None:

@@ -268,7 +268,7 @@ def with_installed(group: Any, name: str) -> Any:
 
     Args:
         group: the command group, a Typer (click) command with subcommands; the function adds commands to it.
-        name: name of the group.
+        name: name of the command group.
 
     """
     for entry in points(COMMANDS.group):

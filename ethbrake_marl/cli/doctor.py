@@ -174,7 +174,7 @@ def _golden_impact() -> tuple[bool, str]:
     """Check the physics: a car at 10 m/s brakes with 5 m/s2, 8 m behind a standing car.
 
     The exact harm, the square of the impact speed, is ``10^2 - 2 * 5 * 8 = 20`` m2/s2. Returns whether the computed
-    harm equals this value, and a text with both.
+    harm equals the exact harm, and a text with both values.
     """
     import numpy as np
 

@@ -194,7 +194,7 @@ def _evaluate_group(
 ) -> None:
     """Evaluate each agent in each scenario of a group, and print a table with a row per agent and scenario.
 
-    The table shows the collision rate, the hardest impact, and mean harm.
+    For each agent and scenario the table shows the collision rate, the hardest impact, and the mean harm.
 
     Args:
         out: object that prints the output of the command.

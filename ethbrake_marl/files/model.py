@@ -55,7 +55,7 @@ UNSHOWN = object()  # passed as a value, means: do not show the value in the err
 
 
 def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
-    """Raise the error for an invalid value in a pydantic validator.
+    """Raise, in a pydantic validator, the error for an invalid value.
 
     Args:
         at: path of the value (keys and indices) inside the checked field; ``()``: the field itself.

@@ -36,7 +36,7 @@ class Estimate:
         return self.interval or (self.value, self.value)
 
     def in_words(self, *, digits: int = 2, scale: float = 1.0, unit: str = "") -> str:
-        """Format value and interval as text: ``24.19 [23.85, 24.53]``.
+        """Format the estimate and its confidence interval as text: ``24.19 [23.85, 24.53]``.
 
         Args:
             digits: number of digits after the decimal point.
@@ -64,14 +64,14 @@ class Estimate:
 
 
 class Shown(NamedTuple):
-    """Text of a table cell: the value, and the interval if the cell is an estimate."""
+    """Text of a table cell: the value, and the confidence interval if the cell is an estimate."""
 
     value: str  # the number, with its unit, or the text
     interval: str = ""  # ``23.85, 24.53``
 
     @property
     def in_words(self) -> str:
-        """Value and interval in one line: ``24.19 [23.85, 24.53]``."""
+        """Value and confidence interval in one line: ``24.19 [23.85, 24.53]``."""
         return f"{self.value} [{self.interval}]" if self.interval else self.value
 
 

@@ -30,7 +30,7 @@ def write_file(path: Path, data: bytes) -> None:
 def new_file(path: Path) -> Iterator[Path]:
     """Context manager: yield the path of a temporary file, which is renamed to ``path`` if the block succeeds.
 
-    If the block raises an error, the temporary file is deleted.
+    If the ``with`` block raises an error, the temporary file is deleted.
     """
     descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=_HIDDEN, suffix=_UNFINISHED)
     os.close(descriptor)

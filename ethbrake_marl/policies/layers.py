@@ -24,7 +24,7 @@ _SMALL = 1e-4  # below this, x - x^3 / 3 is tanh(x) to double precision
 def squash(values: NDArray[np.float32]) -> None:
     """Replace every entry of ``values`` [k, rows] by its hyperbolic tangent, in place.
 
-    The rounding error is little more than half a unit in the last place of a float32.
+    The rounding error of the hyperbolic tangent is little more than half a unit in the last place of a float32.
     """
     for j in range(values.shape[0]):
         row = values[j]

@@ -188,7 +188,7 @@ def _load(path: Path) -> Scenario:
 
 
 def _with_members(document: Document, folder: Path) -> Document:
-    """Return the document with scenarios of a mixture and rows of tables read from the files that it names.
+    """Return the document with the content of the scenario files and CSV files that the document names.
 
     Paths in the document are relative to ``folder``.
     """

@@ -140,7 +140,7 @@ class Channel(NamedTuple):
     def samples(self, time_step_s: float) -> int:
         """Return how many samples of its own state a vehicle stores for its messages; 0 without periodic messages.
 
-        ``time_step_s``: time between two decisions (s); a vehicle stores one sample at each decision.
+        ``time_step_s``: time between two decisions (s); a vehicle stores one sample of its state at each decision.
         """
         return Messages.ring_length(self.delay_s, time_step_s) if self.persistence == "periodic" else 0
 
@@ -297,7 +297,7 @@ class V2X(FileModel):
         return self
 
     def _leave_out(self, names: tuple[str, ...], why: str) -> None:
-        """Raise an error if one of the keys ``names`` is given although it has no effect.
+        """Raise an error if one of the keys ``names`` is in the settings although it has no effect.
 
         ``why``: reason why the key has no effect, for the error message.
         """

@@ -362,7 +362,7 @@ class ScenarioFields(FileModel):
 
     @property
     def table_entries(self) -> dict[Entry, TableColumn]:
-        """Columns of the scenario's table by quantity and index, ``{("gaps_m", 0): column}``; empty without a table."""
+        """Columns of the scenario's table by key and index, ``{("gaps_m", 0): column}``; empty without a table."""
         return self._columns
 
     @property
@@ -409,7 +409,8 @@ class ScenarioFields(FileModel):
 
         An example is ``({0: 2.0, 1: 9.5}, ...)`` for ``mass_t``. The keys of a mapping are the indices of the vehicle's
         possible types; without vehicle types the only key is 0. If a vehicle type does not declare the quantity, the
-        mapping has the scenario's general declaration for this type. Raises the same errors as ``quantities``.
+        mapping has the scenario's general declaration for this type. Raises the same errors as the method
+        ``quantities``.
         """
         line = self.types_of_line
         if line is None or field not in QUANTITY.of_a_type:

@@ -247,7 +247,7 @@ class TableColumn:
 def _kind(value: object) -> str | None:
     """Return the tag of the class in ``Quantity`` that checks a value from a file, such as ``"#uniform"``.
 
-    Return None for a list, or for a mapping that contains no name of a distribution.
+    Return None for a list, and for a mapping that contains no name of a distribution.
     """
     if isinstance(value, _Distribution):
         return f"#{type(value).__name__.lower()}"
@@ -297,7 +297,8 @@ class WithLoad(_Distribution):
     def value(self, load: Floats, u: Floats) -> Floats:
         """Return ``empty + (full - empty) load``, plus an amount that ``u`` draws from ``spread``.
 
-        The arrays ``load`` (loads in [0, 1]) and ``u`` (uniform numbers in [0, 1)) and the result have the same shape.
+        The array ``load`` (loads in [0, 1]), the array ``u`` (uniform numbers in [0, 1)) and the result have the same
+        shape.
         """
         empty, full = self.with_load
         moved = np.clip(empty + (full - empty) * load, min(self.with_load), max(self.with_load))
@@ -310,7 +311,7 @@ AnyTypeQuantity = AnyQuantity | WithLoad
 
 
 def support(quantity: AnyTypeQuantity) -> tuple[float, float]:
-    """Return the smallest and largest value that ``quantity`` can have."""
+    """Return the smallest and the largest value that ``quantity``, a number or distribution, can have."""
     return (quantity, quantity) if isinstance(quantity, float) else quantity.support
 
 

@@ -75,7 +75,7 @@ class QuantityRule:
         return f"finite and in {'(' if self.positive else '['}{self.low:g}, {self.high:g}]{unit}"
 
     def allows(self, low: float, high: float) -> bool:
-        """Return whether every value from ``low`` to ``high`` is in the allowed range; False for NaN."""
+        """Return whether all values from ``low`` to ``high`` are allowed for this quantity; False for NaN."""
         return (low > 0.0 if self.positive else low >= self.low) and high <= self.high
 
     def count(self, vehicles: int) -> int:

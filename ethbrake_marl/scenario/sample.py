@@ -25,7 +25,7 @@ def clusters_of(kinds: Mapping[str, _Texts], index: Ints) -> _Texts | None:
     """Return the name of each world's cluster, [n], or None if all worlds are independent.
 
     Worlds of the same cluster are not statistically independent. A cluster contains all worlds from one recording, even
-    if they show different vehicles. In a mixture, a world without a recording is a cluster of its own.
+    if these worlds contain different vehicles. In a mixture, a world without a recording is a cluster of its own.
 
     Args:
         kinds: texts about each world, such as ``Sample.kinds``: name of the column -> texts, [n].

@@ -274,8 +274,8 @@ def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, drawn: Sample
 def _redraw_one(scenario: ScenarioFields, seed: int, channel: Channel, index: Ints) -> None:
     """Raise ``InvalidInput`` if the world with the number ``index`` [1] has an early impact in all remaining attempts.
 
-    If a scenario has no acceptable worlds, trying a single world shows this sooner than drawing the whole list.
-    ``seed`` and ``channel`` have the same meaning as in ``sample``.
+    If a scenario has no acceptable worlds, repeated draws of a single world show this sooner than draws of the whole
+    list. ``seed`` and ``channel`` have the same meaning as in ``sample``.
     """
     for attempt in range(_PATIENCE, MOST_ATTEMPTS):
         if not early_impact(scenario, _draw(scenario, seed, channel, attempt, index).worlds)[0]:

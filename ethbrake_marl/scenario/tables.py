@@ -267,7 +267,7 @@ def read_rows(file: Path, columns: object, weights: object) -> dict[str, Any]:
 
     Args:
         file: path of the CSV file, which has a header line.
-        columns: names of the columns to read, as the scenario file lists them; this function checks them.
+        columns: names of the columns to read, as the scenario file lists them; this function checks the names.
         weights: name of the column with the weight of each row; None: the rows have no weights.
 
     """
