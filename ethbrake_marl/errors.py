@@ -279,9 +279,9 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
     """Return the error for an unknown name; its message shows the new name, a similar name, or all known names.
 
     Args:
-        kind: kind of thing that is searched, for example ``scenario``.
+        kind: kind of thing that the unknown name should denote, for example ``scenario``.
         name: the unknown name.
-        known: all names that exist, among which a similar name is searched.
+        known: all existing names of this kind, from which the message suggests a similar name.
         may_be_own: true if users can register names of this kind. If ``may_be_own`` is true, the message says that a
             name of the user's own must first be registered or installed.
 

@@ -107,10 +107,10 @@ def evaluate_command(
 
     `ethbrake agent list` shows all agents; the name ladder is short for all agents from coast to best_harm in this
     list. A name can be followed by +search and by one shield, +episode or +step; for instance full_brake+step or
-    ppo@PATH+search+episode, where PATH is a run or a policy bundle. The shield +robust needs the description of an
-    uncertainty, which can be given only in Python; +robust:estimated needs no description. With --set harm_count=total,
-    agents minimise total harm instead of first-impact harm. --set measures=injury,my_file.py:worst adds these measures
-    to the results.
+    ppo@PATH+search+episode, where PATH is the folder of a run or of a policy bundle. The shield +robust needs the
+    description of an uncertainty, which can be given only in Python; +robust:estimated needs no description. With --set
+    harm_count=total, agents minimise total harm instead of first-impact harm. --set measures=injury,my_file.py:worst
+    adds these measures to the results.
     """
     from ethbrake_marl.agents.spec import split_specs
 
@@ -330,9 +330,9 @@ _FILE = typer.Argument(metavar="RESULTS.json", help="File results.json of `evalu
 def compare_command(first: Annotated[Path, _FILE], second: Annotated[Path, _FILE], as_json: JsonOption = False) -> None:
     """Show how harm differs between two results.
 
-    Shows the harm in the second result minus the harm in the first, for each agent that both results contain. Both
-    results must come from the same command and the same worlds of the same scenario. Confidence intervals are paired by
-    world if both folders contain the file that --per-world writes.
+    Shows the harm in the second result minus the harm in the first, for each agent that both results contain. The two
+    compared results must come from the same command and the same worlds of the same scenario. Confidence intervals are
+    paired by world if both folders contain the file that --per-world writes.
     """
     with Out(as_json=as_json) as out:
         comparison = evaluation.compare_results(evaluation.read_result(first), evaluation.read_result(second))

@@ -12,8 +12,8 @@ from ethbrake_marl.registry import Registry
 def register_page(shows: str, write: Callable[..., None]) -> None:
     """Register the function that a command calls to write its page (a report) or its picture.
 
-    An installed package registers a function that writes pages with an entry point of the group
-    ``ethbrake_marl.pages``.
+    With an entry point of the group ``ethbrake_marl.pages``, an installed package registers a function that writes
+    pages.
 
     Args:
         shows: subject of the page: ``"evaluation"`` (``evaluate --report``) or ``"worlds"`` (``scenario sample``).

@@ -398,8 +398,8 @@ agent_group = typer.Typer(
 def agent_list(as_json: JsonOption = False) -> None:
     """List all agents, what they do and what they know.
 
-    In the list, a name that begins with +, such as +step, is appended to the name of an agent: full_brake+step. +search
-    comes before a shield.
+    In the list, a name that begins with + is appended to the name of an agent, as in full_brake+step. The name +search
+    comes before a shield, as in full_brake+search+step.
     """
     with Out(as_json=as_json) as out:
         from ethbrake_marl.agents.protocol import Knowledge

@@ -24,7 +24,7 @@ channel. Under the preset ``paper`` a vehicle knows everything as soon as its ow
 
 With ``persistence: first``, vehicle i knows the present state of vehicle j after the first message. With ``persistence:
 periodic``, vehicle j sends a message in every period T, and the same Gilbert-Elliott channel may lose it. Vehicle i
-then knows that state of vehicle j which the newest message that arrived contains (``physics.messages``).
+then knows the state of vehicle j that the newest arrived message contains (``physics.messages``).
 """
 
 from __future__ import annotations
@@ -342,7 +342,7 @@ class V2X(FileModel):
         return self.by_link and (by_messages or lossy or (channel.senses != "none" and low != high))
 
     def latest_reaction_s(self, own_latency_s: Floats, equipped: Equipped) -> Floats:
-        """Return an upper bound of the time from which each vehicle can react, [N] s.
+        """Return, for each vehicle, an upper bound of the time from which the vehicle can react, [N] s.
 
         Args:
             own_latency_s: upper bounds of the vehicles' own latencies, without delays of the channel, [N] s.

@@ -242,7 +242,7 @@ class ScenarioFields(FileModel):
     @field_validator(*QUANTITY.declared)
     @classmethod
     def _entries(cls, value: Any, info: ValidationInfo) -> Any:
-        """Check that all possible values of a quantity are in range, and that a list has one per vehicle or pair."""
+        """Check that every possible value of a quantity is in range, and that a list has one per vehicle or pair."""
         rule, vehicles = QUANTITY.declared[str(info.field_name)], info.data.get("vehicles")
         if value is None:
             return value
@@ -384,7 +384,7 @@ class ScenarioFields(FileModel):
         return None if self.vehicle_types is None else TypesOfLine(self.vehicle_types, self.types, self.vehicles)
 
     def equipped(self, types: Ints | None = None) -> Equipped:
-        """Return the vehicles' V2X equipment in worlds with the vehicle types ``types`` (indices, [n, N]).
+        """Return the V2X equipment of vehicles with the types ``types`` (indices of vehicle types, [n, N]).
 
         If ``types`` is None, the result has one row, [1, N]: for each vehicle the least equipment of all its possible
         types.
@@ -526,7 +526,7 @@ def obstacle_gap(
 
     Args:
         scenario: the scenario that declares the obstacle.
-        found: the other quantities of the k worlds: key -> values, [k, entries].
+        found: all quantities of the k worlds except the distance to the obstacle: key -> values, [k, entries].
         declared: function that maps ``"obstacle_gap_m"`` or ``"obstacle_margin_m"`` to its value in each world, [k].
 
     """

@@ -131,8 +131,8 @@ class Normal(_Distribution):
         """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
 
         A value is ``mean + sd Q(p_low + (p_high - p_low) u)``, where Q is the quantile function of the standard normal
-        distribution. p_low and p_high are the probabilities that a value before truncation is below ``low``, and below
-        ``high``.
+        distribution. The numbers p_low and p_high are the probabilities that a value before truncation is below
+        ``low``, and below ``high``.
         """
         shape = self.normal
         below, above = self._bounds()

@@ -33,7 +33,7 @@ def with_follower(document: Document, build: Callable[[Document], Any]) -> Docum
 
     In the result, tables and lists also have entries for the follower. If the follower is invalid, the document is
     returned unchanged, and the schema rejects the document later. Raises ``InvalidInput`` if the line of vehicles is
-    invalid, if it has vehicle types, or if the speed of the last vehicle is random and not a column of the table.
+    invalid, if vehicle types are declared, or if the speed of the last vehicle is random and not a column of the table.
 
     Args:
         document: parsed file with a key ``follower``.

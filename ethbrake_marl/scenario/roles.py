@@ -108,7 +108,7 @@ class ScriptSpec(NamedTuple):
     ) -> Floats | None:
         """Return the command (m/s2, negative for braking) of a script that does not need the state.
 
-        The result has the shape of ``braking_capacity_mps2``. The command is minus the braking capacity for
+        The returned command has the shape of ``braking_capacity_mps2``. The command is minus the braking capacity for
         ``full_brake``, 0 for ``coast``, -a for ``constant:a``, the first command for a ``profile``, and None for any
         other script. Raises ``InvalidInput`` if a deceleration exceeds the braking capacity of a vehicle, or if a
         forward acceleration exceeds the driving capacity of a vehicle (checked only if ``driving_capacity_mps2`` is

@@ -70,8 +70,8 @@ class Sample:
     def join(parts: Sequence[Sample], rejected: int) -> Sample:
         """Join samples into one, in the order of their world numbers.
 
-        Either all samples in ``parts`` or none must have vehicle types; the same applies to scenarios and to
-        recordings. ``rejected``: number of rejected draws, which becomes ``Sample.rejected``.
+        Vehicle types must be in all samples of ``parts`` or in none; the same applies to scenarios and to recordings.
+        ``rejected``: number of rejected draws, which becomes ``Sample.rejected``.
         """
         index = np.concatenate([part.index for part in parts])
         order = np.argsort(index)

@@ -56,8 +56,8 @@ def sample(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, chann
         n: number of worlds.
         seed: seed of the list, a whole number of at least 0.
         first: number of the first world in the list, from 0.
-        channel: ``"list"`` (worlds for evaluation) or ``"training"``. Each seed has one list of each kind; the two
-            lists are independent.
+        channel: ``"list"`` (worlds for evaluation) or ``"training"``. Each seed has one list for evaluation and one
+            list for training; the two lists are independent.
 
     Raises ``InvalidInput`` for a negative ``seed`` or ``first``, and for ``n < 1``. If the scenario rejects early
     impacts, ``InvalidInput`` is also raised for a world that has an early impact in each of ``MOST_ATTEMPTS`` draws.
@@ -91,7 +91,7 @@ def sample(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, chann
 
 
 def members_of(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Ints:
-    """Return the scenario that each world of a mixture is drawn from, as an index into ``scenario.members``, [n].
+    """Return, for each world of a mixture, the index in ``scenario.members`` of the world's scenario, [n].
 
     All indices are 0 if the scenario is not a mixture. The arguments have the same meaning as in ``sample``.
     """
@@ -225,8 +225,8 @@ def _draw_numbers(scenario: ScenarioFields, index: Ints, seed: int, channel: Cha
 def early_impact(scenario: ScenarioFields, worlds: Worlds) -> Bools:
     """Return for each world whether an impact happens no later than the time at which the first learner can act, [n].
 
-    No learner can prevent such an impact: until that time learners coast and the other vehicles follow their scripts.
-    Raises ``InvalidInput`` if a script depends on the state. The scenario must have a learner.
+    No learner can prevent this impact, because learners coast until the first learner can act, and the other vehicles
+    follow their scripts. Raises ``InvalidInput`` if a script depends on the state. The scenario must have a learner.
     """
     vehicles = worlds.vehicles
     command = np.zeros(worlds.speeds_mps.shape)
