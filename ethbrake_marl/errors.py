@@ -55,7 +55,8 @@ def plain_text(text: str, keep: str = "") -> str:
     """Return ``text`` with unprintable characters written as Python escapes, safe to show in a terminal.
 
     Control characters, separators and characters that set the direction of text are escaped, except the space and the
-    characters in ``keep``. Names and paths from files could otherwise move the cursor or print a line backwards.
+    characters in ``keep``. Without these escapes, names and paths from files could move the cursor or print a line
+    backwards.
     """
     if text.isprintable():
         return text
@@ -65,7 +66,7 @@ def plain_text(text: str, keep: str = "") -> str:
 def one_line(text: str) -> str:
     """Return ``text`` as one line of ``plain_text``; text longer than ``LINE_LIMIT`` is shortened in the middle.
 
-    The beginning of a message (what is wrong, and where) and its end (what would be right) are kept.
+    If the message is shortened, its beginning (what is wrong, and where) and its end (what would be right) are kept.
     """
     blanks = text if len(text) <= 2 * LINE_LIMIT else text[:LINE_LIMIT] + text[-LINE_LIMIT:]
     line = plain_text(blanks)
@@ -86,7 +87,8 @@ def describe_error(error: BaseException, path: str | None = None) -> str:
     """Describe an exception from the user's code in a few words, with the number of the line of code that raised it.
 
     ``path``: the user's file; the last line of this file in the traceback is reported. If ``path`` is None, the
-    innermost line of the traceback is reported. For an error of this package, the description is only its message.
+    innermost line of the traceback is reported. If the exception is an error of this package, the description is only
+    its message.
     """
     text = str(error) if isinstance(error, EthBrakeError) else f"{type(error).__name__}: {error}"
     frames = traceback.extract_tb(error.__traceback__)
@@ -209,7 +211,7 @@ class PhysicsError(EthBrakeError, ArithmeticError):
 
 
 class AgentFailed(InvalidInput):
-    """A user's agent raised an exception or returned no valid actions; the message names the agent, world and step.
+    """An agent of the user raised an exception or returned no valid actions; the message names agent, world and step.
 
     Args:
         agent: name of the agent that failed.
@@ -282,8 +284,8 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
         kind: kind of thing that the unknown name should denote, for example ``scenario``.
         name: the unknown name.
         known: all existing names of this kind, from which the message suggests a similar name.
-        may_be_own: true if users can register names of this kind. If ``may_be_own`` is true, the message says that a
-            name of the user's own must first be registered or installed.
+        may_be_own: True: users can register names of this kind. If ``may_be_own`` is true, the message says that a name
+            of the user's own must first be registered or installed.
 
     """
     names = sorted(known)

@@ -88,7 +88,7 @@ class Registry(Mapping[str, T]):
     define it, and ``MissingExtra`` if a package of an extra is missing.
 
     Args:
-        kind: what the parts are called in messages, for example ``agent``.
+        kind: word for one part in messages, for example ``agent``.
         group: group of the entry points, without the prefix ``ethbrake_marl.``.
         register: function that is called with the name and the value of an entry point, and calls ``add`` on this
             registry.

@@ -78,8 +78,8 @@ class Check:
 def diagnose(*, compile_all: bool = False) -> list[Check]:
     """Run all checks of the installation; return the results in the order in which problems should be solved.
 
-    A check that raises an error is reported as failed. ``compile_all``: also call the usual commands on a few worlds,
-    which compiles and stores all kernels that they use.
+    A check that raises an error is reported as failed. ``compile_all``: True: also call the usual commands on a few
+    worlds, which compiles and stores all kernels that they use.
     """
     has_torch = find_spec("torch") is not None
     return [
@@ -195,7 +195,7 @@ def _golden_baseline() -> tuple[bool, str]:
     """Check the baseline E-V2X-BM in the paper's distance scenario with gaps of 7 m and 7 m.
 
     The known result is a deceleration of 5.17021 m/s2 and a harm of 4.03447 m2/s2. Returns whether the computed result
-    is the same, and a text with both results.
+    equals the known result, and a text with both results.
     """
     import numpy as np
 
@@ -246,7 +246,7 @@ def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str
 
 
 def _call(arguments: tuple[str, ...], folder: str) -> str:
-    """Run Python with these arguments in ``folder``; return the last line on stderr if it fails, else an empty text."""
+    """Run Python with ``arguments`` in ``folder``; return the last line on stderr if it fails, else an empty text."""
     done = subprocess.run([sys.executable, *arguments], cwd=folder, capture_output=True, text=True, check=False)
     return (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1] if done.returncode else ""
 

@@ -51,7 +51,7 @@ def read_task(scenario: str, settings: Sequence[str] | None) -> Task:
         scenario: name of a scenario, or path of its file.
         settings: settings ``KEY=VALUE`` of the scenario, and ``harm_count=total``; None: no settings.
 
-    Raises ``InvalidInput`` for a scenario without learners.
+    Raises ``InvalidInput`` if the scenario has no learner.
 
     """
     return _task_of(scenario, training.read_settings(settings, of_agents=("harm_count",)))

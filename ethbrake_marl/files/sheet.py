@@ -241,7 +241,8 @@ class Sheet:
         """Return the table as HTML for a notebook or a page, with the title above and the note below.
 
         All content is escaped unless it has a method ``__html__``. The first cell of a row is the heading of the row.
-        Confidence intervals are shown in brackets. In the other columns, a long text may be broken into several lines.
+        Confidence intervals are shown in brackets. Long texts in the columns after the first may be broken
+        into several lines.
         """
         columns, label = self._columns(), self.title or f"Table: {self.headings[0]}"
         kinds = [' class="words"' if k and self.rows and column.text else "" for k, column in enumerate(columns)]

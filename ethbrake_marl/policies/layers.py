@@ -55,8 +55,8 @@ def dense(weight: Float32s, bias: Float32s, x: Float32s, y: Float32s) -> None:
     """Compute one layer of a network, ``y = weight x + bias``.
 
     The products of weights and inputs are added in groups of four, ``(a + b) + (c + d)``, always in this order, without
-    fused or reordered operations (no fastmath). The rounding error is half as large as if one product after another
-    were added. The result for a column of ``x`` does not depend on the other columns.
+    fused or reordered operations (no fastmath). The rounding error is half as large as in a sum that adds one product
+    after another. The result for a column of ``x`` does not depend on the other columns.
 
     Args:
         weight: weights of K inputs and O outputs, [O, K].

@@ -93,7 +93,7 @@ class NetworkSpec(FileModel):
 
     @property
     def actors(self) -> tuple[str, ...]:
-        """Prefix of each actor's tensor names: ``("policy",)``, or ``("network_1", "network_2", ...)``."""
+        """Prefix of the tensor names of each actor: ``("policy",)``, or ``("network_1", "network_2", ...)``."""
         return ("policy",) if self.networks == 1 else tuple(f"network_{m + 1}" for m in range(self.networks))
 
     @property

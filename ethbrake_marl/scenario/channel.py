@@ -2,14 +2,14 @@
 
 A link is the direction from a sending vehicle j to a receiving vehicle i. A message contains the sender's place, speed,
 acceleration, braking capacity, latency and mass, or the items listed in ``tells``. Vehicle i can use the first message
-of vehicle j from this time on, in s after the alert:
+of vehicle j from the time ``tau_ij`` (in s after the alert) on:
 
     tau_ij = U(0, T) + k T + L_radio + t_proc + t_act
 
 T is the message period, and ``U(0, T)`` the random wait for the next message. L_radio is the time of transmission,
 t_proc the time until the message is processed, and t_act the time until the brakes respond. ``k`` is the number of
 message periods during which a burst of losses destroys every message. In each period, a burst begins with probability
-p, and an ongoing burst ends with probability r. In the stationary state of this Gilbert-Elliott channel ``P(k >= m) =
+p, and an ongoing burst ends with probability r. In the stationary state of this Gilbert-Elliott channel, ``P(k >= m) =
 (p / (p + r)) (1 - r)^(m - 1)`` for m = 1, 2, ... With probability ``lost`` no message ever arrives on a link. A
 vehicle's sensors see its direct neighbours after a delay, called a *hop*, which is drawn from the range ``sensing_s``.
 Vehicle i can react to the emergency from the time ``latency_i`` (in s after the alert) on:
@@ -121,7 +121,7 @@ class Channel(NamedTuple):
     def contents(self, vehicles: int) -> Bools | None:
         """Return a mask [N, len(PIECES)]: True where the messages of a vehicle contain an item of ``PIECES``.
 
-        Return None if ``tells`` is not given; messages then contain the items in ``USUAL_PIECES``.
+        If ``tells`` is not given, return None; messages then contain the items in ``USUAL_PIECES``.
         """
         if self.tells is None:
             return None
@@ -460,8 +460,8 @@ def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
     """Return the number k of message periods that a burst of losses lasts, in the shape of ``u``.
 
     For m = 1, 2, ..., the result k is at least m exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``. This rule is the
-    inverse of the distribution function of k in the stationary Gilbert-Elliott channel. k is computed without
-    logarithms, so every machine gets the same k.
+    inverse of the distribution function of k in the stationary Gilbert-Elliott channel. The number k is
+    computed without logarithms, so every machine gets the same k.
 
     Args:
         u: uniform numbers in [0, 1).

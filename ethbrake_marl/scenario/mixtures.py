@@ -101,8 +101,9 @@ def _member_document(document: Document, i: int, entry: Mapping[str, Any], besid
 def _check_members(document: Document, members: Sequence[ScenarioFields]) -> None:
     """Raise ``InvalidInput`` if the scenarios ``members`` of a mixture cannot be drawn together.
 
-    No member may be a mixture, their names must differ, and all must have the same number of vehicles, time step,
-    horizon, roles, objective and observation. ``document``: the mixture's file, for error messages.
+    No scenario of a mixture may itself be a mixture, the names of the scenarios must differ, and all scenarios must
+    have the same number of vehicles, time step, horizon, roles, objective and observation. ``document``: the mixture's
+    file, for error messages.
     """
     where = f"{document.where(('mixture',))}: mixture"
     first = members[0]

@@ -1,4 +1,4 @@
-"""Build worlds from the user's initial conditions: a table with one row per world, or a state for ``reset``."""
+"""Build worlds from initial conditions of the user: a table with one row per world, or a state for ``reset``."""
 
 from __future__ import annotations
 
