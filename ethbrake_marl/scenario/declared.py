@@ -521,8 +521,8 @@ def obstacle_gap(
     """Return the distance from Vehicle 1 to the obstacle ahead in k worlds, [k] m; None without an obstacle.
 
     A scenario declares either the distance to the obstacle, or a margin: the distance between the obstacle and the
-    point where Vehicle 1 stops by full braking. If a margin is declared, ``distance = margin + v_1 tau_1 + v_1^2 / (2 a_1)``.
-    Vehicle 1 has the speed v_1, the latency tau_1 and the braking capacity a_1, and its brakes act at once.
+    point where Vehicle 1 stops by full braking. If a margin is declared, ``distance = margin + v_1 tau_1 + v_1^2 / (2
+    a_1)``. Vehicle 1 has the speed v_1, the latency tau_1 and the braking capacity a_1, and its brakes act at once.
 
     Args:
         scenario: the scenario that declares the obstacle.
