@@ -111,7 +111,7 @@ _NEED_TRAIN = ("EthBrakeVecEnv", "ShieldedVecEnv", "TrainResult", "make_sb3_vec_
 
 
 def _usable() -> list[str]:
-    """Return the public names that can be imported with the installed packages.
+    """Return the public names that can be imported with the packages that are installed.
 
     Importing any other public name raises an error that says which optional extra to install.
     """

@@ -1,8 +1,8 @@
 """Lazy imports: the ``__init__`` of a folder lists public names, and each name is imported when it is first used.
 
-The list is a block of imports under ``if TYPE_CHECKING``. Type checkers read this block as imports. At run time this
-module reads the list from the source file, so packages that a caller does not need (torch, matplotlib, scipy) are not
-loaded.
+The list of public names is a block of imports under ``if TYPE_CHECKING``. Type checkers read this block as imports. At
+run time this module reads the list from the source file, so packages that a caller does not need (torch, matplotlib,
+scipy) are not loaded.
 """
 
 from __future__ import annotations

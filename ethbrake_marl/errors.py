@@ -54,8 +54,9 @@ RENAMED: dict[str, str] = {  # old name -> new name, for messages
 def plain_text(text: str, keep: str = "") -> str:
     """Return ``text`` with unprintable characters written as Python escapes, safe to show in a terminal.
 
-    Control, direction and separator characters are escaped, except the space and the characters in ``keep``. Names and
-    paths from files could otherwise move the cursor or print a line backwards.
+    Control characters, separators and characters that set the direction of text are escaped, except the space and the
+    characters in ``keep``. Without these escapes, names and paths from files could move the cursor or print a line
+    backwards.
     """
     if text.isprintable():
         return text
@@ -65,7 +66,7 @@ def plain_text(text: str, keep: str = "") -> str:
 def one_line(text: str) -> str:
     """Return ``text`` as one line of ``plain_text``; text longer than ``LINE_LIMIT`` is shortened in the middle.
 
-    The beginning of a message (what is wrong, and where) and its end (what would be right) are kept.
+    If the message is shortened, its beginning (what is wrong, and where) and its end (what would be right) are kept.
     """
     blanks = text if len(text) <= 2 * LINE_LIMIT else text[:LINE_LIMIT] + text[-LINE_LIMIT:]
     line = plain_text(blanks)
@@ -77,7 +78,7 @@ def one_line(text: str) -> str:
 def count_of(n: int, thing: str) -> str:
     """Return the number ``n`` and its noun as text, for example ``1 world`` or ``10,000 worlds``.
 
-    ``thing``: the noun in the singular.
+    ``thing``: the noun in the singular, for example ``world``.
     """
     return f"{n:,} {thing}{'' if n == 1 else 's'}"
 
@@ -86,7 +87,8 @@ def describe_error(error: BaseException, path: str | None = None) -> str:
     """Describe an exception from the user's code in a few words, with the number of the line of code that raised it.
 
     ``path``: the user's file; the last line of this file in the traceback is reported. If ``path`` is None, the
-    innermost line of the traceback is reported. For an error of this package, the description is only its message.
+    innermost line of the traceback is reported. If the exception is an error of this package, the description is only
+    its message.
     """
     text = str(error) if isinstance(error, EthBrakeError) else f"{type(error).__name__}: {error}"
     frames = traceback.extract_tb(error.__traceback__)
@@ -190,7 +192,7 @@ class PhysicsError(EthBrakeError, ArithmeticError):
     failed worlds (``physics.left_out.leaving_out_failed``).
 
     Args:
-        worlds: row of each failed world in the batch -> reason of the failure.
+        worlds: mapping from the row (in the batch) of each failed world to the reason of its failure.
 
     """
 
@@ -204,17 +206,17 @@ class PhysicsError(EthBrakeError, ArithmeticError):
         return one_line("; ".join([*named, f"and {count_of(more, 'more world')}"] if more else named))
 
     def renumbered(self, rows: Sequence[int] | NDArray[np.int64]) -> PhysicsError:
-        """Return this error with the row numbers of a larger batch, in which world k of this batch is ``rows[k]``."""
+        """Return this error with its rows in a larger batch, whose row ``rows[k]`` is row k of this batch."""
         return PhysicsError({int(rows[row]): reason for row, reason in self.worlds.items()})
 
 
 class AgentFailed(InvalidInput):
-    """A user's agent raised an exception or returned no valid actions; the message names the agent, world and step.
+    """An agent of the user raised an exception or returned no valid actions; the message names agent, world and step.
 
     Args:
-        agent: name of the agent.
-        row: row of the world in the batch; None if it is unknown.
-        reason: what went wrong, and at which step.
+        agent: name of the agent that failed.
+        row: row of the world in the batch in which the agent failed; None if the row is unknown.
+        reason: what the agent did wrong, and at which step.
 
     """
 
@@ -227,7 +229,7 @@ class AgentFailed(InvalidInput):
         return one_line(f"agent {self.agent!r}{where}, {self.reason}")
 
     def renumbered(self, rows: Sequence[int] | NDArray[np.int64]) -> AgentFailed:
-        """Return this error with the row number of a larger batch, in which world k of this batch is ``rows[k]``."""
+        """Return this error with its row in a larger batch, whose row ``rows[k]`` is row k of this batch."""
         return AgentFailed(self.agent, None if self.row is None else int(rows[self.row]), self.reason)
 
     @staticmethod
@@ -263,7 +265,7 @@ def renumbered(rows: Sequence[int] | NDArray[np.int64]) -> Iterator[None]:
 
 
 class UncertifiedStep(EthBrakeError):
-    """The engine's step differs from the step that the shield certified; the engine did not make the step."""
+    """The engine's step differs from the step that the shield certified, so the step is undone."""
 
 
 def new_name(name: object, known: Collection[str]) -> str | None:
@@ -279,11 +281,11 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
     """Return the error for an unknown name; its message shows the new name, a similar name, or all known names.
 
     Args:
-        kind: what the name should be a name of, for example ``scenario``.
+        kind: kind of thing that the unknown name should denote, for example ``scenario``.
         name: the unknown name.
-        known: the known names.
-        may_be_own: true if users can register names of this kind. The message then says that a name of the user's own
-            must first be registered or installed.
+        known: all existing names of this kind, from which the message suggests a similar name.
+        may_be_own: True: users can register names of this kind. If ``may_be_own`` is true, the message says that a name
+            of the user's own must first be registered or installed.
 
     """
     names = sorted(known)

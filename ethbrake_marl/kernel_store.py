@@ -37,8 +37,8 @@ def is_temporary(folder: Path) -> bool:
 def on_first_compilation(tell: Callable[[Path, bool], None]) -> None:
     """Call ``tell(folder, was_empty)`` once, just before this process compiles its first kernel.
 
-    ``folder`` is the cache folder. ``was_empty`` is true if this process has not loaded any kernel from the cache yet.
-    ``tell`` is not called when a cached kernel is loaded.
+    ``folder`` is the cache folder of the compiled kernels. ``was_empty`` is true if this process has not loaded any
+    kernel from the cache yet. If a kernel is loaded from the cache, ``tell`` is not called.
     """
     _tellers.append(tell)
 

@@ -46,8 +46,8 @@ def run_each(calls: Iterable[Call], jobs: int | None = None, ray: str | None = N
     Args:
         calls: tuples (function, argument, ...) with module-level functions. If ``calls`` is a generator, each tuple is
             taken from it shortly before the call starts.
-        jobs: number of calls that run at once. If ``jobs`` is None, the number is 1 without Ray, and the number of
-            cores with Ray. With one call at a time and without Ray, the calls run in this process.
+        jobs: number of calls that run at once. If ``jobs`` is None, the number of calls at once is 1 without Ray, and
+            the number of cores with Ray. With one call at a time and without Ray, the calls run in this process.
         ray: ``local`` to start Ray on this machine, or the address of a Ray cluster. If ``ray`` is None, the calls run
             in processes of joblib.
 
@@ -97,7 +97,7 @@ def _answer(call: bytes) -> Any:
 
 @cache
 def _end_with_parent() -> None:
-    """Make this worker exit when its parent process has ended, even in the middle of a call."""
+    """Make this worker process exit when its parent process has ended, even in the middle of a call."""
 
     def watch(parent: int) -> None:
         while os.getppid() == parent:
@@ -125,8 +125,9 @@ def _sigterm_as_ctrl_c() -> Iterator[None]:
 def own_signals() -> Iterator[None]:
     """Context manager: restore the caller's handlers of Ctrl-C, SIGTERM and SIGUSR1 after the block.
 
-    Ray and Ray Tune set their own handlers and do not restore the caller's. The handler of Ray Tune would swallow the
-    caller's next Ctrl-C. Outside the main thread, where no handler can be set, this function does nothing.
+    Ray and Ray Tune set their own handlers of signals and do not restore the caller's handlers. The handler of Ray Tune
+    would swallow the caller's next Ctrl-C. Outside the main thread, where no handler can be set, this function does
+    nothing.
     """
     in_main = threading.current_thread() is threading.main_thread()
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1) if in_main else ()

@@ -38,9 +38,9 @@ T = TypeVar("T")
 class Part:
     """Value of an entry point: the arguments of a ``register_...`` function, except the name.
 
-    The function registers the value under the name of the entry point. For example, an entry point in the group
-    ``ethbrake_marl.measures`` with the value ``part`` below has the same effect as ``register_measure(name, closing,
-    unit="m/s")``.
+    The ``register_...`` function registers the part under the name of the entry point. For example, an entry point in
+    the group ``ethbrake_marl.measures`` with the value ``part`` below has the same effect as ``register_measure(name,
+    closing, unit="m/s")``.
 
     >>> import ethbrake_marl as eb
     >>> def closing(episodes):
@@ -81,14 +81,14 @@ def versions_used() -> dict[str, str]:
 
 
 class Registry(Mapping[str, T]):
-    """Mapping name -> part for all parts (such as agents) of one kind. A part is loaded when first looked up.
+    """Mapping name -> part for all parts (such as agents) of one kind. A part is loaded when it is first looked up.
 
     Testing whether a name exists, and iterating over the names, load no part. Looking up a name raises ``UnknownName``
-    if no part has this name. It raises ``InvalidInput`` if the part cannot be loaded or two installed packages define
-    it, and ``MissingExtra`` if a package of an extra is missing.
+    if no part has this name. A look-up raises ``InvalidInput`` if the part cannot be loaded or two installed packages
+    define it, and ``MissingExtra`` if a package of an extra is missing.
 
     Args:
-        kind: what the parts are called in messages, for example ``agent``.
+        kind: word for one part in messages, for example ``agent``.
         group: group of the entry points, without the prefix ``ethbrake_marl.``.
         register: function that is called with the name and the value of an entry point, and calls ``add`` on this
             registry.
@@ -183,7 +183,7 @@ class Registry(Mapping[str, T]):
             )
 
     def usable(self) -> dict[str, T]:
-        """Load all parts (such as agents) and return those that could be loaded, by name."""
+        """Load all parts of this kind (such as all agents) and return those that could be loaded: name -> part."""
         return {name: self.loaded[name] for name in self if self.why_not(name) is None and name in self.loaded}
 
     def why_not(self, name: str) -> str | None:

@@ -72,9 +72,9 @@ def main() -> None:
 def run_command(arguments: Sequence[str]) -> int:
     """Run a command line (the arguments after ``ethbrake``) and return its exit status.
 
-    The exit status is 0 for success. It is 2 for invalid input, wrong usage or a file error; the reason is then printed
-    in one line on stderr. The exit status is 1 if the reader of the output has closed the pipe. Other errors are
-    defects of the program and are raised.
+    The exit status is 0 for success. The exit status is 2 for invalid input, wrong usage or a file error; the reason is
+    then printed in one line on stderr. The exit status is 1 if the reader of the output has closed the pipe. Other
+    errors are defects of the program and are raised.
     """
     asked = _shell_asks(os.environ)
     try:
@@ -154,11 +154,12 @@ def prepare_streams() -> None:
 def tell_compilation(folder: Path, empty: bool) -> None:
     """Announce that kernels are being compiled, and print every ten seconds how many are done.
 
-    A background thread prints these lines, because compiling a single kernel may take a minute.
+    A background thread prints the number of compiled kernels, because compiling a single kernel may take a minute.
 
     Args:
-        folder: folder in which compiled kernels are stored; a temporary folder is deleted at the end.
-        empty: whether the folder was empty before.
+        folder: folder in which compiled kernels are stored; if this folder is temporary, it is deleted when the process
+            ends.
+        empty: True if this process has not loaded any kernel from this folder.
 
     """
     once = "the physics for the first time, which takes minutes" if empty else "parts of the physics for the first time"
@@ -267,7 +268,7 @@ def with_installed(group: Any, name: str) -> Any:
 
     Args:
         group: the command group, a Typer (click) command with subcommands; the function adds commands to it.
-        name: name of the group.
+        name: name of the command group.
 
     """
     for entry in points(COMMANDS.group):

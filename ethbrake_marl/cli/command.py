@@ -67,7 +67,7 @@ def schema_option(module: str, model: str, kind: str) -> Any:
 
     Args:
         module: name of the module that defines ``model``; it is imported only when the option is used.
-        model: name of the model's class, which has a method ``json_schema``.
+        model: name of the pydantic model's class, whose method ``json_schema`` returns the schema.
         kind: kind of file, for the help text, such as ``recipe``.
 
     """
@@ -169,12 +169,12 @@ class Out:
         say(text)
 
     def check(self, path: Path | None, *endings: str, what: str = "the file") -> None:
-        """Raise ``InvalidInput`` or ``AlreadyExists`` if a file cannot be written. Commands call this method first.
+        """Raise ``InvalidInput`` or ``AlreadyExists`` if a file cannot be written; a command calls this method first.
 
         Args:
             path: path of the file; None: no file was requested, and nothing is checked.
             endings: allowed endings of the file's name, such as ``.csv``; if none is given, every ending is allowed.
-            what: words in the error message for the content of the file.
+            what: name of the file's content in the error message, for example ``worlds``.
 
         """
         if path is None:
@@ -211,7 +211,7 @@ class Out:
             name: name of the task; a task ``TASK: STAGE`` has the same bar as ``TASK``.
             done: number of units of work that are done.
             total: number of all units of work.
-            harm: latest harm, shown after the name of the task.
+            harm: text with the harm in the latest evaluation, shown after the name of the task.
             note: message to print once, above the bars.
 
         """

@@ -78,8 +78,8 @@ class Check:
 def diagnose(*, compile_all: bool = False) -> list[Check]:
     """Run all checks of the installation; return the results in the order in which problems should be solved.
 
-    A check that raises an error is reported as failed. ``compile_all``: also call the usual commands on a few worlds,
-    which compiles and stores all kernels that they use.
+    A check that raises an error is reported as failed. ``compile_all``: True: also call the usual commands on a few
+    worlds, which compiles and stores all kernels that they use.
     """
     has_torch = find_spec("torch") is not None
     return [
@@ -174,7 +174,7 @@ def _golden_impact() -> tuple[bool, str]:
     """Check the physics: a car at 10 m/s brakes with 5 m/s2, 8 m behind a standing car.
 
     The exact harm, the square of the impact speed, is ``10^2 - 2 * 5 * 8 = 20`` m2/s2. Returns whether the computed
-    harm equals this value, and a text with both.
+    harm equals the exact harm, and a text with both values.
     """
     import numpy as np
 
@@ -195,7 +195,7 @@ def _golden_baseline() -> tuple[bool, str]:
     """Check the baseline E-V2X-BM in the paper's distance scenario with gaps of 7 m and 7 m.
 
     The known result is a deceleration of 5.17021 m/s2 and a harm of 4.03447 m2/s2. Returns whether the computed result
-    is the same, and a text with both results.
+    equals the known result, and a text with both results.
     """
     import numpy as np
 
@@ -220,7 +220,7 @@ def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str
     a message.
 
     Args:
-        training: whether to call also ``ethbrake run``, which needs torch.
+        training: True: also call ``ethbrake run``, which needs torch.
         run_alone: True: call only the single command that compiles nearly all kernels of ``ethbrake run``.
 
     """
@@ -246,7 +246,7 @@ def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str
 
 
 def _call(arguments: tuple[str, ...], folder: str) -> str:
-    """Run Python with these arguments in ``folder``; return the last line on stderr if it fails, else an empty text."""
+    """Run Python with ``arguments`` in ``folder``; return the last line on stderr if it fails, else an empty text."""
     done = subprocess.run([sys.executable, *arguments], cwd=folder, capture_output=True, text=True, check=False)
     return (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1] if done.returncode else ""
 

@@ -51,7 +51,7 @@ def read_task(scenario: str, settings: Sequence[str] | None) -> Task:
         scenario: name of a scenario, or path of its file.
         settings: settings ``KEY=VALUE`` of the scenario, and ``harm_count=total``; None: no settings.
 
-    Raises ``InvalidInput`` for a scenario without learners.
+    Raises ``InvalidInput`` if the scenario has no learner.
 
     """
     return _task_of(scenario, training.read_settings(settings, of_agents=("harm_count",)))
@@ -107,9 +107,10 @@ def evaluate_command(
 
     `ethbrake agent list` shows all agents; the name ladder is short for all agents from coast to best_harm in this
     list. A name can be followed by +search and by one shield, +episode or +step; for instance full_brake+step or
-    ppo@PATH+search+episode, where PATH is a run or a policy bundle. The shield +robust needs an uncertainty, which can
-    be set only in Python; +robust:estimated does not need one. With --set harm_count=total, agents minimise total harm
-    instead of first-impact harm. --set measures=injury,my_file.py:worst adds these measures to the results.
+    ppo@PATH+search+episode, where PATH is the folder of a run or of a policy bundle. The shield +robust needs the
+    description of an uncertainty, which can be given only in Python; +robust:estimated needs no description. With --set
+    harm_count=total, agents minimise total harm instead of first-impact harm. --set measures=injury,my_file.py:worst
+    adds these measures to the results.
     """
     from ethbrake_marl.agents.spec import split_specs
 
@@ -168,7 +169,7 @@ def _evaluate_long_list(
 
     Args:
         out: object that prints the output of the command.
-        lineup: the agents to evaluate, and the scenario.
+        lineup: the agents to evaluate, and the scenario whose evaluation list is used.
         episodes: number of worlds in the evaluation list.
         seed: seed of the evaluation list.
         jobs: number of parallel processes; None: one process.
@@ -193,12 +194,12 @@ def _evaluate_group(
 ) -> None:
     """Evaluate each agent in each scenario of a group, and print a table with a row per agent and scenario.
 
-    The table shows the collision rate, the hardest impact, and mean harm.
+    For each agent and scenario the table shows the collision rate, the hardest impact, and the mean harm.
 
     Args:
         out: object that prints the output of the command.
         output: folder for the results as JSON; None: do not write them.
-        group: the scenarios, each with its controlled vehicles.
+        group: the scenarios in which the agents are evaluated, each with its controlled vehicles.
         agents: names of agents, with commas between them.
         episodes: number of worlds of each scenario; None: ``GROUP_EPISODES``.
         seed: seed of the evaluation lists; None: the default seed.
@@ -298,12 +299,12 @@ def _json_text(content: object) -> str:
 
 
 def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: float) -> None:
-    """Print in how many worlds some vehicle still moves at the horizon, if there are such worlds.
+    """Print in how many worlds at least one vehicle still moves at the horizon, if there are such worlds.
 
     Args:
         out: object that prints the output of the command.
-        moving: number of worlds in which some vehicle still moves at the horizon, by name of each agent with a shield.
-        worlds: number of all worlds.
+        moving: for each agent with a shield, number of worlds in which at least one vehicle still moves at the horizon.
+        worlds: number of all evaluated worlds.
         horizon_s: time of the horizon (s).
 
     """
@@ -316,7 +317,7 @@ def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: f
 
 
 def _moving(rows: Sequence[evaluation.SummaryRow]) -> dict[str, int]:
-    """Return the number of worlds in which some vehicle still moves at the horizon, for each agent with a shield.
+    """Return, for each agent with a shield, in how many worlds at least one vehicle still moves at the horizon.
 
     ``rows``: rows of the results table, one per agent.
     """
@@ -329,9 +330,9 @@ _FILE = typer.Argument(metavar="RESULTS.json", help="File results.json of `evalu
 def compare_command(first: Annotated[Path, _FILE], second: Annotated[Path, _FILE], as_json: JsonOption = False) -> None:
     """Show how harm differs between two results.
 
-    Shows the harm in the second result minus the harm in the first, for each agent that both results contain. Both
-    results must come from the same command and the same worlds of the same scenario. Confidence intervals are paired by
-    world if both folders contain the file that --per-world writes.
+    Shows the harm in the second result minus the harm in the first, for each agent that both results contain. The two
+    compared results must come from the same command and the same worlds of the same scenario. Confidence intervals are
+    paired by world if both folders contain the file that --per-world writes.
     """
     with Out(as_json=as_json) as out:
         comparison = evaluation.compare_results(evaluation.read_result(first), evaluation.read_result(second))
@@ -367,9 +368,10 @@ def shield_command(
 
     Each agent runs in the same worlds without a shield, with the shield in episode mode, and with the shield in step
     mode. A team of several learners runs without a shield, with the shield in step mode, and with that shield plus
-    caps. Name the agents without a shield: full_brake, not full_brake+step. The shield bounds first-impact harm, or
-    total harm with --set harm_count=total. For each action that step mode replaced, the table says what harm the
-    replaced action would have caused: more (the replacement was needed), the same (harmless) or less (costly).
+    caps. Write the names of the agents without a shield: full_brake, not full_brake+step. The shield bounds
+    first-impact harm, or total harm with --set harm_count=total. For each action that step mode replaced, the table
+    says what harm the replaced action would have caused: more (the replacement was needed), the same (harmless) or less
+    (costly).
     """
     with Out(as_json=as_json) as out:
         task = read_task(scenario, settings)

@@ -1,4 +1,4 @@
-"""Registry of the functions that draw pages and pictures for commands. Extensions register these functions."""
+"""Registry of the functions that draw pages and pictures for commands. Extensions register such functions."""
 
 from __future__ import annotations
 
@@ -12,13 +12,15 @@ from ethbrake_marl.registry import Registry
 def register_page(shows: str, write: Callable[..., None]) -> None:
     """Register the function that a command calls to write its page (a report) or its picture.
 
-    An installed package registers such a function with an entry point of the group ``ethbrake_marl.pages``.
+    With an entry point of the group ``ethbrake_marl.pages``, an installed package registers a function that writes
+    pages.
 
     Args:
         shows: subject of the page: ``"evaluation"`` (``evaluate --report``) or ``"worlds"`` (``scenario sample``).
-        write: function that writes the page. Its arguments are, for ``"evaluation"``, the path of the file, the
-            evaluation, the results table and the agents by name; for ``"worlds"``, the path of the file, the scenario
-            and the sample. The calls in ``cli.evaluate`` and ``cli.scenario`` show the keyword arguments of ``write``.
+        write: function that writes the page. The arguments of ``write`` are, for ``"evaluation"``, the path of the
+            file, the evaluation, the results table and the agents by name; for ``"worlds"``, the path of the file, the
+            scenario and the sample. The calls in ``cli.evaluate`` and ``cli.scenario`` show the keyword arguments of
+            ``write``.
 
     """
     PAGES.add(shows, write, lambda other: other is write)

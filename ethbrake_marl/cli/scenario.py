@@ -67,7 +67,7 @@ def scenario_validate(path: NameArgument, as_json: JsonOption = False) -> None:
     """Check a scenario, and try it in 200 worlds.
 
     Draws the first 200 worlds of the evaluation list and simulates them. Learners brake fully, all other vehicles
-    follow their scripts. Shows the range of each quantity and possible mistakes.
+    follow their scripts. Shows the range of each quantity in these worlds, and possible mistakes in the scenario.
     """
     with Out(as_json=as_json) as out:
         scenario = evaluation.load_runnable(path)
@@ -112,7 +112,7 @@ def scenario_validate(path: NameArgument, as_json: JsonOption = False) -> None:
 
 
 def _drawn_lines(scenario: scenarios.Scenario, sample: scenarios.Sample) -> tuple[list[str], str, dict[str, Any]]:
-    """Return three descriptions of the quantities in the worlds of ``sample``: (lines, text, columns).
+    """Return (lines, text, columns), three descriptions of the quantities in the worlds of ``sample``.
 
     ``lines`` is a table with the range of each varying quantity, and ``text`` lists the fixed quantities. ``columns``
     is for JSON: ``{"gap_1_m": {"least": 5.0, "median": 7.0, "largest": 9.0}}``.
@@ -223,10 +223,10 @@ def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
 
 
 def _refused(scenario: scenarios.Scenario, sample: scenarios.Sample | None = None) -> str:
-    """Return how many draws were rejected for an early impact, as a text ``: 3 of 203 draws (1.5 %)``.
+    """Return the number of draws that were rejected for an early impact, as a text ``: 3 of 203 draws (1.5 %)``.
 
-    The text is empty for a scenario without a table. With a table, rejections change how often each row occurs in the
-    worlds. ``sample``: worlds whose rejected draws are counted; None: draw 200 worlds.
+    The text is empty for a scenario without a table. If the scenario has a table, rejections change how often each row
+    of the table occurs in the worlds. ``sample``: worlds whose rejected draws are counted; None: draw 200 worlds.
     """
     if all(each.table is None for each in scenario.members or (scenario,)):
         return ""
@@ -398,7 +398,8 @@ agent_group = typer.Typer(
 def agent_list(as_json: JsonOption = False) -> None:
     """List all agents, what they do and what they know.
 
-    A name that begins with + is appended to the name of an agent, as in full_brake+step; +search comes before a shield.
+    In the list, a name that begins with + is appended to the name of an agent, as in full_brake+step. The name +search
+    comes before a shield, as in full_brake+search+step.
     """
     with Out(as_json=as_json) as out:
         from ethbrake_marl.agents.protocol import Knowledge
@@ -432,8 +433,8 @@ def agent_export(
 ) -> None:
     """Write a policy as an ONNX model.
 
-    The input of the model is an observation, the output an acceleration. Needs the package onnx, which the extra
-    `export` installs.
+    The input of the model is an observation, the output an acceleration. The command needs the package onnx, which the
+    extra `export` installs.
     """
     with Out(force=force) as out:
         from ethbrake_marl.policies.shipped import load_named_policy

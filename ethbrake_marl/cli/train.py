@@ -79,8 +79,9 @@ def run_command(
     Trains a single learner or a team. Writes a run's folder with policies, results as CSV and JSON, results per world,
     three figures and report.html. If the scenario is one of the three tests (paper-random, paper-random-brake-only,
     paper-random-obstacle), the policy is also evaluated on the other two. For a team, the report also shows the harm
-    that each vehicle bears. To show the effect of each learner and of the messages, the command trains further
-    policies. Ctrl-C ends the training early and evaluates the policy trained so far; a second Ctrl-C stops at once.
+    that each vehicle bears. For a team, the command also trains each learner alone and a team without messages, to show
+    the effect of each learner and of the messages. Ctrl-C ends the training early and evaluates the policy trained so
+    far; a second Ctrl-C stops at once.
     """
     with Out(as_json=as_json, force=force, remains=REMAINS) as out:
         # torch takes seconds to load, here and in the other commands that learn

@@ -202,7 +202,7 @@ def _check_directory(data: bytes) -> None:
     """Raise ``ValueError`` unless ``data`` ends like a simple zip archive with a small directory.
 
     Call this function before opening the archive, because a zip reader creates an object for every entry of the
-    directory.
+    archive's directory.
     """
     if len(data) < 22 or data[-22:-18] != b"PK\x05\x06":
         raise ValueError("not a plain .npz archive")

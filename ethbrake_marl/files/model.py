@@ -55,7 +55,7 @@ UNSHOWN = object()  # passed as a value, means: do not show the value in the err
 
 
 def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
-    """Raise the error for an invalid value in a pydantic validator.
+    """Raise, in a pydantic validator, the error for an invalid value.
 
     Args:
         at: path of the value (keys and indices) inside the checked field; ``()``: the field itself.
@@ -187,7 +187,10 @@ def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
 
 
 class Mistake(NamedTuple):
-    """The first mistake that pydantic found in data from a program. ``str`` gives its place and what would be valid."""
+    """The first mistake that pydantic found in data from a program.
+
+    ``str(mistake)`` is a text with the place of the mistake and what would be valid.
+    """
 
     place: str  # place of the mistake, keys joined by dots; empty if the data as a whole are invalid
     given: Any  # the invalid value
@@ -207,8 +210,8 @@ def first_mistake(error: ValidationError) -> Mistake:
 def path_of(detail: ErrorDetails) -> YamlPath:
     """Return the path (keys and indices inside the file) of a mistake that pydantic reports.
 
-    The tags of unions are removed from the path that pydantic reports. If ``refuse`` raised the error, its argument
-    ``at`` is appended.
+    The tags of unions are removed from the path that pydantic reports. If ``refuse`` raised the error, the argument
+    ``at`` of ``refuse`` is appended to the path.
     """
     keys = tuple(key for key in detail["loc"] if not (isinstance(key, str) and key.startswith("#")))
     return (*keys, *detail.get("ctx", {}).get("at", ()))

@@ -27,9 +27,9 @@ _READ: dict[str, set[str]] = {}  # SHA-256 of the other files that Python files 
 def load_from_file(path: str, name: str, reads: str | None = None) -> Any:
     """Run a Python file, once per process, and return the object ``name`` that it defines.
 
-    The file runs without restrictions. ``reads`` is the path of a file that the Python file uses, such as weights; its
-    SHA-256 is recorded if it exists. Raises ``InvalidInput`` if the Python file is missing, raises an error (the
-    message gives the line number), has changed since it ran, or does not define ``name``.
+    The code in the file runs without restrictions. ``reads`` is the path of a file that the Python file uses, such as
+    weights; its SHA-256 is recorded if it exists. Raises ``InvalidInput`` if the Python file is missing, raises an
+    error (the message gives the line number), has changed since it ran, or does not define ``name``.
     """
     _, module = _run_file(Path(path), f"file {path!r}")
     if not hasattr(module, name):

@@ -25,18 +25,18 @@ WIDE = 120  # smallest width of a terminal (characters) in which every column is
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """An estimate and its confidence interval; the interval is None if it cannot be computed (a single world)."""
+    """An estimate and its confidence interval; the interval is None if it cannot be computed (from one world)."""
 
     value: float  # estimated value
     interval: tuple[float, float] | None  # low and high end of the confidence interval
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Low and high end of the interval; both equal the value if there is no interval."""
+        """Low and high end of the confidence interval; both equal the value if there is no interval."""
         return self.interval or (self.value, self.value)
 
     def in_words(self, *, digits: int = 2, scale: float = 1.0, unit: str = "") -> str:
-        """Format value and interval as text: ``24.19 [23.85, 24.53]``.
+        """Format the estimate and its confidence interval as text: ``24.19 [23.85, 24.53]``.
 
         Args:
             digits: number of digits after the decimal point.
@@ -54,7 +54,7 @@ class Estimate:
     def side_by_side(estimates: Mapping[str, Estimate | None]) -> dict[str, Any]:
         """Convert estimates to a dictionary for JSON: ``{"x": 1.5, "x_interval": [1.0, 2.0]}``.
 
-        If the estimate ``x`` is None, ``x`` and ``x_interval`` are None.
+        If the estimate ``x`` is None, both ``x`` and ``x_interval`` are None in the dictionary.
         """
         cells: dict[str, Any] = {}
         for name, estimate in estimates.items():
@@ -64,14 +64,14 @@ class Estimate:
 
 
 class Shown(NamedTuple):
-    """Text of a table cell: the value, and the interval if the cell is an estimate."""
+    """Text of a table cell: the value, and the confidence interval if the cell is an estimate."""
 
     value: str  # the number, with its unit, or the text
     interval: str = ""  # ``23.85, 24.53``
 
     @property
     def in_words(self) -> str:
-        """Value and interval in one line: ``24.19 [23.85, 24.53]``."""
+        """Value and confidence interval in one line: ``24.19 [23.85, 24.53]``."""
         return f"{self.value} [{self.interval}]" if self.interval else self.value
 
 
@@ -175,7 +175,7 @@ class Sheet:
         return replace(self, columns=[self.columns[k] for k in names], rows=rows)
 
     def filled(self) -> list[int]:
-        """Return the indices of the columns in which some row has a value; all indices if there are no rows."""
+        """Return the indices of the columns in which some row has a value; all indices if the table has no rows."""
         rows = [row for row in self.rows if not isinstance(row, str)]
         return [
             k for k in range(len(self.columns)) if not rows or any(k < len(row) and row[k] is not None for row in rows)
@@ -184,8 +184,8 @@ class Sheet:
     def rich(self, width: int = WIDE) -> RenderableType:
         """Return the table, with the note below, as an object of ``rich`` for a terminal of ``width`` characters.
 
-        In a cell with several lines of text, all but the first line are dim. Columns marked ``wide`` are omitted if
-        ``width`` is below ``WIDE``.
+        In a cell with several lines of text, all but the first line are dim. Columns whose field ``wide`` is True are
+        omitted if ``width`` is below ``WIDE``.
         """
         from rich import box
         from rich.console import Group
@@ -241,7 +241,8 @@ class Sheet:
         """Return the table as HTML for a notebook or a page, with the title above and the note below.
 
         All content is escaped unless it has a method ``__html__``. The first cell of a row is the heading of the row.
-        Confidence intervals are shown in brackets. In the other columns, a long text may be broken into several lines.
+        Confidence intervals are shown in brackets. Long texts in the columns after the first may be broken
+        into several lines.
         """
         columns, label = self._columns(), self.title or f"Table: {self.headings[0]}"
         kinds = [' class="words"' if k and self.rows and column.text else "" for k, column in enumerate(columns)]
@@ -347,7 +348,8 @@ def parquet_file(
 
     Args:
         path: path of the new file.
-        told: function that is called at the end of the block and returns metadata for the file; None: no metadata.
+        told: function that is called at the end of the ``with`` block and returns metadata (key -> text) for the
+            Parquet file; None: no metadata.
         **options: options of ``pyarrow.parquet.ParquetWriter``.
 
     """

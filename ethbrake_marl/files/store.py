@@ -30,7 +30,7 @@ def write_file(path: Path, data: bytes) -> None:
 def new_file(path: Path) -> Iterator[Path]:
     """Context manager: yield the path of a temporary file, which is renamed to ``path`` if the block succeeds.
 
-    If the block raises an error, the temporary file is deleted.
+    If the ``with`` block raises an error, the temporary file is deleted.
     """
     descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=_HIDDEN, suffix=_UNFINISHED)
     os.close(descriptor)
@@ -55,10 +55,11 @@ def check_writable(folder: Path) -> None:
 
 
 def check_target(path: str | Path, *, force: bool = False) -> Path:
-    """Check that a file can be written to ``path``; return ``path`` as a ``Path``. For use before a long computation.
+    """Check that a file can be written to ``path``; return ``path`` as a ``Path``.
 
-    Raises ``AlreadyExists`` if the file exists and ``force`` is False. Raises ``InvalidInput`` if the file cannot be
-    written, or if ``path`` is a folder, device, pipe or symbolic link, which ``force`` does not replace.
+    Call this function before a long computation, so that the result can be written afterwards. Raises ``AlreadyExists``
+    if the file exists and ``force`` is False. Raises ``InvalidInput`` if the file cannot be written, or if ``path`` is
+    a folder, device, pipe or symbolic link, which ``force`` does not replace.
     """
     target = Path(path)
     try:
@@ -152,7 +153,7 @@ def remove_folder(path: Path) -> None:
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Delete temporary files that killed processes left in ``folder``; no other process may be writing there now."""
+    """Delete temporary files that killed processes left in ``folder``, to which no other process may be writing."""
     for left in folder.glob(f"{_HIDDEN}*{_UNFINISHED}"):
         if left.is_dir() and not left.is_symlink():
             shutil.rmtree(left)

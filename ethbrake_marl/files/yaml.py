@@ -210,7 +210,7 @@ class _Reader:
         _fail(self.file, self.at, reason)
 
     def _value(self, event: Any, path: YamlPath) -> Any:
-        """Return the value at ``path`` (keys and indices); its first YAML event is ``event``."""
+        """Return the value at ``path`` (keys and indices), reading from its first YAML event ``event``."""
         self._check_plain(event)
         self.lines.setdefault(path, self.at[0] + 1)
         if isinstance(event, yaml.ScalarEvent):

@@ -54,11 +54,11 @@ class Actor:
         return chosen
 
     def take(self, number: NDArray[np.int64], x: Float32s) -> Float32s:
-        """Return the action of the choice ``number`` for each observation, [1, rows].
+        """Return for each observation the action that belongs to the index in ``number``, [1, rows].
 
         Args:
-            number: index of the choice for each observation, [rows]. The first indices (0, 1, ...) choose a policy in
-                ``NetworkSpec.among``; the indices after them choose a fixed action.
+            number: index of the chosen policy or action for each observation, [rows]. In ``number``, the first indices
+                (0, 1, ...) choose a policy in ``NetworkSpec.among``; the indices after them choose a fixed action.
             x: observations, [F, rows].
 
         """

@@ -87,7 +87,7 @@ def _read(path: Path) -> bytes:
 
 
 def _check_observed(path: Path, manifest: Manifest) -> None:
-    """Check that the features that a policy observes are the same as when the policy was trained.
+    """Raise an error unless the features that a policy observes are the same as when the policy was trained.
 
     ``path`` is the path of the manifest file, for error messages. Raises ``InvalidInput`` for a registered feature that
     is missing or has changed, and ``CorruptBundle`` for features of this package that are missing or whose scaling has

@@ -82,7 +82,7 @@ class ObservationSchema(_Strict):
 
     @property
     def spec(self) -> ObservationSpec:
-        """The observation with these features; raises ``UnknownName`` if a feature does not exist any more."""
+        """The observation that this schema describes; raises ``UnknownName`` if a feature does not exist any more."""
         return choose_observation(self.features)
 
 

@@ -26,7 +26,7 @@ class TensorRow(NamedTuple):
     shape: tuple[int, ...]  # length of each axis
 
     def inside(self, part: str) -> TensorRow:
-        """Return this row with ``part.`` in front of the tensor's name, for a network inside another policy."""
+        """Return this row with ``part.`` in front of the tensor's name, for a tensor inside another policy."""
         return self._replace(name=f"{part}.{self.name}")
 
 
@@ -39,16 +39,16 @@ class NetworkSpec(FileModel):
     whose noise comes from a second head of the actor. If ``value_hidden`` is empty, there is no critic; a policy can
     act without a critic.
 
-    If ``networks`` is above 1, the policy is a mixture of experts. Such a policy has ``networks`` actors of the same
-    shape, and a gating network (hidden layers ``gate_hidden``) that scores the actors at every decision. The actor with
-    the highest score acts; if several actors have this score, the first of them acts. A mixture of experts has no noise
-    and no critic.
+    If ``networks`` is above 1, the policy is a mixture of experts. A mixture of experts has ``networks`` actors of the
+    same shape, and a gating network (hidden layers ``gate_hidden``) that scores the actors at every decision. The actor
+    with the highest score acts; if several actors have this score, the first of them acts. A mixture of experts has no
+    noise and no critic.
 
     With output ``choice`` the actor computes a score for each of ``choices`` actions, which are evenly spaced from -1
     to 1. The policy takes the action with the highest score; if several actions have this score, it takes the lowest of
-    these actions. A policy with output ``choice`` has no noise and no critic. Its actor may also score whole policies
-    (``among``), which act on the same observation. In the actor's result, the scores of the policies precede the scores
-    of the actions.
+    these actions. A policy with output ``choice`` has no noise and no critic. The actor of a policy with output
+    ``choice`` may also score whole policies (``among``), which act on the same observation. In the actor's result, the
+    scores of the policies precede the scores of the actions.
     """
 
     observation_size: Annotated[int, Field(ge=1, le=4096)]  # F, length of an observation
@@ -95,7 +95,7 @@ class NetworkSpec(FileModel):
 
     @property
     def actors(self) -> tuple[str, ...]:
-        """Prefix of each actor's tensor names: ``("policy",)``, or ``("network_1", "network_2", ...)``."""
+        """Prefix of the tensor names of each actor: ``("policy",)``, or ``("network_1", "network_2", ...)``."""
         return ("policy",) if self.networks == 1 else tuple(f"network_{m + 1}" for m in range(self.networks))
 
     @property
@@ -132,7 +132,7 @@ class NetworkSpec(FileModel):
 
     @property
     def _outputs(self) -> int:
-        """Number of outputs of each actor: size of an action, or number of scores if ``output`` is ``choice``."""
+        """Number of outputs of each actor: number of scores if ``output`` is ``choice``, else size of an action."""
         return self.action_size if self.choices is None else len(self.among) + self.choices
 
     def _network(self, name: str, hidden: tuple[int, ...], outputs: int) -> list[TensorRow]:

@@ -82,7 +82,7 @@ class Policy:
 
     @property
     def drivers(self) -> dict[str, Policy]:
-        """The policy itself, by the name of each vehicle that it learned to control: ``{"vehicle_2": policy}``."""
+        """Mapping from each vehicle that this policy learned to control to the policy: ``{"vehicle_2": policy}``."""
         return dict.fromkeys(self.manifest.learners, self)
 
     @classmethod
@@ -94,7 +94,7 @@ class Policy:
         Args:
             tensors: weights and biases by name, see ``NetworkSpec.tensors``.
             observation: the observation that is the input of the networks.
-            **manifest: the other fields of ``Manifest``; ``versions`` defaults to the installed versions.
+            **manifest: values of the other fields of ``Manifest``; ``versions`` defaults to the installed versions.
 
         Raises ``InvalidInput`` naming the invalid tensor or field.
 
@@ -133,7 +133,7 @@ class Policy:
     def save(self, folder: str | os.PathLike[str], *, replace: bool = False) -> None:
         """Write the bundle as a new folder, completely or not at all; raise ``AlreadyExists`` if the folder exists.
 
-        With ``replace``, an existing folder is deleted after the new folder was written.
+        With ``replace``, an existing folder with this path is deleted after the new folder was written.
         """
         own = content_sha256(self.manifest.model_dump(mode="json"))  # keys of older versions are not written
         manifest = self.manifest.model_copy(update={"manifest_sha256": own})
@@ -145,8 +145,9 @@ class Policy:
         """Return the ONNX model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
 
         The acceleration is the action times the vehicle's braking capacity (action below 0) or driving capacity (action
-        above 0). Both capacities are read from the observation. The ONNX model adds products in another order than this
-        package, so its results differ by rounding errors. Raises ``MissingExtra`` if the package onnx is not installed.
+        above 0). The braking and driving capacities are read from the observation. The ONNX model adds products in
+        another order than this package, so its results differ by rounding errors. Raises ``MissingExtra`` if the
+        package onnx is not installed.
         """
         return onnx_model(self.manifest, self.observation, self.tensors)
 

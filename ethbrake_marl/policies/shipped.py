@@ -1,7 +1,7 @@
 """Policies that are shipped with the package, loaded by name.
 
 Each shipped policy is a folder in ``_policies/`` with a bundle and ``card.md``. The card says in which scenario the
-policy was trained, how good it is, and where it fails.
+policy was trained, how good the policy is, and where it fails.
 """
 
 from __future__ import annotations

@@ -27,8 +27,8 @@ class PolicyTeam:
     def save(self, folder: str | os.PathLike[str], *, replace: bool = False) -> None:
         """Write a folder with one subfolder per learner, such as ``vehicle_2/``; each contains the learner's bundle.
 
-        Raises ``AlreadyExists`` if the folder exists. With ``replace``, an existing folder is deleted after the new
-        folder was written.
+        Raises ``AlreadyExists`` if the folder exists. With ``replace``, an existing folder with this path is deleted
+        after the new folder was written.
         """
         with new_folder(Path(folder), replace=replace) as partial:
             for name, policy in self.drivers.items():

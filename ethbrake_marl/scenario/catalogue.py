@@ -24,8 +24,8 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 def shipped_folder(folder: Literal["scenarios", "train"] = "scenarios") -> Path:
     """Return the folder of the shipped scenarios, or of the shipped recipes if ``folder`` is ``"train"``.
 
-    The folder is part of the source checkout or of the installed package. Raises ``InvalidInput`` if neither contains
-    the folder.
+    The folder is part of the source checkout or of the installed package. Raises ``InvalidInput`` if neither the source
+    checkout nor the installed package contains the folder.
     """
     checkout, installed = _PACKAGE.parent / folder, _PACKAGE / "_data" / folder
     if (_PACKAGE.parent / "pyproject.toml").is_file() and checkout.is_dir():
@@ -188,7 +188,7 @@ def _load(path: Path) -> Scenario:
 
 
 def _with_members(document: Document, folder: Path) -> Document:
-    """Return the document with scenarios of a mixture and rows of tables read from the files that it names.
+    """Return the document with the content of the scenario files and CSV files that the document names.
 
     Paths in the document are relative to ``folder``.
     """
@@ -314,7 +314,7 @@ def _line(key: str, values: Mapping[str, object]) -> str:
 
 
 def _short_member(entry: dict[str, Any]) -> dict[str, Any]:
-    """Return an item of a mixture's list, with the content of a shipped scenario replaced by its name."""
+    """Return an entry of the list ``mixture``, with the content of a shipped scenario replaced by its name."""
     content, name = entry["scenario"], entry["scenario"]["name"]
     as_shipped = name in _shipped_paths() and member_content(load_scenario(name)) == content
     return {**entry, "scenario": name} if as_shipped else entry

@@ -1,30 +1,30 @@
-"""The channel between vehicles: V2X messages on each link, losses, and sensors that see the neighbours.
+"""The channel between vehicles: V2X messages on each link, losses of messages, and sensors that see the neighbours.
 
 A link is the direction from a sending vehicle j to a receiving vehicle i. A message contains the sender's place, speed,
 acceleration, braking capacity, latency and mass, or the items listed in ``tells``. Vehicle i can use the first message
-of vehicle j from this time on, in s after the alert:
+of vehicle j from the time ``tau_ij`` (in s after the alert) on:
 
     tau_ij = U(0, T) + k T + L_radio + t_proc + t_act
 
 T is the message period, and ``U(0, T)`` the random wait for the next message. L_radio is the time of transmission,
 t_proc the time until the message is processed, and t_act the time until the brakes respond. ``k`` is the number of
 message periods during which a burst of losses destroys every message. In each period, a burst begins with probability
-p, and an ongoing burst ends with probability r. In the stationary state of this Gilbert-Elliott channel ``P(k >= m) =
+p, and an ongoing burst ends with probability r. In the stationary state of this Gilbert-Elliott channel, ``P(k >= m) =
 (p / (p + r)) (1 - r)^(m - 1)`` for m = 1, 2, ... With probability ``lost`` no message ever arrives on a link. A
 vehicle's sensors see its direct neighbours after a delay, called a *hop*, which is drawn from the range ``sensing_s``.
-Vehicle i can react to the emergency from this time on:
+Vehicle i can react to the emergency from the time ``latency_i`` (in s after the alert) on:
 
     latency_i = max(own latency_i, min(tau_i1, latency_(i-1) + hop_(i, i-1)))
 
-Before this time vehicle i has neither received the message of Vehicle 1 nor seen the vehicle ahead brake. Vehicle i
-knows the state of vehicle j from ``max(latency_i, tau_ij)`` on. If vehicle i also sees vehicle j, it knows the state of
-vehicle j from ``max(latency_i, min(tau_ij, hop_ij))`` on. If a vehicle observes another vehicle's latency, it observes
-the *own* latency of that vehicle, which does not include delays of the channel. Under the preset ``paper`` a vehicle
-knows everything as soon as its own latency has elapsed.
+At the time ``latency_i`` the own latency of vehicle i has elapsed, and vehicle i has received the message of Vehicle 1
+or seen the vehicle ahead brake. Vehicle i knows the state of vehicle j from ``max(latency_i, tau_ij)`` on. If vehicle i
+also sees vehicle j, it knows the state of vehicle j from ``max(latency_i, min(tau_ij, hop_ij))`` on. If a vehicle
+observes another vehicle's latency, it observes the *own* latency of that vehicle, which does not include delays of the
+channel. Under the preset ``paper`` a vehicle knows everything as soon as its own latency has elapsed.
 
 With ``persistence: first``, vehicle i knows the present state of vehicle j after the first message. With ``persistence:
 periodic``, vehicle j sends a message in every period T, and the same Gilbert-Elliott channel may lose it. Vehicle i
-then knows the state of vehicle j in the newest message that arrived (``physics.messages``).
+then knows the state of vehicle j that the newest arrived message contains (``physics.messages``).
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class Equipage(FileModel):
 class Equipped(NamedTuple):
     """V2X equipment of the vehicles in n worlds.
 
-    The arrays have a single row (n = 1) if all worlds have the same equipment, or if the row describes the least
+    The arrays have a single row (n = 1) if all worlds have the same equipment, or if the row contains the least
     equipment that each vehicle has in any world.
     """
 
@@ -91,7 +91,7 @@ class Equipped(NamedTuple):
 
     @property
     def unheard(self) -> Bools:
-        """Whether vehicle i (second axis) never receives a message from vehicle j (third axis), [n, N, N]."""
+        """Mask [n, N, N]: True where vehicle i (second axis) never receives a message from vehicle j (third axis)."""
         receiver, sender = np.indices((self.sends.shape[1],) * 2)
         hears = self.hears[:, :, np.newaxis]
         unheard: Bools = ~self.sends[:, np.newaxis] | (hears == 2) | ((hears == 1) & (sender >= receiver))
@@ -119,9 +119,9 @@ class Channel(NamedTuple):
     tells: Tells | None = None  # items of PIECES that a message contains; None: USUAL_PIECES
 
     def contents(self, vehicles: int) -> Bools | None:
-        """Return whether the messages of each vehicle contain each item of ``PIECES``, [N, len(PIECES)].
+        """Return a mask [N, len(PIECES)]: True where the messages of a vehicle contain an item of ``PIECES``.
 
-        Return None if ``tells`` is not given; messages then contain the items in ``USUAL_PIECES``.
+        If ``tells`` is not given, return None; messages then contain the items in ``USUAL_PIECES``.
         """
         if self.tells is None:
             return None
@@ -140,7 +140,7 @@ class Channel(NamedTuple):
     def samples(self, time_step_s: float) -> int:
         """Return how many samples of its own state a vehicle stores for its messages; 0 without periodic messages.
 
-        ``time_step_s``: time between two decisions (s); a vehicle stores one sample at each decision.
+        ``time_step_s``: time between two decisions (s); a vehicle stores one sample of its state at each decision.
         """
         return Messages.ring_length(self.delay_s, time_step_s) if self.persistence == "periodic" else 0
 
@@ -181,7 +181,7 @@ Preset = Annotated[str, AfterValidator(_known_preset), _PresetSchema]
 
 
 def _pieces(value: Any) -> Tells | None:
-    """Check the value of ``tells``, and return its items in the order of ``PIECES``.
+    """Check the value of the key ``tells`` (what messages contain); return its items in the order of ``PIECES``.
 
     ``value``: list of the items that messages contain (for all vehicles), or a mapping from vehicle names to such
     lists.
@@ -297,7 +297,7 @@ class V2X(FileModel):
         return self
 
     def _leave_out(self, names: tuple[str, ...], why: str) -> None:
-        """Raise an error if one of the keys ``names`` is given although it has no effect.
+        """Raise an error if one of the keys ``names`` is in the settings although it has no effect.
 
         ``why``: reason why the key has no effect, for the error message.
         """
@@ -316,7 +316,7 @@ class V2X(FileModel):
 
     @property
     def channel(self) -> Channel:
-        """The channel: the values of the preset, replaced by the settings that are given."""
+        """The channel that ``v2x`` describes: the values of the preset, except where ``v2x`` gives another value."""
         values = {name: getattr(self, name) for name in Channel._fields[1:] if getattr(self, name) is not None}
         base = CHANNELS[self.preset]
         return base._replace(timing="fixed" if self.link_latency_s is not None else base.timing, **values)
@@ -333,7 +333,7 @@ class V2X(FileModel):
 
     @property
     def drawn(self) -> bool:
-        """Whether the channel is random: what vehicles know, and when, differs from world to world."""
+        """True if random numbers determine what vehicles know, or when they know it."""
         channel = self.channel
         low, high = channel.sensing_s
         by_messages = channel.timing == "messages" and channel.hears != "none"
@@ -342,11 +342,11 @@ class V2X(FileModel):
         return self.by_link and (by_messages or lossy or (channel.senses != "none" and low != high))
 
     def latest_reaction_s(self, own_latency_s: Floats, equipped: Equipped) -> Floats:
-        """Return an upper bound of the time from which each vehicle can react, [N] s.
+        """Return, for each vehicle, an upper bound of the time from which the vehicle can react, [N] s.
 
         Args:
             own_latency_s: upper bounds of the vehicles' own latencies, without delays of the channel, [N] s.
-            equipped: least V2X equipment of the vehicles in any world, [1, N].
+            equipped: for each vehicle, the least V2X equipment that the vehicle has in any world, [1, N].
 
         """
         channel, latest = self.channel, own_latency_s.copy()
@@ -365,14 +365,14 @@ class V2X(FileModel):
         return PER_LINK * vehicles * vehicles
 
     def with_news(self, vehicles: Vehicles, u: Floats, equipped: Equipped) -> Vehicles:
-        """Return ``vehicles`` with the channel's effect on latencies, and the times from which each knows the others.
+        """Return ``vehicles`` with the channel's delays in the latencies, and times from which each knows the others.
 
-        The latencies in the argument ``vehicles`` must not include delays of a channel; they become ``own_latency_s``
-        of the result.
+        The argument ``vehicles`` must contain latencies without delays of a channel; these latencies become
+        ``own_latency_s`` of the result.
 
         Args:
             vehicles: parameters of the vehicles in n worlds.
-            u: uniform numbers in [0, 1) for the links, [n, N * N * PER_LINK].
+            u: uniform numbers in [0, 1) that draw the random values of all links, [n, N * N * PER_LINK].
             equipped: V2X equipment, one row per world or one row for all worlds.
 
         """
@@ -387,12 +387,13 @@ class V2X(FileModel):
         return replace(vehicles, latency_s=latency, known_from_s=known)
 
     def heard_and_seen(self, u: Floats, equipped: Equipped) -> tuple[Floats, Floats]:
-        """Return (heard, seen): when vehicle i can use the first message of vehicle j, and the delay of seeing j.
+        """Return (heard, seen): the time from which i can use the first message of j, and the delay until i sees j.
 
-        Both arrays have the shape [n, N, N] (world, i, j) and the unit s. Infinite means never.
+        Here i and j are vehicles; ``heard`` and ``seen`` have the shape [n, N, N] (world, i, j) and the unit s.
+        Infinite means never.
 
         Args:
-            u: uniform numbers in [0, 1) for the links, [n, N * N * PER_LINK].
+            u: uniform numbers in [0, 1) that draw the random values of all links, [n, N * N * PER_LINK].
             equipped: V2X equipment, one row per world or one row for all worlds.
 
         """
@@ -409,12 +410,13 @@ class V2X(FileModel):
         return heard, np.where(in_sight[channel.senses], hop, np.inf)
 
     def with_channel(self, worlds: Worlds, u: Floats, key: Floats, time_step_s: float, equipped: Equipped) -> Worlds:
-        """Return ``worlds`` with the times from which each vehicle knows the others, and the data of periodic messages.
+        """Return ``worlds`` with the times from which each vehicle knows the others, and with the periodic messages.
 
         Args:
-            worlds: worlds without a channel, at the alert (time 0).
-            u: uniform numbers in [0, 1) for the links, [n, N * N * PER_LINK].
-            key: seed of the losses of all messages after the first one, a number in [0, 1) for each world, [n].
+            worlds: worlds at the alert (time 0) that do not contain data of a channel yet.
+            u: uniform numbers in [0, 1) that draw the random values of all links, [n, N * N * PER_LINK].
+            key: number in [0, 1) for each world, [n], from which the random losses of all messages after the first one
+                are computed.
             time_step_s: time between two decisions (s); vehicles sample their states at each decision.
             equipped: V2X equipment, one row per world or one row for all worlds.
 
@@ -436,10 +438,11 @@ class V2X(FileModel):
         """Return the user's ``worlds`` with this channel's data added; raise ``InvalidInput`` if the channel is random.
 
         Args:
-            worlds: worlds without a channel.
+            worlds: worlds that do not contain data of a channel yet.
             time_step_s: time between two decisions (s).
             where: beginning of the error message, which says where the user gave the worlds.
-            equipped: V2X equipment of the vehicles, one row for all worlds; None if the equipment is random.
+            equipped: V2X equipment of the vehicles, in one row for all worlds; None if the equipment differs randomly
+                between worlds.
 
         """
         if not self.by_link:
@@ -457,9 +460,9 @@ class V2X(FileModel):
 def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
     """Return the number k of message periods that a burst of losses lasts, in the shape of ``u``.
 
-    The result k is at least m exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``. This rule is the inverse of the
-    distribution function of k in the stationary Gilbert-Elliott channel. k is computed without logarithms, so every
-    machine gets the same k.
+    For m = 1, 2, ..., the result k is at least m exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``. This rule is the
+    inverse of the distribution function of k in the stationary Gilbert-Elliott channel. The number k is
+    computed without logarithms, so every machine gets the same k.
 
     Args:
         u: uniform numbers in [0, 1).

@@ -242,7 +242,7 @@ class ScenarioFields(FileModel):
     @field_validator(*QUANTITY.declared)
     @classmethod
     def _entries(cls, value: Any, info: ValidationInfo) -> Any:
-        """Check that all possible values of a quantity are in range, and that a list has the required length."""
+        """Check that every possible value of a quantity is in range, and that a list has one per vehicle or pair."""
         rule, vehicles = QUANTITY.declared[str(info.field_name)], info.data.get("vehicles")
         if value is None:
             return value
@@ -318,12 +318,12 @@ class ScenarioFields(FileModel):
 
     @property
     def scripts(self) -> dict[int, str]:
-        """Scripts of the vehicles that do not learn: vehicle index (from 0) -> script."""
+        """Scripts of the vehicles that do not learn: index of the vehicle (from 0) -> name of its script."""
         roles = [self.roles[name] for name in self.vehicle_names]
         return {i: role for i, role in enumerate(roles) if role != LEARNER}
 
     def play_pieces(self, worlds: Worlds, driven: Sequence[int] = ()) -> Worlds:
-        """Return ``worlds`` with the fixed command sequence of each vehicle that follows a ``profile`` script.
+        """Return ``worlds`` with the commands over time of each vehicle that follows a ``profile`` script.
 
         ``driven``: indices (from 0) of controlled vehicles, which follow no script.
         """
@@ -362,19 +362,19 @@ class ScenarioFields(FileModel):
 
     @property
     def table_entries(self) -> dict[Entry, TableColumn]:
-        """Columns of the scenario's table by quantity and index, ``{("gaps_m", 0): column}``; empty without a table."""
+        """Columns of the scenario's table by key and index, ``{("gaps_m", 0): column}``; empty without a table."""
         return self._columns
 
     @property
     def recordings(self) -> TableColumn | None:
-        """Table column with the name of each row's recording; None without such a column, and for a mixture."""
+        """Column of the table that names each row's recording; None for a mixture, or without such a column."""
         return self._recordings
 
     @property
     def by_link(self) -> bool:
         """Whether ``v2x`` differs from the paper's rule (a vehicle knows everything once its own latency has elapsed).
 
-        For a mixture: whether ``v2x`` differs from this rule in at least one of the scenarios.
+        For a mixture: whether ``v2x`` differs from the paper's rule in at least one of the scenarios.
         """
         return any(member.by_link for member in self.members) or self.v2x.by_link
 
@@ -384,7 +384,7 @@ class ScenarioFields(FileModel):
         return None if self.vehicle_types is None else TypesOfLine(self.vehicle_types, self.types, self.vehicles)
 
     def equipped(self, types: Ints | None = None) -> Equipped:
-        """Return the vehicles' V2X equipment in worlds with the vehicle types ``types`` (indices, [n, N]).
+        """Return the V2X equipment of vehicles with the types ``types`` (indices of vehicle types, [n, N]).
 
         If ``types`` is None, the result has one row, [1, N]: for each vehicle the least equipment of all its possible
         types.
@@ -405,11 +405,12 @@ class ScenarioFields(FileModel):
         return Equipped(np.stack(sends, axis=1), np.stack(hears, axis=1))
 
     def possible_quantities(self, field: str) -> tuple[dict[int, AnyTypeQuantity], ...]:
-        """Return the declarations of a quantity by vehicle type, one mapping for each vehicle, pair or world.
+        """Return for each vehicle, pair or world a mapping from vehicle type to the declaration of the quantity.
 
         An example is ``({0: 2.0, 1: 9.5}, ...)`` for ``mass_t``. The keys of a mapping are the indices of the vehicle's
         possible types; without vehicle types the only key is 0. If a vehicle type does not declare the quantity, the
-        mapping has the scenario's general declaration for this type. Raises the same errors as ``quantities``.
+        mapping has the scenario's general declaration for this type. Raises the same errors as the method
+        ``quantities``.
         """
         line = self.types_of_line
         if line is None or field not in QUANTITY.of_a_type:
@@ -508,8 +509,8 @@ def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]
 def on_road(found: Mapping[str, Floats]) -> dict[str, Floats]:
     """Return ``found`` with all braking and driving capacities limited to friction times gravity.
 
-    ``found`` maps keys such as ``"friction"`` and ``"braking_capacity_mps2"`` to values, [k, entries]. If the key
-    ``"friction"`` is missing, the capacities are not limited.
+    ``found`` maps keys such as ``"friction"`` and ``"braking_capacity_mps2"`` to values, [k, entries]. If ``found`` has
+    no key ``"friction"``, the capacities are not limited.
     """
     return as_road_allows(found, found["friction"]) if "friction" in found else dict(found)
 
@@ -519,13 +520,13 @@ def obstacle_gap(
 ) -> Floats | None:
     """Return the distance from Vehicle 1 to the obstacle ahead in k worlds, [k] m; None without an obstacle.
 
-    A scenario declares either this distance or a margin, the distance from the point where Vehicle 1 stops by full
-    braking to the obstacle. With a margin ``distance = margin + v_1 tau_1 + v_1^2 / (2 a_1)``. Vehicle 1 has the speed
-    v_1, the latency tau_1 and the braking capacity a_1, and its brakes act at once.
+    A scenario declares either the distance to the obstacle, or a margin: the distance between the obstacle and the
+    point where Vehicle 1 stops by full braking. If a margin is declared, ``distance = margin + v_1 tau_1 + v_1^2 / (2
+    a_1)``. Vehicle 1 has the speed v_1, the latency tau_1 and the braking capacity a_1, and its brakes act at once.
 
     Args:
         scenario: the scenario that declares the obstacle.
-        found: the other quantities of the k worlds: key -> values, [k, entries].
+        found: all quantities of the k worlds except the distance to the obstacle: key -> values, [k, entries].
         declared: function that maps ``"obstacle_gap_m"`` or ``"obstacle_margin_m"`` to its value in each world, [k].
 
     """

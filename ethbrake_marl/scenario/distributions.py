@@ -117,7 +117,7 @@ class Normal(_Distribution):
         return self
 
     def _bounds(self) -> tuple[float, float]:
-        """Return the probabilities that a value of the untruncated distribution is below low, and below high."""
+        """Return the probabilities that a value before truncation is below ``low``, and that it is below ``high``."""
         shape = self.normal
         low, high = (normal_probability((end - shape.mean) / shape.sd) for end in (shape.low, shape.high))
         return low, high
@@ -130,9 +130,9 @@ class Normal(_Distribution):
     def value(self, u: Floats) -> Floats:
         """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
 
-        A value is ``mean + sd Q(p_low + (p_high - p_low) u)``. Q is the quantile function of the standard normal
-        distribution; p_low and p_high are the probabilities that the untruncated distribution gives a value below low,
-        and below high.
+        A value is ``mean + sd Q(p_low + (p_high - p_low) u)``, where Q is the quantile function of the standard normal
+        distribution. The numbers p_low and p_high are the probabilities that a value before truncation is below
+        ``low``, and below ``high``.
         """
         shape = self.normal
         below, above = self._bounds()
@@ -205,7 +205,8 @@ class Choice(_Distribution):
     def value(self, u: Floats) -> Floats:
         """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
 
-        A value is the first entry of ``choice`` whose cumulative weight, normalised to a total of 1, is above u.
+        The value for ``u`` is the first entry of ``choice`` whose cumulative weight, normalised to a total of 1, is
+        above ``u``.
         """
         cumulative = np.cumsum(np.asarray(self.weights or (1.0,) * len(self.choice)))
         cumulative /= cumulative[-1]
@@ -230,7 +231,7 @@ class TableColumn:
 
     @property
     def middle(self) -> TableColumn:
-        """A column with a single row, which contains the weighted median of this column."""
+        """Copy of this column with a single row, which contains the weighted median of all rows."""
         order = np.argsort(self.rows, kind="stable")
         shares = np.cumsum(np.diff(self.cumulative, prepend=0.0)[order])
         return replace(self, rows=self.rows[order][[np.searchsorted(shares, 0.5)]], cumulative=np.ones(1))
@@ -238,7 +239,7 @@ class TableColumn:
     def value(self, u: Floats) -> NDArray[Any]:
         """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
 
-        A value comes from the first row whose cumulative weight, normalised to a total of 1, is above u.
+        The value for ``u`` stands in the first row whose cumulative weight, normalised to a total of 1, is above ``u``.
         """
         return self.rows[np.searchsorted(self.cumulative, u, side="right")]
 
@@ -246,7 +247,7 @@ class TableColumn:
 def _kind(value: object) -> str | None:
     """Return the tag of the class in ``Quantity`` that checks a value from a file, such as ``"#uniform"``.
 
-    Return None for a list, or for a mapping that contains no name of a distribution.
+    Return None for a list, and for a mapping that contains no name of a distribution.
     """
     if isinstance(value, _Distribution):
         return f"#{type(value).__name__.lower()}"
@@ -296,7 +297,8 @@ class WithLoad(_Distribution):
     def value(self, load: Floats, u: Floats) -> Floats:
         """Return ``empty + (full - empty) load``, plus an amount that ``u`` draws from ``spread``.
 
-        The arrays ``load`` (loads in [0, 1]) and ``u`` (uniform numbers in [0, 1)) and the result have the same shape.
+        The array ``load`` (loads in [0, 1]), the array ``u`` (uniform numbers in [0, 1)) and the result have the same
+        shape.
         """
         empty, full = self.with_load
         moved = np.clip(empty + (full - empty) * load, min(self.with_load), max(self.with_load))
@@ -309,7 +311,7 @@ AnyTypeQuantity = AnyQuantity | WithLoad
 
 
 def support(quantity: AnyTypeQuantity) -> tuple[float, float]:
-    """Return the smallest and largest value that ``quantity`` can have."""
+    """Return the smallest and the largest value that ``quantity``, a number or distribution, can have."""
     return (quantity, quantity) if isinstance(quantity, float) else quantity.support
 
 

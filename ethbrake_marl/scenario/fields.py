@@ -75,7 +75,7 @@ class QuantityRule:
         return f"finite and in {'(' if self.positive else '['}{self.low:g}, {self.high:g}]{unit}"
 
     def allows(self, low: float, high: float) -> bool:
-        """Return whether every value from ``low`` to ``high`` is in the allowed range; False for NaN."""
+        """Return whether all values from ``low`` to ``high`` are allowed for this quantity; False for NaN."""
         return (low > 0.0 if self.positive else low >= self.low) and high <= self.high
 
     def count(self, vehicles: int) -> int:
@@ -83,7 +83,7 @@ class QuantityRule:
         return {"vehicle": vehicles, "pair": vehicles - 1, "world": 1}[self.per]
 
     def place(self, index: int) -> Place:
-        """Return (stream, column) of the uniform number that draws the value of vehicle or pair ``index`` (from 0)."""
+        """Return (stream, column) of the random number that draws the value of vehicle or pair ``index`` (from 0)."""
         return self.stream, BLOCK * (self.block + index) + self.slot
 
     def column_of(self, index: int) -> str:
@@ -131,9 +131,9 @@ class Quantities(NamedTuple):
     def of(self, worlds: Worlds) -> dict[str, QuantityRule]:
         """Return the quantities that ``worlds`` have: key -> ``QuantityRule``.
 
-        Of the optional quantities, friction is included if all worlds have it, the distance to an obstacle if some
-        world has an obstacle, brake and release rates if some rate is finite, and the weights of harm if some weight is
-        not 1.
+        The result contains friction only if all worlds have it, the distance to an obstacle only if at least one world
+        has an obstacle, brake and release rates only if at least one rate is finite, and the weights of harm only if at
+        least one weight is not 1.
         """
         there = {"obstacle_gap_m": worlds.obstacle_ahead.any(), "friction": np.isfinite(worlds.friction).all()}
         there["harm_weight"] = (worlds.vehicles.harm_weight != 1.0).any()
@@ -267,7 +267,7 @@ Entry = tuple[str, int]  # quantity and index (from 0) of the vehicle or pair
 
 
 def columns_of_table(rules: Mapping[str, QuantityRule], vehicles: int) -> dict[str, Entry]:
-    """Return the columns of a table with these quantities: name -> (quantity, index).
+    """Return the columns of a table that has the quantities in ``rules``: column name -> (key of the quantity, index).
 
     An example is ``{"gap_1_m": ("gaps_m", 0), ...}``.
 
@@ -283,7 +283,8 @@ def columns_of_table(rules: Mapping[str, QuantityRule], vehicles: int) -> dict[s
 def is_tabled(data: Mapping[str, Any], key: str) -> bool:
     """Return whether a scenario's table has columns of the quantity ``key`` for every vehicle, pair or world.
 
-    ``data``: scenario fields that have been checked already, by name; only ``table`` and ``vehicles`` are used.
+    ``data``: scenario fields that have been checked already: name of the field -> value; only ``table`` and
+    ``vehicles`` are used.
     """
     table, rule = data.get("table"), QUANTITY.declared[key]
     if table is None or "vehicles" not in data or not rule.column:

@@ -32,12 +32,12 @@ def with_follower(document: Document, build: Callable[[Document], Any]) -> Docum
     """Return the document with the follower as one more vehicle of the line, and without the key ``follower``.
 
     In the result, tables and lists also have entries for the follower. If the follower is invalid, the document is
-    returned unchanged, and the schema rejects the document later. Raises ``InvalidInput`` if the line is invalid, if it
-    has vehicle types, or if the speed of the last vehicle is random and not in the table.
+    returned unchanged, and the schema rejects the document later. Raises ``InvalidInput`` if the line of vehicles is
+    invalid, if vehicle types are declared, or if the speed of the last vehicle is random and not a column of the table.
 
     Args:
         document: parsed file with a key ``follower``.
-        build: function that builds a scenario from a document.
+        build: function that builds a scenario from a document (the parsed content of a file).
 
     """
     content, where = dict(document.content), f"{document.where(('follower',))}: follower"

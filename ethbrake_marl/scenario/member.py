@@ -15,7 +15,7 @@ from ethbrake_marl.scenario.vehicle_types import Weight
 class _MemberSchema:
     """Pydantic annotation of ``Member.scenario``: the field's JSON schema allows a mapping or a text.
 
-    In a file, the text is the name of a scenario or the path of its file.
+    In a file, a text in the field ``scenario`` is the name of a scenario or the path of its file.
     """
 
     @classmethod

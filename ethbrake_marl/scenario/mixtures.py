@@ -48,7 +48,7 @@ def build_members(
 
     Args:
         document: parsed file with a key ``mixture``.
-        build: function that builds one scenario from a document.
+        build: function that builds one scenario from a document (the parsed content of a file).
 
     """
     listed, content = document.content["mixture"], document.content
@@ -71,7 +71,7 @@ def _is_whole(entry: Any) -> bool:
 
 
 def member_content(member: ScenarioFields) -> dict[str, Any]:
-    """Return everything that determines the worlds of one scenario of a mixture, as plain data.
+    """Return all values that determine the worlds of one scenario of a mixture, as plain data.
 
     The result contains the declared values and the settings that all scenarios of a mixture share, but no title,
     description or source.
@@ -85,7 +85,7 @@ def _member_document(document: Document, i: int, entry: Mapping[str, Any], besid
 
     Args:
         document: parsed file of the mixture.
-        i: position of the scenario in the mixture's list, from 0.
+        i: position of the scenario in the list ``mixture``, from 0.
         entry: content of the mixture's list at this position.
         beside: keys and values that stand beside ``mixture`` in the file; they replace the same keys of the scenario.
 
@@ -101,8 +101,9 @@ def _member_document(document: Document, i: int, entry: Mapping[str, Any], besid
 def _check_members(document: Document, members: Sequence[ScenarioFields]) -> None:
     """Raise ``InvalidInput`` if the scenarios ``members`` of a mixture cannot be drawn together.
 
-    No member may be a mixture, their names must differ, and all must have the same number of vehicles, time step,
-    horizon, roles, objective and observation. ``document``: the mixture's file, for error messages.
+    No scenario of a mixture may itself be a mixture, the names of the scenarios must differ, and all scenarios must
+    have the same number of vehicles, time step, horizon, roles, objective and observation. ``document``: the mixture's
+    file, for error messages.
     """
     where = f"{document.where(('mixture',))}: mixture"
     first = members[0]

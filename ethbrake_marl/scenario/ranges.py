@@ -79,10 +79,10 @@ def _of_quantities(scenario: ScenarioFields) -> dict[str, Place]:
 
 
 def _of_types(scenario: ScenarioFields) -> dict[str, Place]:
-    """Return which uniform numbers draw vehicle types and loads: name -> (stream of random numbers, column).
+    """Return which uniform numbers draw types and loads: name -> (stream of random numbers, column of the stream).
 
-    Numbers without effect are left out: the number of a vehicle's type if only one type is possible, and the number of
-    its load if no quantity depends on the load.
+    Random numbers without effect are left out: the number that draws a vehicle's type if only one type is possible, and
+    the number that draws its load if no quantity depends on the load.
     """
     if scenario.types_of_line is None:
         return {}
@@ -110,7 +110,7 @@ def ranges(scenario: ScenarioFields) -> Ranges:
     """Return the coordinates of the scenario's unit cube, one for every random number of a world.
 
     Raises ``InvalidInput`` if the scenario has nothing random, if it is a mixture, or if its channel is not ``paper``.
-    In a mixture, and with other channels, a point of the cube would not determine a world.
+    In a mixture, or with another channel, a point of the unit cube would not determine a world.
     """
     if scenario.members:
         members = ", ".join(member.name for member in scenario.members)

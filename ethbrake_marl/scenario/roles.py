@@ -75,7 +75,7 @@ class ScriptSpec(NamedTuple):
 
     @property
     def pieces(self) -> tuple[tuple[float, float], ...]:
-        """Intervals of constant braking of a ``profile``; an empty tuple for any other script.
+        """Intervals of constant braking of a script ``profile``; an empty tuple for any other script.
 
         Each interval is (start in s after the latency, deceleration in m/s2). Raises ``InvalidInput`` unless the starts
         begin with 0 and increase, and no deceleration is negative.
@@ -93,7 +93,7 @@ class ScriptSpec(NamedTuple):
     def is_state_free(self) -> bool:
         """Return whether the script does not need the state: ``full_brake``, ``coast``, ``constant:a`` or a profile.
 
-        Raises ``InvalidInput`` if the argument of one of these scripts is missing, invalid or not allowed.
+        Raises ``InvalidInput`` if the argument of such a script is missing, invalid or not allowed.
         """
         if self.name == _PROFILE:
             return len(self.pieces) > 0
@@ -108,10 +108,11 @@ class ScriptSpec(NamedTuple):
     ) -> Floats | None:
         """Return the command (m/s2, negative for braking) of a script that does not need the state.
 
-        The result has the shape of ``braking_capacity_mps2``. The command is minus the braking capacity for
+        The returned command has the shape of ``braking_capacity_mps2``. The command is minus the braking capacity for
         ``full_brake``, 0 for ``coast``, -a for ``constant:a``, the first command for a ``profile``, and None for any
-        other script. Raises ``InvalidInput`` if a deceleration exceeds the braking capacity of a vehicle, or a forward
-        acceleration its driving capacity (checked only if ``driving_capacity_mps2`` is given).
+        other script. Raises ``InvalidInput`` if a deceleration exceeds the braking capacity of a vehicle, or if a
+        forward acceleration exceeds the driving capacity of a vehicle (checked only if ``driving_capacity_mps2`` is
+        given).
         """
         capacity = np.asarray(braking_capacity_mps2, dtype=np.float64)
         if not self.is_state_free():

@@ -25,10 +25,10 @@ def clusters_of(kinds: Mapping[str, _Texts], index: Ints) -> _Texts | None:
     """Return the name of each world's cluster, [n], or None if all worlds are independent.
 
     Worlds of the same cluster are not statistically independent. A cluster contains all worlds from one recording, even
-    if they show different vehicles. In a mixture, a world without a recording is a cluster of its own.
+    if these worlds contain different vehicles. In a mixture, a world without a recording is a cluster of its own.
 
     Args:
-        kinds: texts about the worlds by name, [n] each, such as ``Sample.kinds``.
+        kinds: texts about each world, such as ``Sample.kinds``: name of the column -> texts, [n].
         index: number of each world in its list, [n].
 
     """
@@ -41,7 +41,7 @@ def clusters_of(kinds: Mapping[str, _Texts], index: Ints) -> _Texts | None:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """Worlds at the alert (time 0), with their numbers in the list of worlds.
+    """Worlds at the alert (time 0), each with its number in the list of worlds.
 
     >>> import ethbrake_marl as eb
     >>> sample = eb.load_scenario("paper-random").sample(2, seed=7)
@@ -70,8 +70,8 @@ class Sample:
     def join(parts: Sequence[Sample], rejected: int) -> Sample:
         """Join samples into one, in the order of their world numbers.
 
-        Vehicle types must be given in all of ``parts`` or in none, and so must scenarios and recordings. ``rejected``:
-        number of rejected draws, which becomes ``Sample.rejected``.
+        Vehicle types must be in all samples of ``parts`` or in none; the same applies to scenarios and to recordings.
+        ``rejected``: number of rejected draws, which becomes ``Sample.rejected``.
         """
         index = np.concatenate([part.index for part in parts])
         order = np.argsort(index)
@@ -84,7 +84,7 @@ class Sample:
 
     @property
     def kinds(self) -> dict[str, _Texts]:
-        """Columns of text about the worlds, by name: ``scenario``, ``recording``, ``vehicle_1_type`` ..., [n] each.
+        """Columns of text about the worlds: name (``scenario``, ``recording``, ``vehicle_1_type``, ...) -> texts, [n].
 
         The column ``scenario`` exists for a mixture, ``recording`` for a table that names recordings, and
         ``vehicle_1_type`` and so on for a scenario with vehicle types.
@@ -102,8 +102,8 @@ class Sample:
     def count_kinds(self) -> str:
         """Return a text with the number of worlds for each scenario of a mixture and each vehicle type.
 
-        An example is ``"; vehicle_1_type: car 7, truck 3"``. For recordings the text contains only the number of
-        different recordings. The text is empty if the sample has no ``kinds``.
+        An example is ``"; vehicle_1_type: car 7, truck 3"``. For the column ``recording``, the text contains only the
+        number of different recordings. The text is empty if the sample has no ``kinds``.
         """
         text = ""
         for kind, column in self.kinds.items():

@@ -56,11 +56,11 @@ def sample(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, chann
         n: number of worlds.
         seed: seed of the list, a whole number of at least 0.
         first: number of the first world in the list, from 0.
-        channel: ``"list"`` (worlds for evaluation) or ``"training"``. Each seed has one list of each kind; the two
-            lists are independent.
+        channel: ``"list"`` (worlds for evaluation) or ``"training"``. Each seed has one list for evaluation and one
+            list for training; the two lists are independent.
 
     Raises ``InvalidInput`` for a negative ``seed`` or ``first``, and for ``n < 1``. If the scenario rejects early
-    impacts, also raises it for a world that has an early impact in each of ``MOST_ATTEMPTS`` draws.
+    impacts, ``InvalidInput`` is also raised for a world that has an early impact in each of ``MOST_ATTEMPTS`` draws.
 
     """
     for name, value, least in (("number of worlds", n, 1), ("seed of the list", seed, 0), ("first world", first, 0)):
@@ -91,7 +91,7 @@ def sample(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, chann
 
 
 def members_of(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Ints:
-    """Return the scenario that each world of a mixture is drawn from, as an index into ``scenario.members``, [n].
+    """Return, for each world of a mixture, the index in ``scenario.members`` of the world's scenario, [n].
 
     All indices are 0 if the scenario is not a mixture. The arguments have the same meaning as in ``sample``.
     """
@@ -108,7 +108,7 @@ def middle_world(scenario: ScenarioFields) -> Worlds:
 
 
 def sample_by(scenario: ScenarioFields, numbers: Callable[[int, tuple[int, ...]], Floats], index: Ints) -> Sample:
-    """Return the worlds drawn with uniform numbers from ``numbers``; worlds with early impacts are not rejected.
+    """Return the worlds drawn with the random numbers that ``numbers`` returns; keep worlds with early impacts.
 
     Args:
         scenario: the scenario to draw from; it must not be a mixture.
@@ -223,10 +223,10 @@ def _draw_numbers(scenario: ScenarioFields, index: Ints, seed: int, channel: Cha
 
 
 def early_impact(scenario: ScenarioFields, worlds: Worlds) -> Bools:
-    """Return whether each world has an impact no later than the time at which the first learner can act, [n].
+    """Return for each world whether an impact happens no later than the time at which the first learner can act, [n].
 
-    No learner can prevent such an impact: until that time learners coast and the other vehicles follow their scripts.
-    Raises ``InvalidInput`` if a script depends on the state. The scenario must have a learner.
+    No learner can prevent this impact, because learners coast until the first learner can act, and the other vehicles
+    follow their scripts. Raises ``InvalidInput`` if a script depends on the state. The scenario must have a learner.
     """
     vehicles = worlds.vehicles
     command = np.zeros(worlds.speeds_mps.shape)
@@ -252,8 +252,8 @@ def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, drawn: Sample
         scenario: the scenario to draw from.
         seed: seed of the list.
         channel: ``"list"`` or ``"training"``.
-        drawn: all worlds as drawn in the first attempt.
-        early: whether each world in ``drawn`` is rejected for an early impact, [n].
+        drawn: the sample of all worlds, as drawn in the first attempt.
+        early: mask [n]: True for each world in ``drawn`` that is rejected because of an early impact.
 
     """
     parts, pending, rejected = [drawn.take(~early)], drawn.index[early], int(early.sum())
@@ -272,10 +272,10 @@ def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, drawn: Sample
 
 
 def _redraw_one(scenario: ScenarioFields, seed: int, channel: Channel, index: Ints) -> None:
-    """Raise ``InvalidInput`` if world number ``index`` [1] is rejected in every remaining attempt to draw it.
+    """Raise ``InvalidInput`` if the world with the number ``index`` [1] has an early impact in all remaining attempts.
 
-    If a scenario has no acceptable worlds, trying a single world shows this sooner than drawing the whole list.
-    ``seed`` and ``channel`` have the same meaning as in ``sample``.
+    If a scenario has no acceptable worlds, repeated draws of a single world show this sooner than draws of the whole
+    list. ``seed`` and ``channel`` have the same meaning as in ``sample``.
     """
     for attempt in range(_PATIENCE, MOST_ATTEMPTS):
         if not early_impact(scenario, _draw(scenario, seed, channel, attempt, index).worlds)[0]:
@@ -293,10 +293,10 @@ def _unusable(scenario: ScenarioFields, world: int) -> InvalidInput:
 
 
 def _draw(scenario: ScenarioFields, seed: int, channel: Channel, attempt: int, index: Ints) -> Sample:
-    """Draw the worlds whose numbers are ``index`` (ascending, [n]) once; early impacts are not rejected.
+    """Draw each world whose number is in ``index`` (ascending, [n]) once; keep worlds that have an early impact.
 
-    ``attempt``: number of the draw, from 0; every attempt uses other random numbers. ``seed`` and ``channel`` have the
-    same meaning as in ``sample``.
+    ``attempt``: number of earlier draws of these worlds; every attempt uses other random numbers. ``seed`` and
+    ``channel`` have the same meaning as in ``sample``.
     """
     first, last = int(index[0]), int(index[-1])
 

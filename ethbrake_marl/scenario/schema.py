@@ -81,9 +81,10 @@ class ScenarioWording(Wording):
         return rule.owner(path[1]) if rule is not None and isinstance(path[1], int) else ""
 
     def right(self, detail: ErrorDetails) -> str:
-        """Return a text that says what an invalid quantity must be, with a suggestion for a misspelt distribution.
+        """Return a text that says what an invalid quantity, or an invalid scenario of a mixture, must be.
 
-        The text is empty if the invalid value is not a quantity. ``detail``: one mistake, as pydantic reports it.
+        For a misspelt distribution, the text contains a suggestion. For any other invalid value, the text is empty.
+        ``detail``: one mistake, as pydantic reports it.
         """
         if detail["type"] == "quantity":
             return f"must be a number, {_DISTRIBUTION}{_misspelt(detail['input'])}"
@@ -166,7 +167,7 @@ class Scenario(ScenarioFields):
         return self.model_dump(mode="json", exclude_unset=True, exclude_none=True)
 
     def content(self, without: Collection[str]) -> dict[str, Any]:
-        """Return every value of the scenario, including defaults, as plain data, except the keys ``without``.
+        """Return every value of the scenario, including defaults, as plain data, except the keys in ``without``.
 
         The content of a mixture includes the values of its scenarios, without title, description and source.
         """

@@ -1,4 +1,4 @@
-"""Build worlds from the user's initial conditions: a table with one row per world, or a state for ``reset``."""
+"""Build worlds from initial conditions of the user: a table with one row per world, or a state for ``reset``."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _worlds(given: Mapping[Entry, Floats], scenario: ScenarioFields, naming: _Na
     Raises ``InvalidInput`` for a value out of range, and for a random quantity without a column.
 
     Args:
-        given: values of each column, [n], by (key of the quantity, index of the vehicle or pair).
+        given: mapping from (key of the quantity, index of the vehicle or pair) to the values in the n worlds, [n].
         scenario: the scenario that the worlds belong to.
         naming: whether error messages name a value by column and row, or by key and index.
 
@@ -106,14 +106,14 @@ def _worlds(given: Mapping[Entry, Floats], scenario: ScenarioFields, naming: _Na
 def _fixed(scenario: ScenarioFields, field: str, index: int, full: Mapping[str, Floats]) -> Floats | None:
     """Return the scenario's fixed value of a quantity of one vehicle or pair, [n] or [1]; None if it is random.
 
-    If the scenario declares a time gap, the gap is computed from the speeds in ``full``. If it declares a margin to the
-    obstacle, the distance to the obstacle is computed from the values of Vehicle 1 in ``full``.
+    If the scenario declares a time gap, the gap is computed from the speeds in ``full``. If the scenario declares a
+    margin to the obstacle, the distance to the obstacle is computed from the values of Vehicle 1 in ``full``.
 
     Args:
         scenario: the scenario that declares the quantity.
         field: key of the quantity, such as ``"gaps_m"``.
         index: index of the vehicle or pair, from 0.
-        full: values in the n worlds of the quantities that are already known, by key, [n, entries] each.
+        full: quantities that are already known: key -> values in the n worlds, [n, entries].
 
     """
     if field == "obstacle_gap_m":
@@ -142,10 +142,10 @@ def _require_all(good: Bools, naming: _Naming, entry: Entry, column: Floats, rig
     """Raise ``InvalidInput`` for the first world in which ``good`` [n] is False.
 
     Args:
-        good: whether the value is valid in each world, [n].
+        good: mask [n]: True for each world in which the value is valid.
         naming: whether error messages name a value by column and row, or by key and index.
         entry: key of the value's quantity, and index of its vehicle or pair.
-        column: the value in each world, [n].
+        column: the value of one quantity of one vehicle or pair in each world, [n].
         right: what would be valid, for the error message.
 
     """
@@ -236,7 +236,7 @@ def _cell_at(file: Path, header: list[str], row: list[str], line: int, column: s
 
 
 def table_columns(scenario: ScenarioFields) -> dict[str, Entry]:
-    """Return the columns that a table of initial states may have for this scenario: name -> (quantity, index).
+    """Return the columns that a table of initial states may have: column name -> (key of the quantity, index).
 
     An example is ``{"gap_1_m": ("gaps_m", 0), "speed_1_mps": ("speeds_mps", 0)}``.
     """
@@ -267,7 +267,7 @@ def read_rows(file: Path, columns: object, weights: object) -> dict[str, Any]:
 
     Args:
         file: path of the CSV file, which has a header line.
-        columns: names of the columns to read, as the scenario file lists them; this function checks them.
+        columns: names of the columns to read, as the scenario file lists them; this function checks the names.
         weights: name of the column with the weight of each row; None: the rows have no weights.
 
     """

@@ -127,7 +127,8 @@ class TypesOfLine:
     """The possible vehicle types at each place of a line, and their weights.
 
     Args:
-        kinds: declaration of each type, by name; the index of a type is its position in this mapping.
+        kinds: mapping from the name of each vehicle type to its declaration; the index of a type is its position in
+            this mapping, from 0.
         types: possible types at each place of the line, one entry per place or one entry for all places; None: every
             type is possible at every place, in proportion to its weight.
         vehicles: number of vehicles in the line.
@@ -208,7 +209,7 @@ Row = Annotated[tuple[Cell, ...], Field(strict=False, min_length=1)]
 
 
 class Table(FileModel):
-    """A table of measured values: every world takes one of its rows, drawn by weight.
+    """A table of measured values: every world takes its values from one row, drawn in proportion to the row's weight.
 
     A scenario file may name a CSV file that contains the rows of the table. Rows with the same text in the column
     ``recording`` come from the same vehicles in the same recording, so they are not independent of each other.

@@ -384,7 +384,7 @@ def test_sigterm__is_as_ctrl_c_while_processes_work_unless_somebody_else_answers
 
 
 def test_evaluate__says_where_the_uncertainty_of_robust_is_given_and_keeps_no_place_for_it(ethbrake: Command) -> None:
-    assert "+robust needs an uncertainty, which can be set only in Python" in " ".join(
+    assert "+robust needs the description of an uncertainty, which can be given only in Python" in " ".join(
         ethbrake("evaluate", "--help").out.split()
     )
     (row,) = told_json(ethbrake("evaluate", "--episodes", "2", "--agents", "full_brake", "--json"))
