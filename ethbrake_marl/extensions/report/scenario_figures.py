@@ -55,9 +55,9 @@ def write_worlds(path: Path, scenario: Scenario, sample: Sample, *, seed: int, f
 def worlds_figure(scenario: Scenario, sample: Sample, *, seed: int) -> Figure:
     """Draw distributions and scatter plots of the quantities that vary between the worlds, and three worlds to scale.
 
-    The scatter plots prefer quantities of the first learner and of the gap ahead of it. If ``scenario`` is a mixture of
-    scenarios, the colour of a point shows from which scenario its world is drawn. Otherwise the colour shows the
-    vehicle type of the first learner.
+    The scatter plots prefer quantities of the first learner and of the gap ahead of this vehicle. If ``scenario`` is a
+    mixture of scenarios, the colour of a point shows from which scenario its world is drawn. If ``scenario`` is a
+    single scenario, the colour of a point shows the vehicle type of the first learner.
 
     Args:
         scenario: scenario of the worlds.
@@ -109,7 +109,8 @@ def _paired(worlds: Worlds, focus: int) -> dict[str, Floats]:
 
 
 def _distributions(panels: Mapping[str, Mapping[str, Floats]], part: Any) -> None:
-    """Draw a panel for each quantity. Vehicles with the same distribution of the quantity share one histogram.
+    """Draw the distribution of each quantity in its own panel. Vehicles with the same distribution of the quantity
+    share one histogram.
 
     ``panels`` maps the key of each quantity to its histograms: name of the vehicles -> values of these vehicles, [n,
     ...]. ``part`` is a sub-figure of matplotlib.

@@ -46,7 +46,7 @@ _NO_DATES: dict[str, dict[str, None]] = {  # metadata to omit, because they diff
 
 
 class ShownFigure(Figure):
-    """Figure that a notebook displays when the last line of a notebook cell returns it, without pyplot."""
+    """Figure that a notebook displays without pyplot, if the last line of a notebook cell returns the figure."""
 
     def draw(self, renderer: RendererBase) -> None:
         """Draw the figure with matplotlib's ``renderer``.
@@ -143,7 +143,7 @@ def finish(
     Args:
         figure: figure to change.
         caption: text below the figure.
-        legend: the legend of the figure lists the curves of this one panel; None: no legend.
+        legend: panel whose curves the legend of the figure lists; None: no legend.
         columns: number of columns in the legend.
         fontsize: font size of the legend.
         loc: position of the legend.
@@ -171,7 +171,7 @@ def add_caption(figure: Figure, text: str) -> None:
 def picture_ending(path: str | Path) -> str:
     """Return the ending of a picture's file name: .png, .svg or .pdf.
 
-    Raises ``InvalidInput`` for any other ending.
+    Raises ``InvalidInput`` if the file name has a different ending.
     """
     ending = Path(path).suffix.lower()
     if ending not in _NO_DATES:

@@ -57,7 +57,7 @@ class Reading:
     def scenario(self, name: str, **changes: object) -> Scenario:
         """Load the shipped scenario ``name``, and return it with Vehicle 2's latency under this assumption.
 
-        ``changes`` gives new values for further keys of the scenario.
+        ``changes`` contains new values for further keys of the scenario.
         """
         scenario = load_scenario(name).replace(**changes) if changes else load_scenario(name)
         if self.acts_s is None:
@@ -96,8 +96,8 @@ def drive_list(scenario: Scenario, agents: Mapping[str, Agent], episodes: int, s
 def harms(evaluation: Evaluation) -> dict[str, Floats]:
     """Return the first-impact harm of each strategy: name of the strategy -> [n] harm in each world (m2/s2).
 
-    If they are known, two entries are added: the harm that E-V2X-BM predicts (key ``PREDICTED``), and the proven lower
-    bound of the harm (key ``PROVEN``).
+    If the harm that E-V2X-BM predicts is known, it is added with the key ``PREDICTED``. If a proven lower bound of the
+    harm is known, it is added with the key ``PROVEN``.
     """
     each_harm = {name: outcome.first_impact_harm for name, outcome in evaluation.outcomes.items()}
     pairwise = evaluation.outcomes.get(NAMES[PAIRWISE])
@@ -116,8 +116,8 @@ def unconverged_policy(settings: Reproduction) -> tuple[Policy, str]:
     """Return a policy that has not converged, and its description.
 
     The paper uses a "PPO model obtained from training before convergence occurred". This function returns the policy of
-    a training run that ``--full`` stops early. If this run has not been done, the function returns a shipped policy
-    instead.
+    a training run that ``--full`` stops early. If this training run has not been done, the function returns a shipped
+    policy instead.
     """
     for (path,) in settings.trained([STOPPED]).values():
         about = f"PPO stopped early: the last policy of {EARLY.decisions:,} decisions on paper-random"

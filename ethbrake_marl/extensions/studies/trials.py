@@ -104,8 +104,8 @@ class TrialCallback(tune.Callback):  # type: ignore[misc]  # Ray ships no types
     Args:
         name: name of the study, for the progress display.
         done: number of trials that ended in earlier runs of the command.
-        total: number of all trials.
-        tell: function that is called with each ``Progress``; None: nothing is reported.
+        total: number of all trials of the study.
+        tell: function that is called with a ``Progress`` object at each report; None: nothing is reported.
 
     """
 
