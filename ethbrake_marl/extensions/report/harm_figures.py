@@ -39,7 +39,7 @@ def harm_by_agent(
     figure is narrow enough for the screen of a phone. Raises ``InvalidInput`` if ``rows`` is empty.
 
     Args:
-        rows: results of each agent.
+        rows: results of the evaluation, one row for each agent.
         harm_count: harm count that the figure shows, ``first`` or ``total``.
         elsewhere: results of the agents in other tests, by the title of the test; None: no other tests.
 

@@ -255,7 +255,7 @@ class Page:
         title: title of the page.
         sections: sections, in the order of the page; each section has an entry in the table of contents.
         lead: one or two sentences about the page, below the title.
-        opening: parts between the lead and the table of contents.
+        opening: parts of the page between the lead and the table of contents.
 
     >>> from ethbrake_marl.extensions.report.page import Page, Part, Section
     >>> section = Section("Results", ["Text with <b> stays text.", Part.paragraph("small print")])

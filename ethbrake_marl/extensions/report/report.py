@@ -175,13 +175,13 @@ class Report:
     def driven(self, agents: Mapping[str, Driver], *, on_agent: Callable[[str], None] | None = None) -> Report:
         """Return a new report that also has episodes to watch and the section about shields.
 
-        For the episodes, every agent drives some worlds again (see ``choose_shown``). The section about shields
-        compares the modes of each shield in the first ``SHIELD_WORLDS`` worlds.
+        For the episodes to watch, every agent drives some worlds again (see ``choose_shown``). The section about
+        shields compares the modes of each shield in the first ``SHIELD_WORLDS`` worlds.
 
         Args:
             agents: evaluated agents, by name; they are not changed.
             on_agent: function that is called with the name of an agent, once this agent has driven the worlds for the
-                episodes.
+                episodes to watch.
 
         """
         evaluation, focus, harm_count = self.evaluation, self.about, self.harm_count
@@ -259,8 +259,8 @@ class Report:
         """First sentence of the page, which compares the harm of one agent with full braking and the best known harm.
 
         The sentence is about the agent ``about``. The sentence names the tests in ``tests`` in which this agent does
-        about as much harm as full braking, or more. If no test in ``tests`` has this result, the sentence says in how
-        many worlds of the evaluation the agent does more harm than full braking.
+        about as much harm as full braking, or more. If the agent does clearly less harm than full braking in all of
+        ``tests``, the sentence says in how many worlds of the evaluation the agent does more harm than full braking.
         """
         rows, harm = {row.agent: row for row in self.rows}, NAMES[self.harm_count]
         if self.about not in rows:

@@ -109,7 +109,8 @@ def style_axes(axes: Axes, labelsize: float = 9) -> None:
 def new_panels(size_in: tuple[float, float], rows: int = 1, columns: int = 1, **how: Any) -> tuple[Figure, list[Axes]]:
     """Return a figure with ``rows`` times ``columns`` panels, and the axes of the panels, row by row.
 
-    ``size_in`` is the width and height in inches. ``how`` are further keyword arguments for matplotlib's ``subplots``.
+    ``size_in`` is the width and height of the figure in inches. ``how`` are further keyword arguments for matplotlib's
+    ``subplots``.
     """
     figure = new_figure(*size_in)
     panels = list(figure.subplots(rows, columns, squeeze=False, **how).ravel())
@@ -198,8 +199,8 @@ def picture_bytes(figure: Figure, path: str | Path) -> bytes:
 def write_picture(path: str | Path, figure: Figure, *, force: bool = False) -> None:
     """Write ``figure`` to a PNG, SVG or PDF file. The ending of ``path`` selects the format.
 
-    If writing fails, an existing file stays unchanged. Raises ``InvalidInput`` if the ending is not .png, .svg or .pdf
-    or if the file cannot be written, and ``AlreadyExists`` if the file exists and ``force`` is false.
+    If writing fails, an existing file stays unchanged. Raises ``InvalidInput`` if the ending of ``path`` is not .png,
+    .svg or .pdf or if the file cannot be written, and ``AlreadyExists`` if the file exists and ``force`` is false.
     """
     write_output(path, picture_bytes(figure, path), force=force)
 

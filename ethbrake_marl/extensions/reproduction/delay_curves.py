@@ -134,7 +134,7 @@ class Course:
 
     @property
     def still_rising(self) -> float:
-        """Rise of the return in the last quarter of a run divided by its rise in the whole run; mean over the runs."""
+        """Mean rise of the return in the last quarter of the runs, divided by the absolute value of ``rise``."""
         before = self.returns_at(np.array([0.75]))[:, 0]
         return float((self.returns.values[:, -1] - before).mean()) / abs(self.rise)
 

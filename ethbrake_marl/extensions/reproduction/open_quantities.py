@@ -1,7 +1,7 @@
 """Sensitivity of the random test's results to the quantities that the paper leaves open.
 
-For each such quantity, a table states what the paper says, our default, and alternative values. Another table states,
-for each alternative, how much the mean harm changes, and the new collision rates.
+For each quantity that the paper leaves open, a table states what the paper says, our default, and alternative values.
+Another table states, for each alternative value, how much the mean harm changes, and the new collision rates.
 """
 
 from __future__ import annotations
@@ -44,9 +44,7 @@ from ethbrake_marl.training.run_folder import RunDirectory
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alternative:
-    """Another possible value of a quantity that the paper leaves open, and how to repeat the random test with this
-    value.
-    """
+    """Other value of a quantity that the paper leaves open, and how to repeat the random test with this value."""
 
     value: str  # the value in words
     changes: Mapping[str, Any] = field(default_factory=dict)  # keys of the scenario with their new values

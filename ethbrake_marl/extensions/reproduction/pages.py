@@ -30,8 +30,9 @@ _NUMERAL = re.compile(r"[-+−]?\d[\d,.]*( ?%)?|–|")
 def _account(results: Sequence[Result]) -> tuple[str, str, str, list[str]]:
     """Return four results: the page's first sentence, the command, the origin of the results, and remarks.
 
-    The command is the one that makes the results. The origin states dates, machines and processor time. The list of
-    remarks has one entry if the results use fewer worlds than the paper, and is empty otherwise.
+    The command is the command line that makes the results. The origin of the results states dates, machines and
+    processor time. The list of remarks has one entry if the results use fewer worlds than the paper, and is empty
+    otherwise.
     """
     every = len(results) == len(ITEMS)
     most = max((result.episodes for result in results), default=MOST_EPISODES)

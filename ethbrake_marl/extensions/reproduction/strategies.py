@@ -48,7 +48,8 @@ NAMES = {  # names of the strategies in tables and figures
 class Reading:
     """An assumption on the time at which Vehicle 2 may act.
 
-    The list ``READINGS`` has two such assumptions, because the paper is not clear about this time.
+    The list ``READINGS`` contains two assumptions, because the paper is not clear about the time at which Vehicle 2 may
+    act.
     """
 
     name: str  # name of the assumption
@@ -70,10 +71,10 @@ READINGS = (Reading("as stated"), Reading("Vehicle 2 acts at 0.2 s", 0.2))
 
 
 def lineup(scenario: Scenario, *specs: str) -> dict[str, Agent]:
-    """Return the agents with the given specs, by name.
+    """Return the agents that ``specs`` describe, as a dictionary by name.
 
-    ``specs`` are specs such as ``"full_brake"``. The name of an agent in the result is its entry in ``NAMES``, or the
-    spec if there is no such entry.
+    Each of ``specs`` is a text that describes an agent, such as ``"full_brake"``. The name of the agent in the result
+    is the entry of the text in ``NAMES``, or the text itself if ``NAMES`` has no such entry.
     """
     return {NAMES.get(spec, spec): agent for spec, agent in make_agents(specs, scenario).items()}
 
@@ -96,8 +97,8 @@ def drive_list(scenario: Scenario, agents: Mapping[str, Agent], episodes: int, s
 def harms(evaluation: Evaluation) -> dict[str, Floats]:
     """Return the first-impact harm of each strategy: name of the strategy -> [n] harm in each world (m2/s2).
 
-    If the harm that E-V2X-BM predicts is known, it is added with the key ``PREDICTED``. If a proven lower bound of the
-    harm is known, it is added with the key ``PROVEN``.
+    If the harm that E-V2X-BM predicts is known, the result also contains this harm (key ``PREDICTED``). If a proven
+    lower bound of the harm is known, the result also contains this bound (key ``PROVEN``).
     """
     each_harm = {name: outcome.first_impact_harm for name, outcome in evaluation.outcomes.items()}
     pairwise = evaluation.outcomes.get(NAMES[PAIRWISE])

@@ -69,11 +69,11 @@ class Beside:
     def candidates(self, row: str, quantity: str) -> Iterator[tuple[str, Estimate]]:
         """Yield our results that may correspond to a printed number of the paper, each as (name, estimate).
 
-        The printed number is compared with the first of the yielded results. If the printed number and the first result
-        differ, the verdict also names the yielded result that is nearest to the printed number.
+        The printed number is compared with the first of the yielded results. If the printed number and the first
+        yielded result differ, the verdict also names the yielded result that is nearest to the printed number.
 
         Args:
-            row: name that the paper gives the strategy.
+            row: name of the strategy in the paper's table.
             quantity: quantity that the paper prints: "collision rate", "average harm" or "harm decrease".
 
         """

@@ -34,7 +34,7 @@ class TrainedRecipe:
     per_s: int  # decisions per second on one core (Intel Xeon), to estimate the time of the training
 
     def load(self, name: str, **changes: Any) -> TrainingRecipe:
-        """Load the recipe, and return it with the new name ``name``.
+        """Load the recipe of this object, and return the recipe with the new name ``name``.
 
         The returned recipe has the length of training and the number of updates between two evaluations that this
         object contains. ``changes`` contains new values for further keys of the recipe.

@@ -197,7 +197,8 @@ def _both(records: Records, reading: Reading, number: int, what: str, column: in
 def _apart(records: Records, reading: Reading, what: str) -> list[float]:
     """Return how far a quantity of Vehicle 2 differs between PPO and SAC, in Scenario 1 and in Scenario 2.
 
-    The result is the root mean square, over the times of an episode, of the difference between PPO and SAC.
+    Each result is the root mean square, over the times of an episode, of the difference of this quantity between PPO
+    and SAC.
 
     Args:
         records: recorded episodes.

@@ -75,10 +75,10 @@ def compare_number(
     Args:
         what: name of the printed number, as the verdict shows it.
         printed: number that the paper prints.
-        ours: value of this quantity in our results, with its 95 % interval.
+        ours: our result for the quantity whose value the paper prints, with its 95 % interval.
         show: format in which the verdict writes our number and the printed number.
         least: description and value of a proven lower bound for all strategies in our worlds; None: no bound.
-        others: values of this quantity in our results under other assumptions, by the description of the assumption. If
+        others: our results for the same quantity under other assumptions, by the description of the assumption. If
             ``ours`` differs from the printed number, the verdict names the assumption whose value is nearest to the
             printed number.
 

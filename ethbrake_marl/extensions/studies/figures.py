@@ -47,7 +47,7 @@ def is_done(job: TrainingJob) -> bool:
 
 
 def finish(job: TrainingJob, stop_at: StopAt | None = None) -> bool:
-    """Continue the training run of ``job`` to its end. Return False if ``stop_at`` stopped the run early.
+    """Start or continue the training run of ``job`` until it ends. Return False if ``stop_at`` stopped the run early.
 
     ``stop_at`` is a function that is called with each evaluation; it returns a reason to stop, or None to continue.
     Raises the exceptions of ``train`` and ``resume``, ``InvalidInput`` if the folder contains a training run with other

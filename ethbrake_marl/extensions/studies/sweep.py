@@ -227,7 +227,7 @@ class Row:
 
 @dataclass(frozen=True)
 class SweepPlan:
-    """All jobs of a sweep, checked and loaded, in the order of its table."""
+    """All jobs of a sweep, checked and loaded, in the order of the sweep's table."""
 
     rows: Sequence[Row]  # the jobs
 
@@ -409,7 +409,7 @@ class SweepResult:
 
     @property
     def interrupted(self) -> bool:
-        """Whether Ctrl-C stopped the run, so that some jobs have neither finished nor failed."""
+        """Whether Ctrl-C stopped the sweep, so that some jobs have neither finished nor failed."""
         return self.finished + self.failed < self.jobs
 
 

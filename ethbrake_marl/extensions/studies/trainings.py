@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 def train_all(trainings: Sequence[TrainingJob], jobs: int = 1, tell: OnProgress | None = None) -> bool:
-    """Continue every training run to its end. Return False if a run was stopped before its end.
+    """Start or continue every training run until it ends. Return False if a training run was stopped before its end.
 
     The trained policies depend neither on ``jobs`` nor on interruptions. Before any run begins, raises the exceptions
     of ``steps_left``. If a training run fails later, raises the exception of the first run that fails.
@@ -85,7 +85,7 @@ class TrainingJob:
         return max(total - (steps if isinstance(steps, int) else 0), 1)
 
     def finish(self, tell: OnProgress | None = None, *, stop_at: StopAt | None = None) -> bool | None:
-        """Continue the training run to its end.
+        """Start or continue the training run until it ends.
 
         Return True if the run has finished, or None if the run was stopped early.
 

@@ -37,8 +37,8 @@ def run_trials(
     """Run trials on Ray Tune. Return the last report of each trial that began, in the order in which the trials began.
 
     A report is the dictionary that ``work`` passes to ``tune.report``, and to which Ray adds entries. If the trial
-    failed, the entry ``reason`` says why. The entry ``done`` is True if the trial has ended. Ctrl-C stops all trials.
-    The caller must connect to Ray first (see ``cluster.connected``).
+    failed, the entry ``reason`` of the report says why. The entry ``done`` of the report is True if the trial has
+    ended. Ctrl-C stops all trials. The caller must connect to Ray first (see ``cluster.connected``).
 
     Args:
         work: function that runs a trial in a worker process, called as ``work(config, **given)``.

@@ -403,8 +403,8 @@ class TuningPlan:
     def example(self) -> str:
         """Return a command line ``ethbrake train ...`` that does the same training run as one trial.
 
-        The searched keys have the recipe's own values. If the search excludes any of the recipe's own values, all
-        searched keys have random values instead.
+        In the command line, the searched keys have the recipe's own values. If the search excludes any of the recipe's
+        own values, all searched keys have random values instead.
         """
         values = self.own_values() or next(self.file.points(1))
         measured = {"evaluation": self.training(values).recipe.evaluation.model_dump(mode="json")}
@@ -490,7 +490,7 @@ class TuningPlan:
 
         Args:
             path: folder of all results; created if necessary.
-            trials: number of trials that the folder contains at the end, with the trials of earlier runs.
+            trials: number of trials that the folder contains at the end, including the trials of earlier runs.
             jobs: number of trials that run at once; this number affects the proposals.
             ray: address of a Ray cluster; ``local``: Ray is started on this machine.
             retries: number of times that a trial is started again after its process has ended unexpectedly.
@@ -640,7 +640,7 @@ class TuningResult:
 
     @property
     def interrupted(self) -> bool:
-        """Whether Ctrl-C stopped the run before all requested trials had ended."""
+        """Whether Ctrl-C stopped the tuning before all requested trials had ended."""
         return len(self.trials) < self.asked or "running" in self.counts
 
     @property
