@@ -40,7 +40,7 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class DecelerationCurve:
-    """Harm in one world at K constant decelerations of one vehicle, in increasing order."""
+    """Harm in one world at K constant decelerations of one vehicle, the smallest deceleration first."""
 
     task: Task  # scenario, and the one controlled vehicle
     world: Worlds  # world at the alert, n = 1
@@ -62,10 +62,10 @@ class DecelerationCurve:
 def deceleration_curve(world: Worlds, task: Task, *, points: int = POINTS) -> DecelerationCurve:
     """Compute predicted, first-impact and total harm of one world at many constant decelerations of one vehicle.
 
-    The decelerations are ``points`` evenly spaced values. Further decelerations are the values at which the predicted
-    harm (the pairwise closed form) has a kink or jump. The prediction assumes that all other vehicles brake fully. In
-    the simulation, the other vehicles follow the scripts of the scenario. Raises ``InvalidInput`` if there is not
-    exactly one world, if ``points`` is below 2, or if a script reacts to what happens after the alert.
+    ``points`` of the decelerations are evenly spaced. The other decelerations are those at which the predicted harm
+    (the pairwise closed form) has a kink, a jump or its minimum. The prediction assumes that all other vehicles brake
+    fully. In the simulation, the other vehicles follow the scripts of the scenario. Raises ``InvalidInput`` if there is
+    not exactly one world, if ``points`` is below 2, or if a script reacts to what happens after the alert.
 
     Args:
         world: world at the alert, n = 1.

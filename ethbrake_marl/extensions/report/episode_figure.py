@@ -26,7 +26,8 @@ def trajectories(records: Mapping[str, EpisodeRecord], *, caption: str = "") -> 
 
     Args:
         records: recorded episodes; the key of an episode is the title of its column.
-        caption: text below the figure; if empty, the gaps, speeds and other parameters of the first world.
+        caption: text below the figure; if ``caption`` is empty, the text states the gaps, speeds and other parameters
+            of the first world.
 
     """
     if not records:

@@ -83,7 +83,7 @@ def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
     others, done = other_tests(evaluation.scenario) if len(evaluation.vehicles) == 1 else (), count()
 
     def begin(stage: str) -> None:
-        """Report that ``stage`` begins. An empty ``stage`` means that all stages have ended."""
+        """Report that the stage named ``stage`` begins. An empty ``stage`` means that all stages have ended."""
         tell(Progress(f"report{stage and ': '}{stage}", next(done), 2 + len(others)))
 
     is_papers = is_papers_test(evaluation.task, evaluation.seed)
@@ -146,7 +146,7 @@ def write_figures(
     """Draw the three figures, write them as PNG files into ``folder``, and return them as parts of an HTML page.
 
     Args:
-        folder: folder of the run.
+        folder: folder of the run, into which the PNG files are written.
         evaluation: evaluation of the trained policy or team and of the baselines.
         rows: results of the evaluation, one row for each agent.
         course: evaluations during the training, each with ``steps``, ``first_impact_harm``, ``total_harm`` and
@@ -188,9 +188,9 @@ def write_figures(
 def telling_world(evaluation: Evaluation, harm_count: HarmCount = "first", learned: str = TRAINED_POLICY) -> int:
     """Return the index of a typical world: the world in which ``learned`` reduces the harm by the median amount.
 
-    The reduction is the harm of full braking minus the harm of ``learned``, the trained policy or team. The median is
-    taken over the worlds in which full braking does harm. If full braking does no harm in any world, the index is 0.
-    ``harm_count`` is ``first`` or ``total``.
+    The reduction of the harm is the harm of full braking minus the harm of ``learned``, the trained policy or team. The
+    median is taken over the worlds in which full braking does harm. If full braking does no harm in any world, the
+    index is 0. ``harm_count`` is the harm count for the reduction: ``first`` or ``total``.
     """
     before = evaluation.outcome(BESIDE[0]).world_harm(harm_count)
     rows = np.flatnonzero(before > 0.0)

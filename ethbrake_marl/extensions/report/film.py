@@ -37,7 +37,8 @@ def film_scenes(world: Worlds, agent: Driver, *, scenario: Scenario, fps: float 
 
     Args:
         world: world at the alert, n = 1.
-        agent: agent of the learner, or a team of agents. The agent is not changed.
+        agent: agent that controls the learner of the scenario, or a team of agents for several learners. The agent is
+            not changed.
         scenario: scenario of the world; its scripts control the other vehicles.
         fps: scenes per second.
 

@@ -39,7 +39,7 @@ def harm_by_agent(
     figure is narrow enough for the screen of a phone. Raises ``InvalidInput`` if ``rows`` is empty.
 
     Args:
-        rows: results of each agent.
+        rows: results of the evaluation, one row for each agent.
         harm_count: harm count that the figure shows, ``first`` or ``total``.
         elsewhere: results of the agents in other tests, by the title of the test; None: no other tests.
 
@@ -72,7 +72,7 @@ def harm_by_agent(
 def _name_rows(axes: Axes, agents: Sequence[str], most: int = 40) -> None:
     """Label the rows of a figure with the names of the agents, the first agent in the top row.
 
-    Longer names are shortened to ``most`` characters.
+    Names with more than ``most`` characters are shortened.
     """
     axes.set_yticks(range(len(agents)), [label_text(agent, most) for agent in agents])
     axes.invert_yaxis()

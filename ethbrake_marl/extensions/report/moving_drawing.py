@@ -151,8 +151,8 @@ class _Strip:
     def _events(self) -> list[tuple[int, int, Struck]]:
         """Return the impacts to show, each as (start, stop, impact): scenes ``start`` to ``stop - 1`` show the impact.
 
-        Only one impact is shown at a time. If the next impact is at least as strong as the shown impact, it replaces
-        the shown impact; if it is weaker, it is not shown.
+        Only one impact is shown at a time. If the next impact is at least as strong as the shown impact, the next
+        impact replaces the shown impact. A weaker impact is not shown.
         """
         known: set[tuple[int, float]] = set()
         events: list[tuple[int, int, Struck]] = []
@@ -187,7 +187,7 @@ def _clock(y: int, last: int, frames: int, fps: int) -> Iterator[str]:
     """Yield the SVG elements of the clock: a scale in seconds since the alert, and a bar that grows with time.
 
     Args:
-        y: vertical position of the bar in the picture.
+        y: vertical position of the clock's bar in the picture.
         last: index of the last scene of the longest film.
         frames: number of scenes of the whole animation, after which it starts again.
         fps: scenes per second.

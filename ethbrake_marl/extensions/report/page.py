@@ -45,7 +45,7 @@ class Part:
 
     @classmethod
     def paragraph(cls, text: str, kind: str = "") -> Part:
-        """Return a part with ``text`` as a paragraph.
+        """Return a part of a page: ``text`` as a paragraph.
 
         ``kind`` is the style of the paragraph: ``quiet`` (small print), ``note`` (important remark), ``alarm``, or
         empty.
@@ -54,34 +54,37 @@ class Part:
 
     @classmethod
     def heading(cls, text: str) -> Part:
-        """Return a part with ``text`` as a heading inside a section."""
+        """Return a part of a page: ``text`` as a heading inside a section."""
         return cls(Markup("<h3>{}</h3>\n").format(shown(text)))
 
     @classmethod
     def facts(cls, facts: Mapping[str, object]) -> Part:
-        """Return a part that lists the entries of ``facts``, each as a name with its value."""
+        """Return a part of a page that lists the entries of ``facts``, each as a name with its value."""
         lines = [Markup("<dt>{}</dt><dd>{}</dd>").format(shown(name), _text(value)) for name, value in facts.items()]
         return cls(Markup("<dl>\n{}\n</dl>\n").format(Markup("\n").join(lines)))
 
     @classmethod
     def remarks(cls, texts: Sequence[str]) -> Part:
-        """Return a part with a list of important remarks; an empty part if ``texts`` is empty."""
+        """Return a part of a page with a list of important remarks; the part is empty if ``texts`` is empty."""
         lines = [Markup("<li>{}</li>").format(shown(text)) for text in texts]
         return cls(Markup('<ul class="remarks">\n{}\n</ul>\n').format(Markup("\n").join(lines)) if lines else Markup())
 
     @classmethod
     def box(cls, title: str, meanings: Mapping[str, str]) -> Part:
-        """Return a part with a box that explains words; ``meanings`` maps each word to its meaning."""
+        """Return a part of a page: a box that explains words; ``meanings`` maps each word to its meaning."""
         return cls(Markup('<aside class="box"><strong>{}</strong>{}</aside>\n').format(title, cls.facts(meanings).html))
 
     @classmethod
     def beside(cls, parts: Sequence[Part]) -> Part:
-        """Return one part that shows ``parts`` side by side, or one below the other on a narrow screen."""
+        """Return a part of a page that shows ``parts`` side by side, or one below the other on a narrow screen."""
         return cls._around('<div class="beside">{}</div>\n', parts)
 
     @classmethod
     def opened(cls, title: str, parts: Sequence[Part]) -> Part:
-        """Return one part with ``parts`` under a title. These parts are hidden until the reader clicks on the title."""
+        """Return a part of a page that shows ``parts`` under a title.
+
+        The ``parts`` are hidden until the reader clicks on the title.
+        """
         return cls._around("<details><summary>{}</summary>\n{}</details>\n", parts, shown(title))
 
     @classmethod
@@ -92,12 +95,12 @@ class Part:
 
     @classmethod
     def data(cls, name: str, content: object, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = ()) -> Part:
-        """Return a part with ``content`` as JSON in an HTML element ``script``, which the scripts of the page can read.
+        """Return a part of a page: ``content`` as JSON in an HTML element ``script``, for the scripts of the page.
 
         The characters < > and & are escaped, so the content cannot end the element or begin a new element.
 
         Args:
-            name: id of the element.
+            name: id of the HTML element ``script``.
             content: plain data: mappings, lists, texts and numbers.
             styles: names of the style sheets that the scripts need.
             scripts: names of the scripts that read the data.
@@ -111,7 +114,7 @@ class Part:
 
     @classmethod
     def template(cls, file: str, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = (), **values: object) -> Part:
-        """Fill the template ``file``, which is in the folder of this module, with ``values``, and return it as a part.
+        """Return a part of a page: the template ``file`` from the folder of this module, filled with ``values``.
 
         Values of the type ``Markup`` (HTML text) are inserted unchanged; other values are escaped. ``styles`` and
         ``scripts`` are the names of the style sheets and scripts that the part needs, in the same folder.
@@ -120,7 +123,9 @@ class Part:
 
     @classmethod
     def table(cls, sheet: Sheet) -> Part:
-        """Return a part that shows ``sheet`` as a table. A table that is wider than the page can be scrolled.
+        """Return a part of a page that shows ``sheet`` as a table.
+
+        A table that is wider than the page can be scrolled.
 
         To put HTML such as a button into a cell, give a ``Shown`` object whose value has the type ``Markup``. The texts
         of all other cells are escaped.
@@ -138,7 +143,7 @@ class Part:
         known: str = "",
         where: object = "",
     ) -> Part:
-        """Return a part that shows a figure with a title and a description.
+        """Return a part of a page that shows a figure with a title and a description.
 
         The caption of the figure becomes text of the page below the figure, because the text of a wide figure is too
         small on a phone. Raises ``InvalidInput`` if ``figure`` is an SVG file that this package did not write.
@@ -179,15 +184,15 @@ class Part:
         shown_first: Sequence[int] = (),
         folded: bool = False,
     ) -> Part:
-        """Return a part with the episode player, which shows the same worlds driven by different agents.
+        """Return a part of a page: the episode player, which shows the same worlds driven by different agents.
 
         Args:
             worlds: worlds to show, at least one, with the episode of each agent.
             driven: indices (0 = front) of the controlled vehicles. If different agents control different vehicles, give
                 a mapping from the name of each agent to the indices of its vehicles.
             focus: name of an agent that is shown at the start if ``shown_first`` is empty.
-            shown_first: indices of the agents that are shown at the start. If empty, up to three agents are shown:
-                ``focus``, the first agent and the last agents.
+            shown_first: indices of the agents that are shown at the start. If ``shown_first`` is empty, up to three
+                agents are shown: ``focus``, the first agent, and agents from the end of the list.
             folded: whether the curves over time are hidden until the reader clicks on the title above them.
 
         """
@@ -250,7 +255,7 @@ class Page:
         title: title of the page.
         sections: sections, in the order of the page; each section has an entry in the table of contents.
         lead: one or two sentences about the page, below the title.
-        opening: parts between the lead and the table of contents.
+        opening: parts of the page between the lead and the table of contents.
 
     >>> from ethbrake_marl.extensions.report.page import Page, Part, Section
     >>> section = Section("Results", ["Text with <b> stays text.", Part.paragraph("small print")])

@@ -36,7 +36,8 @@ class Played:
         """Let one agent drive the worlds, and store the motion in each world as ``motions[name]``.
 
         Args:
-            played: one object for each world; the function adds the motion to ``motions`` of this object.
+            played: one object for each world; the function stores the motion of the vehicles in the dictionary
+                ``motions`` of this object.
             worlds: worlds at the alert, in the order of ``played``.
             name: name of the agent, as the page shows it.
             agent: agent that drives the worlds; the agent is not changed.
@@ -52,7 +53,7 @@ class Played:
 
         Args:
             motion: motion of the vehicles in the episode.
-            driven: indices of the controlled vehicles.
+            driven: indices (0 = front) of the controlled vehicles.
 
         """
         obstacle = float(motion.world.obstacle_gap_m[0])
@@ -75,9 +76,9 @@ def _impacts(motion: EpisodeMotion) -> list[list[float]]:
     """Return a list of seven numbers for each impact of an episode, earlier impacts first.
 
     The numbers are the time (s), the index of the pair, the closing speed (m/s), 1 for the first impact of the pair and
-    0 for a later one, the number of the impact in the episode (from 1), the first-impact harm so far, and the total
+    0 for a later impact, the number of the impact in the episode (from 1), the first-impact harm so far, and the total
     harm so far (m2/s2). If a pair has several impacts within the same 1 ms (``_BIN_S``), only the last of these impacts
-    is returned. At the last impact, the two harms so far equal the recorded harms of the episode exactly.
+    is returned. For the last impact, the two harms equal the recorded harms of the whole episode exactly.
     """
     rows = motion.impacts
     order = np.argsort(rows.time_s, kind="stable")

@@ -40,8 +40,8 @@ SHIELD_WORLDS = 200  # number of worlds in which each replacement by a shield is
 def worst_section(evaluation: Evaluation, focus: str, watched: Sequence[int]) -> Section:
     """Return the section that lists the ten worlds in which the agent ``focus`` did worst.
 
-    ``watched`` are the numbers of the worlds that the episode player on the page can show. A listed world with such a
-    number gets a button that starts the player.
+    ``watched`` are the numbers of the worlds that the episode player on the page can show. Each listed world that the
+    player can show gets a button that starts the player.
     """
     regrets, outcome = regrets_of(evaluation), evaluation.outcome(focus)
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
@@ -175,12 +175,13 @@ class Report:
     def driven(self, agents: Mapping[str, Driver], *, on_agent: Callable[[str], None] | None = None) -> Report:
         """Return a new report that also has episodes to watch and the section about shields.
 
-        For the episodes, every agent drives some worlds again (see ``choose_shown``). The section about shields
-        compares the modes of each shield in the first ``SHIELD_WORLDS`` worlds.
+        For the episodes to watch, every agent drives some worlds again (see ``choose_shown``). The section about
+        shields compares the modes of each shield in the first ``SHIELD_WORLDS`` worlds.
 
         Args:
             agents: evaluated agents, by name; they are not changed.
-            on_agent: function that is called with the name of each agent when it has driven the chosen worlds.
+            on_agent: function that is called with the name of an agent, once this agent has driven the worlds for the
+                episodes to watch.
 
         """
         evaluation, focus, harm_count = self.evaluation, self.about, self.harm_count
@@ -206,8 +207,9 @@ class Report:
     def about(self) -> str:
         """Name of the agent that the page is mainly about.
 
-        If ``focus`` is not empty, this agent is ``focus``. If ``focus`` is empty, this agent is the last one with a
-        trained policy, or the last one of all if no agent has a trained policy.
+        If ``focus`` is not empty, the page is mainly about the agent ``focus``. If ``focus`` is empty, the page is
+        mainly about the last agent with a trained policy, or about the last agent of all if no agent has a trained
+        policy.
         """
         learned = [row.agent for row in self.rows if row.policy_sha256]
         return self.focus or (learned or [row.agent for row in self.rows] or [""])[-1]
@@ -256,9 +258,9 @@ class Report:
     def first_sentence(self) -> str:
         """First sentence of the page, which compares the harm of one agent with full braking and the best known harm.
 
-        The sentence is about the agent ``about``. If this agent does about as much harm as full braking, or more, in
-        some other tests, the sentence names these tests. If there are no such tests, the sentence says in how many
-        worlds the agent does more harm than full braking.
+        The sentence is about the agent ``about``. The sentence names the tests in ``tests`` in which this agent does
+        about as much harm as full braking, or more. If the agent does clearly less harm than full braking in all of
+        ``tests``, the sentence says in how many worlds of the evaluation the agent does more harm than full braking.
         """
         rows, harm = {row.agent: row for row in self.rows}, NAMES[self.harm_count]
         if self.about not in rows:
@@ -282,9 +284,10 @@ class Report:
     def _fails(self, harm: str) -> str:
         """Return the end of ``first_sentence``, which names tests or worlds in which the agent does badly, if any.
 
-        The text names the other tests in which the agent's harm is not clearly less than the harm of full braking (see
-        ``_change``). If there is no such test, the text says in how many worlds of the evaluation the agent does more
-        harm than full braking. ``harm`` is the name of the compared measure, for instance ``total_harm``.
+        The text names the tests in ``self.tests`` in which the agent's harm is not clearly less than the harm of full
+        braking (see ``_change``). If the agent's harm is clearly less in all tests, the text says in how many worlds of
+        the evaluation the agent does more harm than full braking. ``harm`` is the name of the compared measure, for
+        instance ``total_harm``.
         """
         reasons = []
         for title, _, others in self.tests:
@@ -383,7 +386,7 @@ def _short_table(rows: SummaryTable) -> Part:
 
 
 def _remarks(rows: SummaryTable) -> list[str]:
-    """Return the important notes about ``rows`` as texts, without the notes in small print."""
+    """Return the important notes about the results ``rows`` as texts, without the notes in small print."""
     return [text for kind, text in SummaryTable(rows).notes() if kind == "note"]
 
 
@@ -420,7 +423,7 @@ def _empty(rows: SummaryTable) -> list[str]:
 
 
 def _table(sheet: Sheet, caption: str, names: set[str]) -> Part:
-    """Return a table with the agents, and with those columns of ``sheet`` that are in ``names`` and have values.
+    """Return a table of the agents, with those columns of ``sheet`` that have values and whose name is in ``names``.
 
     ``caption`` is the title of the table.
     """

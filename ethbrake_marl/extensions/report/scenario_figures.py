@@ -55,9 +55,9 @@ def write_worlds(path: Path, scenario: Scenario, sample: Sample, *, seed: int, f
 def worlds_figure(scenario: Scenario, sample: Sample, *, seed: int) -> Figure:
     """Draw distributions and scatter plots of the quantities that vary between the worlds, and three worlds to scale.
 
-    The scatter plots prefer quantities of the first learner and of the gap ahead of it. If ``scenario`` is a mixture of
-    scenarios, the colour of a point shows from which scenario its world is drawn. Otherwise the colour shows the
-    vehicle type of the first learner.
+    The scatter plots prefer quantities of the first learner and of the gap ahead of this vehicle. If ``scenario`` is a
+    mixture of scenarios, the colour of a point shows from which scenario its world is drawn. If ``scenario`` is a
+    single scenario, the colour of a point shows the vehicle type of the first learner.
 
     Args:
         scenario: scenario of the worlds.
@@ -109,10 +109,12 @@ def _paired(worlds: Worlds, focus: int) -> dict[str, Floats]:
 
 
 def _distributions(panels: Mapping[str, Mapping[str, Floats]], part: Any) -> None:
-    """Draw a panel for each quantity. Vehicles with the same distribution of the quantity share one histogram.
+    """Draw the distribution of each quantity in its own panel.
+
+    Vehicles with the same distribution of a quantity share one histogram.
 
     ``panels`` maps the key of each quantity to its histograms: name of the vehicles -> values of these vehicles, [n,
-    ...]. ``part`` is a sub-figure of matplotlib.
+    ...]. ``part`` is the sub-figure of matplotlib to draw in.
     """
     columns = min(len(panels), _ABREAST)
     every = part.subplots(-(-len(panels) // columns), columns, squeeze=False).ravel()
@@ -140,7 +142,7 @@ def _pairs(paired: Mapping[str, Floats], kinds: Any, part: Any) -> None:
     """Draw a scatter plot for every two quantities; the colour of a point shows the kind of its world.
 
     ``paired`` maps the label of each quantity to its values [n]. ``kinds`` [n] contains the name of the kind of each
-    world (its scenario or vehicle type). ``part`` is a sub-figure of matplotlib.
+    world (its scenario or vehicle type). ``part`` is the sub-figure of matplotlib to draw in.
     """
     labels, values, names = list(paired), list(paired.values()), np.unique(kinds)
     grid = part.subplots(len(paired) - 1, len(paired) - 1, squeeze=False, sharex="col", sharey="row")
@@ -165,7 +167,8 @@ def _pairs(paired: Mapping[str, Floats], kinds: Any, part: Any) -> None:
 def _lines(sample: Sample, shown: Mapping[int, str], part: Any) -> None:
     """Draw the vehicles of some worlds at the alert, to scale, one world below the other.
 
-    ``shown`` maps the index of each drawn world in ``sample`` to a description. ``part`` is a sub-figure of matplotlib.
+    ``shown`` maps the index of each drawn world in ``sample`` to a description. ``part`` is the sub-figure of
+    matplotlib to draw in.
     """
     worlds, every = sample.worlds, part.subplots(len(shown), 1, squeeze=False, sharex=True).ravel()
     for axes, (row, name) in zip(every, shown.items(), strict=True):

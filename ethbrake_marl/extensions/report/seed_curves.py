@@ -55,8 +55,8 @@ def seed_curves(
 
     Args:
         panels: nested mapping: label of a quantity -> name of a recipe -> values of the quantity.
-        logarithmic: labels of the quantities whose panels have a logarithmic axis. Even these panels have a linear axis
-            if one of their values is not positive.
+        logarithmic: labels of the quantities whose panels have a logarithmic axis. If a value in one of these panels is
+            not positive, this panel has a linear axis instead.
         caption: text below the figure.
         x_label: label of the x axis.
         known: best known value of each quantity, by the label of the quantity, drawn as a dashed line; None: no lines.

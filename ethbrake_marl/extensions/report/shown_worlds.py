@@ -34,12 +34,13 @@ WORDS = {
 
 
 def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS) -> dict[int, Played]:
-    """Choose at most ``most`` worlds. Return a ``Played`` object for each, by the index of the world in the evaluation.
+    """Choose at most ``most`` worlds of an evaluation to show as episodes.
 
-    The worlds are chosen in this order: worlds in which the agent ``focus`` did worst, worlds with an avoidable
-    collision, worlds with the largest reduction of harm compared with full braking, worlds with more harm than full
-    braking, worlds with typical harm of the agent ``focus``, and random worlds. These objects contain no motion of
-    vehicles yet; the method ``Played.drive`` adds the motion.
+    Return a dictionary from the index of each chosen world in the evaluation to a ``Played`` object. The worlds are
+    chosen in this order: worlds in which the agent ``focus`` did worst, worlds with an avoidable collision, worlds with
+    the largest reduction of harm compared with full braking, worlds with more harm than full braking, worlds with
+    typical harm of the agent ``focus``, and random worlds. The ``Played`` objects contain no motion of vehicles yet;
+    the method ``Played.drive`` adds the motion.
     """
     outcome = evaluation.outcome(focus)
     chosen: dict[int, Played] = {}

@@ -46,7 +46,7 @@ _NO_DATES: dict[str, dict[str, None]] = {  # metadata to omit, because they diff
 
 
 class ShownFigure(Figure):
-    """Figure that a notebook displays when the last line of a notebook cell returns it, without pyplot."""
+    """Figure that a notebook displays without pyplot, if the last line of a notebook cell returns the figure."""
 
     def draw(self, renderer: RendererBase) -> None:
         """Draw the figure with matplotlib's ``renderer``.
@@ -109,7 +109,8 @@ def style_axes(axes: Axes, labelsize: float = 9) -> None:
 def new_panels(size_in: tuple[float, float], rows: int = 1, columns: int = 1, **how: Any) -> tuple[Figure, list[Axes]]:
     """Return a figure with ``rows`` times ``columns`` panels, and the axes of the panels, row by row.
 
-    ``size_in`` is the width and height in inches. ``how`` are further keyword arguments for matplotlib's ``subplots``.
+    ``size_in`` is the width and height of the figure in inches. ``how`` are further keyword arguments for matplotlib's
+    ``subplots``.
     """
     figure = new_figure(*size_in)
     panels = list(figure.subplots(rows, columns, squeeze=False, **how).ravel())
@@ -143,7 +144,7 @@ def finish(
     Args:
         figure: figure to change.
         caption: text below the figure.
-        legend: the legend of the figure lists the curves of this one panel; None: no legend.
+        legend: panel whose curves the legend of the figure lists; None: no legend.
         columns: number of columns in the legend.
         fontsize: font size of the legend.
         loc: position of the legend.
@@ -171,7 +172,7 @@ def add_caption(figure: Figure, text: str) -> None:
 def picture_ending(path: str | Path) -> str:
     """Return the ending of a picture's file name: .png, .svg or .pdf.
 
-    Raises ``InvalidInput`` for any other ending.
+    Raises ``InvalidInput`` if the file name has a different ending.
     """
     ending = Path(path).suffix.lower()
     if ending not in _NO_DATES:
@@ -198,8 +199,8 @@ def picture_bytes(figure: Figure, path: str | Path) -> bytes:
 def write_picture(path: str | Path, figure: Figure, *, force: bool = False) -> None:
     """Write ``figure`` to a PNG, SVG or PDF file. The ending of ``path`` selects the format.
 
-    If writing fails, an existing file stays unchanged. Raises ``InvalidInput`` if the ending is not .png, .svg or .pdf
-    or if the file cannot be written, and ``AlreadyExists`` if the file exists and ``force`` is false.
+    If writing fails, an existing file stays unchanged. Raises ``InvalidInput`` if the ending of ``path`` is not .png,
+    .svg or .pdf or if the file cannot be written, and ``AlreadyExists`` if the file exists and ``force`` is false.
     """
     write_output(path, picture_bytes(figure, path), force=force)
 

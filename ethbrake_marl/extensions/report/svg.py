@@ -67,8 +67,8 @@ def inline_svg(figure: Figure | bytes, label: str, *, recolour: bool = True) -> 
 
     Args:
         figure: figure of matplotlib, or the bytes of an SVG file with a figure.
-        label: description for readers who cannot see the figure. Two figures with different descriptions have different
-            ids.
+        label: description for readers who cannot see the figure. The ids of the SVG elements depend on this
+            description.
         recolour: True: use the colours of the page, light or dark; False: keep the colours of the figure.
 
     """

@@ -24,7 +24,7 @@ TESTS = {
 def is_as_shipped(scenario: Scenario) -> bool:
     """Return whether the scenario equals the shipped scenario of the same name.
 
-    Titles, descriptions and sources are not compared.
+    The keys ``title``, ``description`` and ``source`` are not compared.
     """
     one, other = (
         each.model_dump(exclude={"title", "description", "source"}) for each in (scenario, load_scenario(scenario.name))

@@ -105,7 +105,7 @@ class Course:
 
     @property
     def rise(self) -> float:
-        """Mean return over the last tenth of the updates, minus the return at the first update (mean over the runs)."""
+        """Mean return over the last tenth of the updates, minus the return at the first update; mean over the runs."""
         return float((self.last_returns - self.returns.values[:, 0]).mean())
 
     @property
@@ -116,7 +116,7 @@ class Course:
         return np.asarray(self.harm.steps[np.argmax(there, axis=1)])
 
     def returns_at(self, shares: Floats) -> Floats:
-        """Return the mean return of each training run at k points of the run, [seeds, k].
+        """Return the mean return of training episodes at k points of each training run, [seeds, k].
 
         ``shares`` [k] gives each point as a share of the run: 0 is the start of the run and 1 its end.
         """
@@ -126,21 +126,21 @@ class Course:
     def unrest(self, points: int) -> Floats:
         """Return how much the return of each training run fluctuates in the second half of the run, [seeds].
 
-        The return is read at ``points`` equally spaced points of the second half, so runs of different lengths can be
-        compared. The result is the standard deviation of the changes from one point to the next, divided by the
-        absolute value of ``rise`` (the rise of the return in the whole run).
+        The return is read at ``points`` equally spaced points of the second half of the run, so runs of different
+        lengths can be compared. The result is the standard deviation of the changes of the return from one point to the
+        next, divided by the absolute value of ``rise`` (the rise of the return in the whole run).
         """
         return np.asarray(np.diff(self.returns_at(np.linspace(0.5, 1.0, points)), axis=1).std(axis=1) / abs(self.rise))
 
     @property
     def still_rising(self) -> float:
-        """Rise of the return in the last quarter of a run (mean over the runs), as a share of the whole ``rise``."""
+        """Mean rise of the return in the last quarter of the runs, divided by the absolute value of ``rise``."""
         before = self.returns_at(np.array([0.75]))[:, 0]
         return float((self.returns.values[:, -1] - before).mean()) / abs(self.rise)
 
     @property
     def spread(self) -> Floats:
-        """Standard deviation of the return between the runs, at k steps in the second half of the runs, [k]."""
+        """Standard deviation of the return over the runs, at each of the k steps in the second half of a run, [k]."""
         return np.asarray(self.returns.values[:, len(self.returns.steps) // 2 :].std(axis=0, ddof=1))
 
 

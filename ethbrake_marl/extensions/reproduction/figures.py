@@ -56,12 +56,12 @@ def estimates_figure(
 
 
 def road_figure(records: Mapping[str, EpisodeRecord], *, caption: str) -> Figure:
-    """Draw the positions of all vehicles on the road as the paper does.
+    """Draw the positions of all vehicles on the road, in the way of the paper's figure.
 
     Each episode has a panel, and each vehicle has a row in the panel.
 
-    An arrow marks the position of a vehicle every ten time steps. Dashed lines connect the positions of the vehicles at
-    the same time.
+    An arrow marks the position of a vehicle every ten time steps. Dashed lines connect the positions that the vehicles
+    have at the same time.
 
     Args:
         records: episodes; the key of an episode is the title of its panel.
@@ -127,7 +127,8 @@ def profiles_figure(panels: Mapping[str, Mapping[str, EpisodeRecord]], *, captio
 def changes_figure(changes: Mapping[str, Mapping[str, Estimate]], *, x_label: str, caption: str) -> Figure:
     """Draw the effects of several changes with their 95 % intervals.
 
-    The figure has one row for each change, with one marker for each label.
+    The figure has one row for each change; in each row, each label has one marker, which shows the effect of the
+    change.
 
     Args:
         changes: nested mapping: name of the change -> label (for instance a strategy) -> effect of the change.

@@ -76,9 +76,9 @@ class Reproduction:
         ]
 
     def trained(self, wanted: Collection[str]) -> dict[str, list[Path]]:
-        """Find the recipes whose training runs are finished for every seed: ``group/recipe`` -> folder of each seed.
+        """Return the recipes whose training runs are all finished, as ``group/recipe`` -> folder of each seed.
 
-        ``wanted`` are the names of the groups in which recipes are checked.
+        ``wanted`` are the names of the groups of training runs that are checked.
         """
         return {
             f"{group.name}/{name}": paths
@@ -89,7 +89,7 @@ class Reproduction:
     def seconds_left(self, wanted: Collection[str]) -> float:
         """Estimate the time (s) in which one core does all unfinished training runs of the groups named in ``wanted``.
 
-        A run that has begun is counted with its whole time, not with its remaining time.
+        For a training run that has begun but not finished, the whole time is counted, not the remaining time.
         """
         return sum(
             group.trained[name][0].decisions / group.trained[name][0].per_s
@@ -101,7 +101,7 @@ class Reproduction:
     def train(self, wanted: Collection[str]) -> bool:
         """Do those training runs of the groups named in ``wanted`` that are not finished.
 
-        Return False if Ctrl-C stopped a run.
+        Return False if Ctrl-C stopped a training run.
         """
         from ethbrake_marl.extensions.reproduction.learning_curves import LearningCurves
 
@@ -161,7 +161,7 @@ class Drawn:
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """Reproduction of a figure or table of the paper, before this result is written to files."""
+    """Reproduction of a figure or table of the paper, before the reproduction is written to files."""
 
     verdicts: Sequence[Verdict]  # verdict on each comparison with the paper
     parameters: Sequence[Parameter]  # quantities that affect the result
@@ -196,7 +196,7 @@ class Result:
     def in_words(self) -> dict[str, Any]:
         """Return the result as mappings, lists and texts, for a JSON file.
 
-        The JSON file contains each table cell as one text, with value and interval.
+        The JSON file contains each cell of a table as one text: the value, and its interval if it has one.
         """
         tables = [
             {**asdict(table), "rows": [[cell.in_words for cell in row] for row in table.rows]} for table in self.tables
@@ -255,8 +255,9 @@ def scenario_parameters(scenario: Scenario, **places: str) -> list[Parameter]:
 
     Args:
         scenario: the scenario.
-        places: place where the paper states the value, by key of the scenario. A missing key has the place in
-            ``_QUANTITIES``. If a place is empty, the paper does not state the value, and the value is our default.
+        places: place where the paper states the value, by key of the scenario. For a key that ``places`` does not
+            contain, the place in ``_QUANTITIES`` is used. An empty place means that the paper does not state the value,
+            and that the value is our default.
 
     """
     content = scenario.model_dump(mode="json", exclude_none=True)

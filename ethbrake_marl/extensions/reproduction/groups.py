@@ -56,11 +56,11 @@ _ENDS_M = (10.0, 12.0, 14.0, 16.0, 18.0, 20.0)  # limits of the groups, for the 
 
 
 def by_distance(evaluation: Evaluation) -> tuple[list[float], Groups]:
-    """Group the worlds by the sum of the two gaps.
+    """Divide the worlds of an evaluation into groups by the sum of the two gaps.
 
-    Return the mean sum of the gaps in each group (m), and the harm of each strategy in each world of each group. The
-    harm has the form ``{"10-12 m": {"PPO": harm, ...}, ...}``, in which ``harm`` is an array with one value for each
-    world of the group. Groups without worlds are omitted.
+    Return two results. The first result is a list with the mean sum of the two gaps (m) in each group of worlds. The
+    second result is a dictionary ``{"10-12 m": {"PPO": harm, ...}, ...}`` from the group and the strategy to an array
+    ``harm`` with one value for each world of the group. Groups without worlds are omitted.
     """
     total, each_harm = evaluation.worlds.gaps_m.sum(axis=1), harms(evaluation)
     inner, at, groups = np.digitize(total, _ENDS_M[1:-1]), [], {}
@@ -72,10 +72,10 @@ def by_distance(evaluation: Evaluation) -> tuple[list[float], Groups]:
 
 
 def less_in_each(groups: Groups, smaller: str, *larger: str) -> list[Less]:
-    """Compare, in every group of worlds, the harm of strategy ``smaller`` with the harm of each strategy ``larger``.
+    """Compare the harm of the strategy ``smaller`` with each strategy in ``larger``, in every group of worlds.
 
-    Each comparison is paired: the two strategies drive the same worlds. For each group of worlds, ``groups`` contains
-    the harm of each strategy in each of the n worlds, [n].
+    Each comparison is paired, because the two strategies drive the same worlds. For each group of worlds, ``groups``
+    contains the harm of each strategy in each of the n worlds of the group, [n].
     """
     return [
         Less.of_harms(group if len(larger) == 1 else f"{group}, {other}", harm, smaller, other)
@@ -85,12 +85,12 @@ def less_in_each(groups: Groups, smaller: str, *larger: str) -> list[Less]:
 
 
 def _harm_table(title: str, groups: Groups, note: str) -> Sheet:
-    """Return a table of mean harms with intervals.
+    """Return a table with the mean harm of each strategy in each group of worlds.
 
-    The table has a row for each strategy and a column for each group of worlds.
+    Each mean harm has its 95 % interval. The table has a row for each strategy and a column for each group of worlds.
 
-    For each group of worlds, ``groups`` contains the harm of each strategy in each of the n worlds, [n]. ``note`` is
-    added to the text below the table.
+    For each group of worlds, ``groups`` contains the harm of each strategy in each of the n worlds of the group, [n].
+    ``note`` is added to the text below the table.
     """
     strategies = next(iter(groups.values()))
     rows = [(name, *(mean(harm[name]) for harm in groups.values())) for name in strategies]
@@ -110,7 +110,7 @@ def over_distance(
     Args:
         stem: file name of the figure and of the data, without ending.
         curves: results of ``by_distance``, by the name of the assumption on when Vehicle 2 may act.
-        verdicts: verdicts on the paper's statements.
+        verdicts: verdicts on the paper's statements about this figure, which become part of the result.
         lines: names of the strategies that the figure shows.
         parameters: parameters to list on the page in addition to the quantities of the scenario.
         episodes: number of worlds.
@@ -192,8 +192,8 @@ _ONE, _LIST = "d = 7, 7 m; v = 20, 18, 20 m/s", "d = 5-10 m; v = 18-22 m/s"
 def reproduce_delays(settings: Reproduction) -> Made:
     """Reproduce the paper's figure of harm at three delays; return figures, tables and verdicts.
 
-    The paper's figure is about a single world. Our first figure shows the harm in this world, and our second figure the
-    mean harm in random worlds.
+    The paper's figure is about a single world. Our first figure shows the harm in the world of the paper's figure. Our
+    second figure shows the mean harm in random worlds.
     """
     episodes = min(_DELAY_WORLDS, settings.episodes)
     curves: dict[tuple[str, str], Groups] = {}  # (description of the worlds, assumption) -> delay -> harm
@@ -246,6 +246,6 @@ def reproduce_delays(settings: Reproduction) -> Made:
 
 
 def _delay_name(scenario: Scenario) -> str:
-    """Name a scenario's delay, and add the latencies of Vehicles 2 and 3: "low (0.1, 0.3 s)"."""
+    """Return the name of a scenario's delay, with the latencies of Vehicles 2 and 3: "low (0.1, 0.3 s)"."""
     _, middle, rear = scenario.model_dump()["latency_s"]
     return f"{scenario.name.removeprefix('paper-delay-')} ({middle:g}, {rear:g} s)"

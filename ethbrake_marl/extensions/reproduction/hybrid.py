@@ -65,11 +65,11 @@ def _drive_hybrid(name: str, settings: Reproduction, reading: Reading) -> Evalua
 
 @lru_cache(maxsize=2 * len(READINGS))  # figure and table share the evaluations
 def _driven_hybrid(name: str, settings: Reproduction, reading: Reading, about: str) -> Evaluation:
-    """Return the evaluation that ``_drive_hybrid`` describes, from the cache if it is there.
+    """Return the evaluation that ``_drive_hybrid`` describes; a repeated call returns the result from the cache.
 
-    ``about`` is the description of the policy that has not converged. The description is part of the cache key. If the
-    training run of this policy ends after the first call, the trained policy replaces a shipped policy, the description
-    changes, and the strategies are evaluated again.
+    ``about`` is the description of the policy that has not converged, and is part of the cache key. If the training run
+    of this policy ends after the first call, the trained policy replaces a shipped policy, the description changes, and
+    the strategies are evaluated again.
     """
     scenario, (policy, _) = reading.scenario(name), unconverged_policy(settings)
     agents: dict[str, Agent] = {

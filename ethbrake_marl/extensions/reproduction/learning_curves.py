@@ -81,8 +81,8 @@ class LearningCurves(NamedTuple):
     ) -> bool:
         """Train every recipe with every seed. Finished training runs are not repeated; unfinished runs continue.
 
-        Returns False if Ctrl-C stopped the work. Raises the exceptions of ``train_all``; in particular, before any run
-        begins, ``InvalidInput`` if a folder contains a training run with other settings.
+        Returns False if Ctrl-C stopped a training run. Raises the exceptions of ``train_all``; in particular, before
+        any run begins, ``InvalidInput`` if a folder contains a training run with other settings.
 
         Args:
             steps: number of steps of each training run; None: the number in the recipe.
@@ -110,9 +110,9 @@ class LearningCurves(NamedTuple):
     def write(self) -> dict[str, Any]:
         """Draw the curves of the training runs, write figure, table and summary to the folder, and return the summary.
 
-        For each recipe, the summary contains the harm of the best policy and of the last policy in a training run. Both
-        harms are interquartile means over the seeds, with a bootstrap interval. The summary also contains hashes of the
-        best policies and of the worlds on which the policies were evaluated.
+        For each recipe, the summary contains the harm of the best policy and of the last policy of a training run. Each
+        of these harms is an interquartile mean over the seeds, with a bootstrap interval. The summary also contains
+        hashes of the best policies and of the worlds on which the policies were evaluated.
 
         Raises ``InvalidInput`` if the runs of a recipe have no step in common at which each of them was evaluated.
         """

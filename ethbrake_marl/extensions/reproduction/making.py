@@ -48,7 +48,7 @@ def open_folder(asked: Reproduction, *, force: bool = False) -> StudyFolder:
 
     If the folder contains a reproduction with the same settings, the work continues this reproduction.
 
-    Raises ``InvalidInput`` if the folder is a symbolic link.
+    Raises ``InvalidInput`` if the path of the folder is a symbolic link.
 
     Args:
         asked: settings of the reproduction.
@@ -75,15 +75,15 @@ def make_items(asked: Reproduction, items: Sequence[Item], *, force: bool = Fals
     Items that need no training runs are reproduced first. An item is not reproduced again if its stored result comes
     from the same training runs. The HTML page with all results is written again after each item.
 
-    Ctrl-C during a training run stops all training runs; afterwards the items are reproduced with the finished runs. A
-    second Ctrl-C stops the command at once.
+    Ctrl-C during a training run stops all training runs; the items are then reproduced with the finished training runs.
+    A second Ctrl-C stops the command at once.
 
     Returns all results in the folder, and whether all training runs are finished. Raises the exceptions of
     ``open_folder`` and ``StudyFolder.work``.
 
     Args:
         asked: settings of the reproduction.
-        items: items to reproduce.
+        items: items (figures and tables of the paper) to reproduce.
         force: whether items whose results exist are reproduced again.
 
     """

@@ -1,7 +1,7 @@
 """Sensitivity of the random test's results to the quantities that the paper leaves open.
 
-For each such quantity, a table states what the paper says, our default, and alternative values. Another table states,
-for each alternative, how much the mean harm changes, and the new collision rates.
+For each quantity that the paper leaves open, a table states what the paper says, our default, and alternative values.
+Another table states, for each alternative value, how much the mean harm changes, and the new collision rates.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from ethbrake_marl.training.run_folder import RunDirectory
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alternative:
-    """Another possible value of a quantity that the paper leaves open, and how to repeat the random test with it."""
+    """Other value of a quantity that the paper leaves open, and how to repeat the random test with this value."""
 
     value: str  # the value in words
     changes: Mapping[str, Any] = field(default_factory=dict)  # keys of the scenario with their new values
@@ -130,7 +130,7 @@ class Headline:
     collided: Mapping[str, Bools]  # strategy -> [n] whether each world has a collision
 
     def change(self, base: Headline, strategy: str) -> Estimate:
-        """Return the mean harm of ``strategy`` in these results minus its mean harm in the results ``base``, m2/s2.
+        """Return the mean harm of ``strategy`` in this object minus its mean harm in the results ``base``, m2/s2.
 
         If both results are for the same worlds, the difference is computed world by world (paired).
         """
@@ -141,10 +141,10 @@ class Headline:
 
 
 def reproduce_gaps(settings: Reproduction) -> Made:
-    """Measure how much the results of the random test change when one open quantity changes.
+    """Measure how results of the random test change if a quantity that the paper leaves open gets another value.
 
-    Open quantities are those that the paper does not state, or states ambiguously (``GAPS``). Returns a figure,
-    verdicts and tables; one table lists all open quantities.
+    The paper leaves a quantity open if it does not state the quantity, or states it ambiguously (``GAPS``). Returns a
+    figure, verdicts and tables; one table lists all quantities that the paper leaves open.
     """
     episodes, scenario = min(2_000, settings.episodes), load_scenario(RANDOM)
     base = _measure(scenario, Alternative("default"), episodes)
@@ -243,14 +243,14 @@ def reproduce_gaps(settings: Reproduction) -> Made:
 
 
 def _measure(scenario: Scenario, alternative: Alternative, episodes: int) -> Headline:
-    """Evaluate the strategies in the random test after one open quantity has got another value.
+    """Evaluate the strategies in the random test with another value of a quantity that the paper leaves open.
 
-    Returns the harm and the collisions in each world. If ``alternative.harm`` is ``predicted``, only the pairwise
-    E-V2X-BM has predicted harm; for the other strategies, first-impact harm is returned.
+    Returns the harm and the collisions of each strategy in each world. If ``alternative.harm`` is ``predicted``, only
+    the pairwise E-V2X-BM has predicted harm; for the other strategies, first-impact harm is returned.
 
     Args:
         scenario: scenario of the random test, before ``alternative.changes`` are applied.
-        alternative: the other value of an open quantity.
+        alternative: the other value, and how to repeat the random test with this value.
         episodes: number of worlds.
 
     """

@@ -28,10 +28,11 @@ _NUMERAL = re.compile(r"[-+−]?\d[\d,.]*( ?%)?|–|")
 
 
 def _account(results: Sequence[Result]) -> tuple[str, str, str, list[str]]:
-    """Return the first sentence of the page, the command that makes the results, how they were made, and remarks.
+    """Return four results: the page's first sentence, the command, the origin of the results, and remarks.
 
-    The third text states date, machines and processor time. There is one remark if fewer worlds were used than in the
-    paper, else none.
+    The command is the command line that makes the results. The origin of the results states dates, machines and
+    processor time. The list of remarks has one entry if the results use fewer worlds than the paper, and is empty
+    otherwise.
     """
     every = len(results) == len(ITEMS)
     most = max((result.episodes for result in results), default=MOST_EPISODES)

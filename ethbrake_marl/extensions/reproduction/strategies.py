@@ -48,7 +48,8 @@ NAMES = {  # names of the strategies in tables and figures
 class Reading:
     """An assumption on the time at which Vehicle 2 may act.
 
-    The list ``READINGS`` has two such assumptions, because the paper is not clear about this time.
+    The list ``READINGS`` contains two assumptions, because the paper is not clear about the time at which Vehicle 2 may
+    act.
     """
 
     name: str  # name of the assumption
@@ -57,7 +58,7 @@ class Reading:
     def scenario(self, name: str, **changes: object) -> Scenario:
         """Load the shipped scenario ``name``, and return it with Vehicle 2's latency under this assumption.
 
-        ``changes`` gives new values for further keys of the scenario.
+        ``changes`` contains new values for further keys of the scenario.
         """
         scenario = load_scenario(name).replace(**changes) if changes else load_scenario(name)
         if self.acts_s is None:
@@ -70,10 +71,10 @@ READINGS = (Reading("as stated"), Reading("Vehicle 2 acts at 0.2 s", 0.2))
 
 
 def lineup(scenario: Scenario, *specs: str) -> dict[str, Agent]:
-    """Return the agents with the given specs, by name.
+    """Return the agents that ``specs`` describe, as a dictionary by name.
 
-    ``specs`` are specs such as ``"full_brake"``. The name of an agent in the result is its entry in ``NAMES``, or the
-    spec if there is no such entry.
+    Each of ``specs`` is a text that describes an agent, such as ``"full_brake"``. The name of the agent in the result
+    is the entry of the text in ``NAMES``, or the text itself if ``NAMES`` has no such entry.
     """
     return {NAMES.get(spec, spec): agent for spec, agent in make_agents(specs, scenario).items()}
 
@@ -96,8 +97,8 @@ def drive_list(scenario: Scenario, agents: Mapping[str, Agent], episodes: int, s
 def harms(evaluation: Evaluation) -> dict[str, Floats]:
     """Return the first-impact harm of each strategy: name of the strategy -> [n] harm in each world (m2/s2).
 
-    If they are known, two entries are added: the harm that E-V2X-BM predicts (key ``PREDICTED``), and the proven lower
-    bound of the harm (key ``PROVEN``).
+    If the harm that E-V2X-BM predicts is known, the result also contains this harm (key ``PREDICTED``). If a proven
+    lower bound of the harm is known, the result also contains this bound (key ``PROVEN``).
     """
     each_harm = {name: outcome.first_impact_harm for name, outcome in evaluation.outcomes.items()}
     pairwise = evaluation.outcomes.get(NAMES[PAIRWISE])
@@ -116,8 +117,8 @@ def unconverged_policy(settings: Reproduction) -> tuple[Policy, str]:
     """Return a policy that has not converged, and its description.
 
     The paper uses a "PPO model obtained from training before convergence occurred". This function returns the policy of
-    a training run that ``--full`` stops early. If this run has not been done, the function returns a shipped policy
-    instead.
+    a training run that ``--full`` stops early. If this training run has not been done, the function returns a shipped
+    policy instead.
     """
     for (path,) in settings.trained([STOPPED]).values():
         about = f"PPO stopped early: the last policy of {EARLY.decisions:,} decisions on paper-random"

@@ -48,7 +48,7 @@ class Beside:
     def numbers(self) -> dict[str, dict[str, Estimate]]:
         """Our results: strategy -> quantity (such as "collision rate") -> estimate.
 
-        If lower bounds for all strategies are proven, they are the entry "least possible (proven)" (``NOBODY``).
+        If lower bounds for all strategies are proven, these bounds have the key "least possible (proven)" (``NOBODY``).
         """
         numbers, braking = {}, self.evaluation.outcomes.get(NAMES[FULL_BRAKE])
         for name, outcome in self.evaluation.outcomes.items():
@@ -67,13 +67,13 @@ class Beside:
         return numbers
 
     def candidates(self, row: str, quantity: str) -> Iterator[tuple[str, Estimate]]:
-        """Yield those of our results that a printed number of the paper may mean, each as (name, estimate).
+        """Yield our results that may correspond to a printed number of the paper, each as (name, estimate).
 
-        The printed number is compared with the first of these results. If the printed number and the first result
-        differ, the verdict also names the result that is nearest to the printed number.
+        The printed number is compared with the first of the yielded results. If the printed number and the first
+        yielded result differ, the verdict also names the yielded result that is nearest to the printed number.
 
         Args:
-            row: name that the paper gives the strategy.
+            row: name of the strategy in the paper's table.
             quantity: quantity that the paper prints: "collision rate", "average harm" or "harm decrease".
 
         """
@@ -121,13 +121,13 @@ def compare_rows(printed: Sequence[PaperRow], besides: Sequence[Beside]) -> list
 def selection_verdict(one: PaperRow, other: PaperRow, chosen: PaperRow) -> Verdict:
     """Return a verdict on the printed number of collisions of the hybrid, which chooses between two strategies.
 
-    In each world the hybrid chooses one of the two strategies. Therefore the hybrid avoids a collision only in worlds
-    in which at least one of the two strategies avoids a collision. So the hybrid cannot avoid more collisions than the
-    two strategies together.
+    In each world the hybrid chooses one of two strategies: E-V2X-BM or a policy. Therefore the hybrid avoids a
+    collision only in worlds in which at least one of the two strategies avoids a collision. So the hybrid cannot avoid
+    more collisions than E-V2X-BM and the policy together.
 
     Args:
-        one: row of the paper's table for the first of the two strategies.
-        other: row of the paper's table for the second of the two strategies.
+        one: row of the paper's table for the first of the two strategies between which the hybrid chooses.
+        other: row of the paper's table for the second of the two strategies between which the hybrid chooses.
         chosen: row of the paper's table for the hybrid.
 
     """
@@ -144,11 +144,11 @@ def selection_verdict(one: PaperRow, other: PaperRow, chosen: PaperRow) -> Verdi
 def decrease_verdict(row: PaperRow, baseline: PaperRow) -> Verdict:
     """Return a verdict on whether the decrease of harm that the paper prints follows from the printed mean harms.
 
-    The printed and the computed decrease may differ by at most 0.01 percentage points.
+    The verdict is "agrees" if the printed and the computed decrease differ by less than 0.01 percentage points.
 
     Args:
         row: row of the paper's table in which the decrease is printed.
-        baseline: row of the strategy from whose harm the decrease is counted.
+        baseline: row of the strategy with whose harm the harm in ``row`` is compared.
 
     """
     follows = 1.0 - row.average_harm / baseline.average_harm
@@ -187,7 +187,7 @@ def beside_printed(
         stem: name of the CSV file with the data, without ending.
         printed: rows of the paper's table.
         besides: our results under each assumption on when Vehicle 2 may act.
-        arithmetic: verdicts on whether the printed numbers fit together, which need none of our results.
+        arithmetic: verdicts on whether the paper's printed numbers are consistent; they need none of our results.
         parameters: quantities that affect our results, to list on the page.
         notes: sentences that say what was run and what was not.
 

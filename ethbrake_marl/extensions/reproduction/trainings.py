@@ -1,4 +1,4 @@
-"""Training runs of ``ethbrake reproduce --full``: for learning curves, a policy stopped early, and open settings.
+"""Training runs of ``ethbrake reproduce --full``: for learning curves, an unconverged policy, and open settings.
 
 *Open settings* are settings that the paper does not state. The runs of a group are stored in one folder, which
 ``learning_curves.LearningCurves`` manages.
@@ -34,10 +34,10 @@ class TrainedRecipe:
     per_s: int  # decisions per second on one core (Intel Xeon), to estimate the time of the training
 
     def load(self, name: str, **changes: Any) -> TrainingRecipe:
-        """Load the recipe, and return it with the new name ``name``.
+        """Load the recipe of this object, and return the recipe with the new name ``name``.
 
-        The length of training and the number of updates between two evaluations are those of this object. ``changes``
-        gives new values for further keys of the recipe.
+        The returned recipe has the length of training and the number of updates between two evaluations that this
+        object contains. ``changes`` contains new values for further keys of the recipe.
         """
         recipe = load_recipe(self.recipe)
         evaluation = {**recipe.evaluation.model_dump(), "every_updates": self.every_updates}

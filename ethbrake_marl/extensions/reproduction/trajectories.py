@@ -175,16 +175,17 @@ def _parameters() -> list[Parameter]:
 
 
 def _both(records: Records, reading: Reading, number: int, what: str, column: int) -> tuple[Floats, Floats]:
-    """Return the course of one recorded quantity under PPO and under SAC, at the same times.
+    """Return the values over time of one recorded quantity: under PPO, and under SAC at the same times.
 
-    The times end with the longer of the two episodes. After the end of the shorter episode, its last value is repeated.
+    The last time is the end of the longer of the two episodes. After the end of the shorter episode, its last value is
+    repeated.
 
     Args:
         records: recorded episodes.
         reading: assumption on when Vehicle 2 may act.
         number: number of the scenario, 1 or 2.
         what: name of the quantity, an attribute of ``EpisodeRecord`` such as ``gaps_m``.
-        column: index of the vehicle or of the pair.
+        column: index (0 = front) of the vehicle or pair of vehicles whose quantity is returned.
 
     """
     pair = [records[reading, number, name] for name in _POLICIES]
@@ -196,7 +197,8 @@ def _both(records: Records, reading: Reading, number: int, what: str, column: in
 def _apart(records: Records, reading: Reading, what: str) -> list[float]:
     """Return how far a quantity of Vehicle 2 differs between PPO and SAC, in Scenario 1 and in Scenario 2.
 
-    The result is the root mean square, over the times of an episode, of the difference between PPO and SAC.
+    Each result is the root mean square, over the times of an episode, of the difference of this quantity between PPO
+    and SAC.
 
     Args:
         records: recorded episodes.
@@ -212,10 +214,10 @@ def _judge_one_world(claims: Mapping[str, tuple[str, float, float]], reading: Re
     """Return a verdict on each claim of the paper about a single world. Numbers for a single world have no intervals.
 
     Args:
-        claims: for each claim, a text with two numbers, the number that is smaller according to the claim, and the
-            number that is larger according to the claim.
+        claims: dictionary from each claim to three values: a text for the verdict, the number that is smaller according
+            to the claim, and the number that is larger according to the claim.
         reading: assumption on when Vehicle 2 may act, for the text of the verdict.
-        show: format in which the verdict writes the difference of the two numbers.
+        show: format in which the verdict writes the smaller minus the larger number.
 
     """
     return [

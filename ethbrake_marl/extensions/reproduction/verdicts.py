@@ -1,17 +1,20 @@
 """Verdicts on whether the paper's numbers and statements agree with our results.
 
-*Chance* means: how much two results may differ only because they come from two different random lists of worlds.
+The *chance difference* is how much two results may differ only because they come from two different random lists of
+worlds.
 
 - A number that the paper prints *agrees* with our number if the difference is at most ``TOLERANCE`` of the printed
-  number. It also agrees if the difference is at most chance, and chance is at most ``WIDE`` of the larger of the two
-  numbers.
-- A printed number that does not agree is *undecided* if the difference is at most chance.
-- A printed number *cannot agree* if it is below a proven lower bound for all strategies by more than chance.
+  number. The printed number also agrees if the difference is at most the chance difference, and the chance difference
+  is at most ``WIDE`` of the larger of the two numbers.
+- A printed number that does not agree is *undecided* if its difference from our number is at most the chance
+  difference.
+- A printed number *cannot agree* if it is below a proven lower bound for all strategies by more than the chance
+  difference.
 - A printed number *differs* in all other cases.
 
 A statement of the paper says that some quantities are smaller than others. A statement *agrees* if every difference
 (smaller minus larger quantity) has a 95 % interval below 0. A statement that does not agree is *undecided* if each of
-its other intervals contains 0.
+the intervals that are not below 0 contains 0.
 """
 
 from __future__ import annotations
@@ -72,10 +75,10 @@ def compare_number(
     Args:
         what: name of the printed number, as the verdict shows it.
         printed: number that the paper prints.
-        ours: value of this quantity in our results, with its 95 % interval.
-        show: format in which both numbers are written.
+        ours: our result for the quantity whose value the paper prints, with its 95 % interval.
+        show: format in which the verdict writes our number and the printed number.
         least: description and value of a proven lower bound for all strategies in our worlds; None: no bound.
-        others: values of this quantity in our results under other assumptions, by the description of the assumption. If
+        others: our results for the same quantity under other assumptions, by the description of the assumption. If
             ``ours`` differs from the printed number, the verdict names the assumption whose value is nearest to the
             printed number.
 
@@ -103,8 +106,9 @@ def compare_number(
 def _off(printed: float, ours: Estimate) -> str:
     """Return how far ``ours`` is from the printed number, as text such as "+3.1 %"; empty if the two numbers agree.
 
-    Two numbers agree if they differ by at most 2 % of the printed number (``TOLERANCE``). They also agree if they
-    differ by no more than chance (``_chance``), and chance is at most 15 % (``WIDE``) of the larger number.
+    Two numbers agree if they differ by at most 2 % of the printed number (``TOLERANCE``). Two numbers also agree if
+    they differ by no more than the chance difference (``_chance``), and the chance difference is at most 15 %
+    (``WIDE``) of the larger number.
     """
     chance = _chance(ours)
     off = chance if chance <= WIDE * max(abs(printed), abs(ours.value)) else 0.0
@@ -116,7 +120,7 @@ def _off(printed: float, ours: Estimate) -> str:
 def _chance(estimate: Estimate) -> float:
     """Return by how much ``estimate`` may differ, by chance, from an estimate in equally many other worlds.
 
-    The result is sqrt(2) times half the width of the 95 % interval.
+    The result is sqrt(2) times half the width of the 95 % interval of ``estimate``.
     """
     low, high = estimate.ends
     return math.sqrt(2.0) * 0.5 * (high - low)
@@ -138,7 +142,7 @@ class Less:
 
     @classmethod
     def of_lists(cls, where: str, smaller: Floats, larger: Floats) -> Less:
-        """Compare the mean of ``smaller`` [n] with the mean of ``larger`` [m], two independent samples.
+        """Compare the means of two independent samples, ``smaller`` [n] and ``larger`` [m].
 
         ``where`` is a text that says which worlds or strategies are compared.
         """
@@ -168,8 +172,8 @@ def judge_statement(what: str, parts: Sequence[Less], *, or_equal: bool = False,
     Args:
         what: statement of the paper, in words.
         parts: all comparisons that must be right if the statement is right.
-        or_equal: whether an interval whose upper end is exactly 0 also agrees with the statement.
-        show: format in which the differences are written.
+        or_equal: True: an interval whose upper end is exactly 0 also agrees with the statement.
+        show: format in which the verdict writes the differences.
 
     """
     compared, ties = [part for part in parts if not part.neither], [part.where for part in parts if part.neither]

@@ -247,8 +247,8 @@ def falsify_command(
     the score is the agent's harm minus the harm of --against (by default the best known commands). With difference, the
     score is the absolute difference between the harms of the agent and of --against. With bound, the score is the
     agent's harm minus the bound of its shield, so a score above 0 means that the bound is broken. With --again FILE,
-    the agent that FILE names (or --agent) drives the worlds of FILE again. If the score of a world is then larger than
-    in FILE, the exit status is 1.
+    the agent that FILE names (or --agent) drives the worlds of FILE again. If the score of any of these worlds is
+    larger than in FILE, the exit status is 1.
     """
     with Out(as_json=as_json, force=force) as out:
         import numpy as np

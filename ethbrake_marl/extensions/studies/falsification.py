@@ -44,10 +44,11 @@ def search(
     """Search the unit cube for points with a high score, and return all points that were tried.
 
     The points are tried in rounds of at most 256 points (``ROUND``). Half of the points of a round are spread evenly
-    (scrambled Sobol points). Each point of the other half is one step away from a *parent*. The parents are the points
-    with the highest scores so far that are far apart from each other. A step is a normal random step in some
-    coordinates, or half the difference between two random parents (differential evolution). In the first round, and
-    later while no score is above the median score, all points are spread evenly. The same seed gives the same points.
+    over the cube (scrambled Sobol points). Each other point of the round is one step away from a *parent*. The parents
+    are the points with the highest scores so far that are far apart from each other. A step is a normally distributed
+    random step in some coordinates, or half the difference between two random parents (differential evolution). In the
+    first round, and later while no score is above the median score, all points are spread evenly. The same seed gives
+    the same points.
 
     Args:
         score: function from points [n, d] to scores [n].
@@ -78,7 +79,7 @@ def search(
 
 
 def _spread(dimensions: int, seed: int) -> Iterator[Floats]:
-    """Yield points [d] that are evenly spread over the unit cube (scrambled Sobol points), without end.
+    """Yield, without end, points [d] that are spread evenly over the unit cube (scrambled Sobol points).
 
     ``dimensions`` is d. The same seed gives the same points.
     """
@@ -94,8 +95,8 @@ def far_apart(scored: Scored, count: int) -> Ints:
 
     Return the row numbers of the chosen points in ``scored``, highest score first.
 
-    Any two of the chosen points differ by at least 0.1 in some coordinate. Points whose score is not finite are
-    omitted.
+    Any two of the chosen points differ by at least 0.1 in some coordinate. Points whose score is not finite are never
+    chosen.
     """
     order = np.argsort(-scored.scores, kind="stable")
     order = order[np.isfinite(scored.scores[order])]

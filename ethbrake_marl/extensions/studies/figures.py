@@ -47,7 +47,7 @@ def is_done(job: TrainingJob) -> bool:
 
 
 def finish(job: TrainingJob, stop_at: StopAt | None = None) -> bool:
-    """Continue the training run of ``job`` to its end. Return False if ``stop_at`` stopped the run early.
+    """Start or continue the training run of ``job`` until it ends. Return False if ``stop_at`` stopped the run early.
 
     ``stop_at`` is a function that is called with each evaluation; it returns a reason to stop, or None to continue.
     Raises the exceptions of ``train`` and ``resume``, ``InvalidInput`` if the folder contains a training run with other
@@ -68,7 +68,7 @@ def finish(job: TrainingJob, stop_at: StopAt | None = None) -> bool:
 def evaluations_of(job: TrainingJob) -> list[dict[str, float]]:
     """Return the evaluations so far of the training run ``job``, each as a dictionary with ``steps`` and the measures.
 
-    Raises ``InvalidInput`` if the file ``progress.csv`` in the folder is damaged.
+    Raises ``InvalidInput`` if the file ``progress.csv`` in the folder of ``job`` is damaged.
     """
     run, names = RunDirectory(job.folder), (*_MEASURED, RunDirectory.OBJECTIVE)
     try:
@@ -87,7 +87,7 @@ def evaluations_of(job: TrainingJob) -> list[dict[str, float]]:
 
 
 def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, Any]:
-    """Return the values in the table's row for ``job``, by column, computed from its ``evaluations`` so far.
+    """Return the values for the table's row of ``job``, by column, computed from the ``evaluations`` so far.
 
     The columns are ``harm`` (the least harm in an evaluation, by which the best policy is chosen) and all ``FIGURES``
     except ``policy_sha256``. Example: ``{"harm": 7.1, "steps": 400000, "total_harm": 9.8, ...}``.
@@ -104,9 +104,9 @@ def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, An
 
 
 def final_figures(job: TrainingJob) -> dict[str, Any]:
-    """Return the values in the table's row for the finished ``job``, by column: ``harm`` and all ``FIGURES``.
+    """Return the values for the table's row of the finished ``job``, by column: ``harm`` and all ``FIGURES``.
 
-    Raises ``InvalidInput`` if a file in the folder is damaged.
+    Raises ``InvalidInput`` if a file in the folder of ``job`` is damaged.
     """
     run, evaluations = RunDirectory(job.folder), evaluations_of(job)
     if not evaluations:

@@ -22,17 +22,17 @@ class StudyFolder:
     """Folder for the results of a study. After an interruption, the same command continues the work in this folder.
 
     Args:
-        path: path of the folder; it is created when the work begins.
+        path: path of the folder, which the method ``work`` creates if necessary.
         kind: words for the content of the folder in messages, such as ``a sweep``.
-        question: all settings and software versions that the results depend on, as plain data. If the folder stores
-            other settings, the work does not begin. None: the folder stores no common settings, because each result in
-            it stores its own settings.
+        question: all settings and software versions that the results depend on, as plain data. If the folder already
+            stores other settings, ``check`` and ``work`` raise ``InvalidInput``. If ``question`` is None, the folder
+            stores no common settings, because each result in the folder stores its own settings.
         record: name of the file in the folder that stores ``question``.
         more: additional entries for the file ``record``; they are stored, but never compared.
         advice: last words of an error message about the folder, which say what the user can do.
         beside: names of the files that an existing folder without the file ``record`` may contain; if it contains any
-            other file, ``check`` raises an error. None: every file is allowed.
-        writes: names of files that the work replaces; they must be writable.
+            other file, ``check`` raises an error. If ``beside`` is None, every file is allowed.
+        writes: names of files in the folder that the study replaces; these files must be writable.
 
     """
 
@@ -53,7 +53,7 @@ class StudyFolder:
         self._record, self._more = path / record, dict(more or {})
 
     def check(self) -> bool:
-        """Check that work may begin in this folder, and return whether the file ``record`` must still be written.
+        """Check that the study may use this folder, and return whether the file ``record`` must still be written.
 
         The method writes nothing. Raises ``InvalidInput`` if the path is not a folder, if the folder or a file in
         ``writes`` is not writable, or if other settings are stored in the folder. Raises ``AlreadyExists`` if the

@@ -1,6 +1,6 @@
-"""Files of worlds with names.
+"""YAML files of named worlds.
 
-A search for an agent's worst worlds writes such a file, and agents can drive its worlds again.
+A search for an agent's worst worlds writes a file of named worlds, and agents can drive the worlds of the file again.
 
 A file stores the worlds, the scenario with a hash of its content, the agent that drove the worlds, and the harm and
 score of each world.
@@ -30,7 +30,7 @@ Number = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class NamedWorld(FileModel):
-    """One world of the file: the world's name, its initial state, and the harm and score that were measured in it."""
+    """One world of a file of named worlds: its name, its initial state, and the harm and score measured in it."""
 
     # Name of the world, unique in the file.
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")]
@@ -63,7 +63,7 @@ class NamedWorlds(FileModel):
     def of(cls, scenario: Scenario, /, **fields: Any) -> NamedWorlds:
         """Return the content of a file of worlds that were drawn from ``scenario``.
 
-        ``fields`` gives every field of this class by name, except ``format``, ``version`` and ``scenario_sha256``.
+        ``fields`` contains every field of this class by name, except ``format``, ``version`` and ``scenario_sha256``.
         """
         return cls(format="ethbrake-worlds", version=1, scenario_sha256=scenario_sha256(scenario), **fields)
 
@@ -82,7 +82,7 @@ class NamedWorlds(FileModel):
 
     @property
     def text(self) -> str:
-        """YAML text of the file. Reading this text gives the same worlds, bit for bit."""
+        """YAML text of the file of named worlds. Reading this text gives the same worlds, bit for bit."""
         head = self.model_dump(exclude={"worlds"}, exclude_none=True)
         lines = [f"{key}: {flow_text(value)}" for key, value in head.items() if value != []]
         lines.append("worlds:")
@@ -94,7 +94,7 @@ class NamedWorlds(FileModel):
     def worlds_of(self, scenario: Scenario, where: str) -> Worlds:
         """Return the worlds of the file, in their states at the alert.
 
-        Raises ``InvalidInput`` if the content of ``scenario`` has changed since the worlds were found.
+        Raises ``InvalidInput`` if the content of ``scenario`` has changed since the search found the worlds.
 
         Args:
             scenario: scenario from which the worlds were drawn, as it is now.

@@ -199,7 +199,7 @@ TABLE, FAILURES, RUNS = "results.csv", "failures.csv", "runs"  # names inside th
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One job (one training run) of a sweep, checked and loaded. Its results become one row of the sweep's table."""
+    """One job (one training run) of a sweep, checked and loaded. The results of the job become one row of the table."""
 
     asked: Request  # job as requested in the file
     identity: str  # SHA-256 of everything that affects the training (``Training.identity``)
@@ -227,7 +227,7 @@ class Row:
 
 @dataclass(frozen=True)
 class SweepPlan:
-    """All jobs of a sweep, checked and loaded, in the order of its table."""
+    """All jobs of a sweep, checked and loaded, in the order of the sweep's table."""
 
     rows: Sequence[Row]  # the jobs
 
@@ -244,7 +244,8 @@ class SweepPlan:
         """Read the file of a sweep, and load the scenario and the recipe of every job.
 
         Raises ``InvalidInput``, which names the file, the line and the job, if a scenario, a recipe or a setting is
-        unknown, if they do not fit together, or if two jobs are the same training.
+        unknown, if the scenario, recipe and settings of a job do not fit together, or if two jobs request the same
+        training run.
         """
         file = SweepFile.read_as(path, "with a grid or a list of jobs")
         if not 1 <= file.size() <= MOST_JOBS:
@@ -280,7 +281,7 @@ class SweepPlan:
     def folder(path: Path) -> StudyFolder:
         """Return a ``StudyFolder`` that checks and locks the folder ``path`` of a sweep.
 
-        This object compares no settings, because the folder of each job stores the settings of this job.
+        The ``StudyFolder`` compares no settings, because the folder of each job stores the settings of this job.
         """
         return StudyFolder(path, "a sweep", writes=(TABLE, FAILURES))
 
@@ -408,7 +409,7 @@ class SweepResult:
 
     @property
     def interrupted(self) -> bool:
-        """Whether Ctrl-C stopped the run, so that some jobs have neither finished nor failed."""
+        """Whether Ctrl-C stopped the sweep, so that some jobs have neither finished nor failed."""
         return self.finished + self.failed < self.jobs
 
 

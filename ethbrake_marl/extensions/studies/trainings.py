@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
 
 def train_all(trainings: Sequence[TrainingJob], jobs: int = 1, tell: OnProgress | None = None) -> bool:
-    """Continue every training run to its end. Return False if a run was stopped before its end.
+    """Start or continue every training run until it ends. Return False if a training run was stopped before its end.
 
     The trained policies depend neither on ``jobs`` nor on interruptions. Before any run begins, raises the exceptions
-    of ``steps_left``. Afterwards, raises the exception of the first run that fails.
+    of ``steps_left``. If a training run fails later, raises the exception of the first run that fails.
 
     Args:
         trainings: training runs, each with its folder.
@@ -59,7 +59,7 @@ class TrainingJob:
 
     @property
     def per_update(self) -> int:
-        """Number of decisions between two updates of the policy, of all learners together."""
+        """Number of decisions of all learners together between two updates of the policy."""
         return self.training.recipe.n_envs * len(self.training.scenario.learners) * self.training.recipe.rounds
 
     def steps_left(self) -> int:
@@ -85,7 +85,7 @@ class TrainingJob:
         return max(total - (steps if isinstance(steps, int) else 0), 1)
 
     def finish(self, tell: OnProgress | None = None, *, stop_at: StopAt | None = None) -> bool | None:
-        """Continue the training run to its end.
+        """Start or continue the training run until it ends.
 
         Return True if the run has finished, or None if the run was stopped early.
 
@@ -156,7 +156,7 @@ class Timed(NamedTuple):
     world_s: float  # time to evaluate the policies in one world, s
 
     def seconds(self, steps: int) -> float:
-        """Estimate the time in s in which this training run makes ``steps`` decisions, evaluations included.
+        """Estimate how long (s) this training run takes for ``steps`` decisions, including its evaluations.
 
         A training run evaluates its policies at the start, every few updates and at the end, on the recipe's list of
         worlds.

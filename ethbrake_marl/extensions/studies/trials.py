@@ -37,8 +37,8 @@ def run_trials(
     """Run trials on Ray Tune. Return the last report of each trial that began, in the order in which the trials began.
 
     A report is the dictionary that ``work`` passes to ``tune.report``, and to which Ray adds entries. If the trial
-    failed, the entry ``reason`` says why. The entry ``done`` is True if the trial has ended. Ctrl-C stops all trials.
-    The caller must connect to Ray first (see ``cluster.connected``).
+    failed, the entry ``reason`` of the report says why. The entry ``done`` of the report is True if the trial has
+    ended. Ctrl-C stops all trials. The caller must connect to Ray first (see ``cluster.connected``).
 
     Args:
         work: function that runs a trial in a worker process, called as ``work(config, **given)``.
@@ -104,8 +104,8 @@ class TrialCallback(tune.Callback):  # type: ignore[misc]  # Ray ships no types
     Args:
         name: name of the study, for the progress display.
         done: number of trials that ended in earlier runs of the command.
-        total: number of all trials.
-        tell: function that is called with each ``Progress``; None: nothing is reported.
+        total: number of all trials of the study.
+        tell: function that is called with a ``Progress`` object at each report; None: nothing is reported.
 
     """
 

@@ -89,7 +89,7 @@ class Range(FileModel):
 
     @property
     def whole(self) -> bool:
-        """Whether the search tries only whole numbers: ``low`` and ``high`` are written without a decimal point."""
+        """Whether ``low`` and ``high`` are written without a decimal point, so that only whole numbers are tried."""
         return isinstance(self.low, int) and isinstance(self.high, int)
 
     @model_validator(mode="after")
@@ -102,9 +102,9 @@ class Range(FileModel):
 
     @property
     def ends(self) -> tuple[Any, ...]:
-        """The smallest and the largest value.
+        """The smallest and the largest value of the range.
 
-        Before the search starts, the recipe is checked with each of these two values.
+        Before the search starts, the recipe is checked with the smallest and with the largest value.
         """
         return self.low, self.high
 
@@ -152,11 +152,11 @@ class Choices(FileModel):
 
     @property
     def ends(self) -> tuple[Any, ...]:
-        """All choices. Before the search starts, the recipe is checked with each choice."""
+        """All choices of this setting. Before the search starts, the recipe is checked with each choice."""
         return self.choices
 
     def own(self, value: Any) -> Any:
-        """Return the choice that equals ``value``, the recipe's own value of this setting; None if there is none."""
+        """Return the choice that equals the recipe's own ``value`` of this setting; None if no choice equals it."""
         return next((each for each in self.choices if flow_text(each) == flow_text(value)), None)
 
     def distribution(self) -> BaseDistribution:
@@ -205,8 +205,8 @@ class Pruning(FileModel):
     """Rule that stops weak trials early (Ray's median stopping rule).
 
     A trial is one training run with several evaluations. After the k-th evaluation of a trial, the rule computes the
-    mean harm of each other trial so far, up to the k-th evaluation. If the trial's own least harm so far is above the
-    median of these means, the trial is stopped.
+    mean harm of each other trial over the first k evaluations. The trial is stopped if its own least harm so far is
+    above the median of the mean harms of the other trials.
     """
 
     # Number of other trials that must have reached an evaluation before a trial may be stopped there.
@@ -403,8 +403,8 @@ class TuningPlan:
     def example(self) -> str:
         """Return a command line ``ethbrake train ...`` that does the same training run as one trial.
 
-        The searched keys have the recipe's own values. If the search excludes any of these values, the keys have random
-        values.
+        In the command line, the searched keys have the recipe's own values. If the search excludes any of the recipe's
+        own values, all searched keys have random values instead.
         """
         values = self.own_values() or next(self.file.points(1))
         measured = {"evaluation": self.training(values).recipe.evaluation.model_dump(mode="json")}
@@ -435,7 +435,7 @@ class TuningPlan:
     def folder(self, path: Path) -> StudyFolder:
         """Return a ``StudyFolder`` that checks and locks the folder ``path``.
 
-        This object raises ``InvalidInput`` if the folder belongs to a tuning with other settings.
+        The ``StudyFolder`` raises ``InvalidInput`` if the folder belongs to a tuning with other settings.
         """
         return StudyFolder(path, "a tuning", self.question, record="tuning.json", writes=(TABLE,))
 
@@ -490,7 +490,7 @@ class TuningPlan:
 
         Args:
             path: folder of all results; created if necessary.
-            trials: number of trials that the folder contains at the end, with the trials of earlier runs.
+            trials: number of trials that the folder contains at the end, including the trials of earlier runs.
             jobs: number of trials that run at once; this number affects the proposals.
             ray: address of a Ray cluster; ``local``: Ray is started on this machine.
             retries: number of times that a trial is started again after its process has ended unexpectedly.
@@ -529,7 +529,8 @@ class TuningPlan:
     ) -> tuple[list[Values], list[dict[str, Any]]]:
         """Run the trials on Ray. Return all proposals, and the last result that each trial reported to Ray.
 
-        ``known`` are the proposals of earlier runs. The docstring of ``run`` explains the other arguments.
+        ``known`` are the proposals (values to try in each trial) of earlier runs of the command. The docstring of
+        ``run`` explains the other arguments.
         """
         from ray import tune
 
@@ -639,21 +640,21 @@ class TuningResult:
 
     @property
     def interrupted(self) -> bool:
-        """Whether Ctrl-C stopped the run before all requested trials had ended."""
+        """Whether Ctrl-C stopped the tuning before all requested trials had ended."""
         return len(self.trials) < self.asked or "running" in self.counts
 
     @property
     def best(self) -> Trial | None:
         """Finished trial with the least harm; if several trials have this harm, the first of them.
 
-        None if no trial has finished.
+        The value is None if no trial has finished.
         """
         finished = [each for each in self.trials if each.harm is not None]
         return min(finished, key=lambda each: (each.harm, each.number), default=None)
 
 
 def do_trial(config: dict[str, Any], plan: TuningPlan, path: Path) -> None:
-    """Train the policy of one trial to the end in a worker process of Ray, and report every evaluation.
+    """Train the policy of one trial to the end in a worker process of Ray, and report every evaluation to Ray.
 
     When the trial reports an evaluation, Ray may stop (prune) the trial.
 

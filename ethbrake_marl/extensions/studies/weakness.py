@@ -1,6 +1,6 @@
 """Measures of how badly an agent does in a world.
 
-A search for an agent's worst worlds uses such a measure as its score.
+A search for an agent's worst worlds uses one of these measures as the score of a world.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ HINDSIGHT = "best_harm"  # default reference agent of the measure regret
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Score and harm of an agent in n worlds, and the harm with which its harm is compared, in m2/s2."""
+    """Score and harm of an agent in n worlds, and the harm or bound with which its harm is compared (all in m2/s2)."""
 
     score: Floats  # [n] value of the measure, the larger the worse for the agent; minus infinity if the physics failed
     harm: Floats  # [n] harm of the agent; NaN if the physics failed
@@ -47,10 +47,10 @@ class Measure:
 
     Call this object with a ``Sample`` of worlds to compute the score of every world.
 
-    There are four measures. ``harm`` is the agent's harm. ``regret`` is the agent's harm minus the harm of a reference
-    agent, by default ``best_harm``. ``difference`` is the absolute difference between the harms of the agent and the
-    reference agent. ``bound`` is the agent's harm minus the bound of its shield at the alert; a value above 0 means
-    that the bound is broken.
+    The measure ``harm`` is the agent's harm. The measure ``regret`` is the agent's harm minus the harm of a reference
+    agent, by default ``best_harm``. The measure ``difference`` is the absolute difference between the harms of the
+    agent and the reference agent. The measure ``bound`` is the agent's harm minus the bound of its shield at the alert;
+    a value above 0 means that the bound is broken.
     """
 
     name: MeasureName  # name of the measure
@@ -59,7 +59,7 @@ class Measure:
     harm_count: HarmCount  # harm count: the first impact of each pair (``first``) or all impacts (``total``)
 
     def __call__(self, sample: Sample) -> Measured:
-        """Return the agent's score and harm in each world of ``sample``, and the harm with which its harm is compared.
+        """Return the agent's score and harm in each world of ``sample``, and the harm or bound to compare with.
 
         If the physics fails in any world, the scores of all worlds are minus infinity. Raises ``InvalidInput`` for the
         measure ``bound`` if the agent has no shield.
@@ -90,10 +90,11 @@ class Measure:
     def falsify(
         self, budget: int, seed: int, *, most: int = 20, adaptive: bool = True, on_round: Watcher | None = None
     ) -> Falsified:
-        """Search the worlds that the scenario can draw for those in which the agent does worst.
+        """Search for those worlds in which the agent does worst, among all worlds that the scenario can draw.
 
-        For every measure but ``bound``, only worlds with a score above 0 are returned, so there may be none. Raises the
-        exceptions of ``scenario.ranges``. Raises ``InvalidInput`` if no tried world has a finite score.
+        For every measure but ``bound``, only worlds with a score above 0 are returned, so the result may contain no
+        world. Raises the exceptions of ``scenario.ranges``. Raises ``InvalidInput`` if no tried world has a finite
+        score.
 
         Args:
             budget: number of worlds to try.
@@ -148,8 +149,8 @@ class Measure:
             name: name of the measure: ``harm``, ``regret``, ``difference`` or ``bound``.
             agent: spec of the agent, such as ``ppo`` or ``ppo+step``.
             against: spec of the reference agent, whose harm the measures ``regret`` and ``difference`` compare with the
-                agent's harm. For ``regret``, None means ``best_harm``. For ``harm`` and ``bound``, ``against`` must be
-                None.
+                agent's harm. For the measure ``regret``, None means that the reference agent is ``best_harm``. For the
+                measures ``harm`` and ``bound``, ``against`` must be None.
             scenario: scenario whose learners the agents drive.
             harm_count: impacts that count as harm: the first of each pair (``first``) or all (``total``).
 
