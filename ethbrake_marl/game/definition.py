@@ -53,7 +53,7 @@ class Game(Protocol):
 
     @property
     def objective(self) -> Declared:
-        """Objective of the vehicles: one name for all vehicles, or one name per vehicle. Rewards may replace it."""
+        """Objective of the vehicles: one name for all, or one name per vehicle. A reward may set another objective."""
 
     @property
     def observation(self) -> Any:
@@ -67,7 +67,7 @@ class Game(Protocol):
     def by_link(self) -> bool:
         """Whether each link between two vehicles has its own delays and losses.
 
-        If no link has them, a vehicle knows everything after its latency.
+        If no link has delays or losses, a vehicle knows everything after its latency.
         """
 
     @property

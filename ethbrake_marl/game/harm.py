@@ -5,7 +5,7 @@ The harm of an impact of pair (i, i + 1) with closing speed ``w`` is ``w^2`` (m2
 ``H_i = w^2 * m_{i+1} / (m_i + m_{i+1})`` and ``H_{i+1} = w^2 - H_i``.
 
 An impact of Vehicle 1 with an immovable obstacle ahead has the harm ``v_1^2``, where ``v_1`` is the speed of Vehicle 1.
-Vehicle 1 bears all harm of such an impact.
+Vehicle 1 bears all harm of an impact with the obstacle.
 
 *First-impact harm* counts only the first impact of each pair, as the paper does. *Total harm* counts every impact. An
 agent can exploit first-impact harm: after a light early impact, a harder impact of the same pair costs nothing.
@@ -121,8 +121,8 @@ class Ledger:
 
         The changes of speed are computed from each pair's harm, as if a single impact of the pair had caused all of its
         harm. The result is exact for a first impact in which no third vehicle takes part. If the harm comes from
-        several impacts of the pair, the result is larger than the change of speed in the hardest of them.
-        ``harm_count`` selects the harm: ``"first"`` for first-impact harm, ``"total"`` for total harm.
+        several impacts of the pair, the result is larger than the change of speed in the hardest impact. ``harm_count``
+        selects the harm: ``"first"`` for first-impact harm, ``"total"`` for total harm.
         """
         with_obstacle = np.concatenate([self.obstacle_harm(harm_count)[:, np.newaxis], self.pair_harm(harm_count)], 1)
         rebound = (1.0 + self.restitution[:, np.newaxis]) * np.sqrt(with_obstacle)
@@ -156,8 +156,8 @@ class Ledger:
 def line_sum(pair_values: Floats, obstacle_values: Floats) -> Floats:
     """Return the sum of ``obstacle_values`` [n] and all pairs of ``pair_values`` [n, P] in each world, [n].
 
-    The order of summation is fixed: first the obstacle, then the pairs from front to rear. So the sum of a world does
-    not depend on the other worlds, to the last bit.
+    The order of summation is fixed: first the obstacle, then the pairs from front to rear. The fixed order makes the
+    sum of a world independent of the other worlds, to the last bit.
     """
     n, pairs = pair_values.shape
     total = np.zeros(n)
@@ -197,8 +197,8 @@ def split(pair_harm: Floats, mass_t: Floats) -> Floats:
 def front_share(harm: float, front_mass: float, rear_mass: float) -> float:
     """Return the part of a pair's ``harm`` that the front vehicle bears.
 
-    This part is ``harm * rear_mass / (front_mass + rear_mass)``. If the rear vehicle bears the larger part, its
-    part is computed by the same kind of formula and subtracted from ``harm``. This subtraction is exact, so the parts
+    The front vehicle bears ``harm * rear_mass / (front_mass + rear_mass)``. If the rear vehicle bears the larger part,
+    the function computes the rear vehicle's part and subtracts it from ``harm``. The subtraction is exact, so the parts
     of the two vehicles add up to ``harm`` without rounding error. The two masses must have the same unit. The result
     has the unit of ``harm``.
     """

@@ -66,8 +66,8 @@ class NamedMeasure:
 
         Args:
             given: the data from which the measure is computed: a step, or the impacts of an episode.
-            counts: whether to use the value in each world, a mask [n]; the result is 0 where ``counts`` is False. None:
-                use the value in all worlds.
+            counts: whether to use the value in each world, a mask [n]; the result is 0 where ``counts`` is False. If
+                ``counts`` is None, the value is used in all worlds.
             steps: number of steps that each episode has taken, [n], for error messages.
 
         """
@@ -121,7 +121,7 @@ class NamedMeasure:
         return whole
 
     def change(self, before: EpisodeImpacts, after: EpisodeImpacts, steps: Ints) -> Floats:
-        """Return how much the value of this measure has changed during a step, [n] or [n, N]; ``by`` is ``"impacts"``.
+        """Return how much a measure with ``by="impacts"`` has changed during a step, [n] or [n, N].
 
         ``before``: impacts of the episodes up to the beginning of the step. ``after``: impacts of the same episodes up
         to the end of the step. ``steps``: number of steps that each episode has taken, [n], for error messages.

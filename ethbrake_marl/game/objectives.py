@@ -201,14 +201,15 @@ def added_harm(before: Ledger, after: Ledger, harm_count: HarmCount, objectives:
 def aim_of(objective: Objective, line: Weighed, vehicle: int) -> tuple[Floats, bool]:
     """Return the weight of each vehicle's harm in an objective, [n, N], and how the weighted harms are combined.
 
-    The second result is False if the objective is the sum of the weighted harms, and True if it is the largest of them.
+    The second result is False if the objective is the sum of the weighted harms, and True if it is the largest weighted
+    harm.
 
     Args:
         objective: the objective.
         line: masses and weights of the vehicles in n worlds: a ``Vehicles`` or a ``Ledger``.
         vehicle: index of the vehicle that has this objective (0 = front).
 
-    Raises ``InvalidInput`` for an objective that is neither such a sum nor such a maximum, for example ``injury``.
+    Raises ``InvalidInput`` for an objective such as ``injury``, which is neither a sum nor a maximum of weighted harms.
 
     """
     weights = OBJECTIVES[objective.kind].weights
@@ -223,7 +224,7 @@ def aim_of(objective: Objective, line: Weighed, vehicle: int) -> tuple[Floats, b
 
 
 def standard_objectives() -> tuple[str, ...]:
-    """Return the names of the objectives that every scenario can use, including registered ones that are loaded."""
+    """Return the names of the objectives that every scenario can use, including loaded registered objectives."""
     return (*STANDARD, *(name for name, kind in OBJECTIVES.loaded.items() if kind.function is not None))
 
 
@@ -287,7 +288,7 @@ def scored(ledger: Ledger, harm_count: HarmCount, declared: Sequence[Declared] |
         ledger: harm in n worlds since the start of the episode.
         harm_count: ``"first"``: use first-impact harm; ``"total"``: use total harm.
         declared: list of objectives. Each item is the text of one objective for all vehicles, or a tuple with one text
-            per vehicle. None: the objectives that ``standard_objectives`` returns.
+            per vehicle. If ``declared`` is None, the objectives are those that ``standard_objectives`` returns.
 
     Raises ``InvalidInput`` if ``declared`` is a single text instead of a list.
 

@@ -107,7 +107,7 @@ class ObservationSpec:
 
     @property
     def whole(self) -> tuple[Feature, ...]:
-        """All features of the built-in groups from which the features of the observation are selected, in order."""
+        """All features of the built-in groups that the observation uses, in order; it observes some of these."""
         groups = [("own", GROUPS.own), *((prefix, GROUPS.neighbour) for prefix, _ in self.sides)]
         groups += [("role", GROUPS.role)] if self.role else []
         groups += [("obstacle", GROUPS.obstacle)] if self.obstacle else []
@@ -172,7 +172,7 @@ def choose_observation(listed: Observation, time_step_s: float | None = None) ->
 
 
 def _reach(names: Sequence[str]) -> tuple[int, int, bool, bool, bool]:
-    """Return the fields front, rear, role, obstacle and contact that fit an observation of the features ``names``."""
+    """Return the fields front, rear, role, obstacle and contact of the observation whose features are ``names``."""
     sides = [side for name in names if (side := side_of(name)) is not None]
     front, rear = (max((k for at, k in sides if at == wanted), default=0) for wanted in ("front", "rear"))
     groups = {name.partition(".")[0] for name in names}
@@ -432,7 +432,7 @@ def _observe_rows(
 def _hide_untold(
     state: Floats, params: Floats, observers: Ints, offsets: Ints, role: bool, with_obstacle: bool, out: Observations
 ) -> None:
-    """Set the features in ``out`` to 0 for which the observer lacks data that messages do not contain.
+    """Set to 0 in ``out`` each feature for which the observer lacks data, because messages do not contain these data.
 
     If the observer knows no data of a neighbour, all features of this neighbour become 0. An observer knows the
     obstacle only if it knows the place of Vehicle 1.
@@ -465,8 +465,8 @@ def _fitting_deceleration(speed: float, latency_left: float, room: float) -> flo
     """Return the deceleration (m/s2) with which a vehicle stops after the distance ``room``: ``v^2 / (2 b)``.
 
     Here ``b = room - v tau`` is the distance that is left when the vehicle begins to brake. If b is below 1 mm, 1 mm is
-    used instead. In this case the result is at least 20 m/s2, the largest value that is observed, unless the speed is
-    below 0.2 m/s. For a vehicle at rest the result is 0.
+    used instead. If b is below 1 mm, the result is at least 20 m/s2, the largest value that a vehicle can observe,
+    unless the speed is below 0.2 m/s. For a vehicle at rest the result is 0.
 
     Args:
         speed: present speed v of the vehicle, m/s.

@@ -32,7 +32,8 @@ def observations_of(scenario: Game, given: Observation | None = None) -> tuple[O
     Args:
         scenario: the scenario, which may declare observations.
         given: observations that replace the observations of the scenario: one observation for all vehicles, or a
-            mapping for some vehicles, such as ``{"vehicle_2": ["own", "front_1"]}``. None: nothing is replaced.
+            mapping for some vehicles, such as ``{"vehicle_2": ["own", "front_1"]}``. If ``given`` is None, no
+            observation is replaced.
 
     """
     names, step_s, said = scenario.vehicle_names, scenario.time_step_s, scenario.observation

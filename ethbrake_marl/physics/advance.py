@@ -36,7 +36,7 @@ def advance_worlds(
     command: Floats, until: Floats, braking: Floats, driving: Floats, latency: Floats, mass: Floats, limit: Floats,
     restitution: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats, failed: Ints, at: int, rows: Floats,
 ) -> tuple[int, bool]:  # fmt: skip
-    """Advance every world to its time ``until``, in place; return the number of impacts, and False for bad input.
+    """Advance every world to its time ``until``, in place; return the number of impacts, and whether input is valid.
 
     A world in which a check of the physics fails keeps its state; the other worlds are advanced. The second result is
     True if all entries of ``until`` and ``command`` are valid, otherwise False. Arguments that are not listed are

@@ -1,6 +1,6 @@
 """Forecast of harm under constant commands, for many candidate commands of one vehicle.
 
-The forecast uses the physics of ``advance``. It is fast because it returns only the harm, not the motion.
+The forecast uses the physics of ``advance``. The forecast is fast because it returns only the harm, not the motion.
 """
 
 from __future__ import annotations

@@ -11,11 +11,11 @@ Vehicles 2 and 3, and f1 the impact of Vehicles 1 and 2. For Vehicle 2, f is f1 
 Vehicle 3, then the impact with Vehicle 1, with the speed that the first impact has changed. Each impact changes the
 speeds of both its vehicles.
 
-The paper leaves some points open. This map resolves them as follows:
+The paper leaves some points open. This map resolves these points as follows:
 
 * f1 uses the state that f3 has changed. The closing speed of the front impact, and its harm (the square of this closing
-  speed), therefore depend on f3. The paper's formula of J_harm uses the speeds before both impacts. This makes a
-  difference only if both pairs have an impact at the same sample.
+  speed), therefore depend on f3. The paper's formula of J_harm uses the speeds before both impacts. The two formulas
+  differ only if both pairs have an impact at the same sample.
 * The paper's formulas of f1 and f3 also change the speeds of overlapping vehicles that are separating, and would pull
   these vehicles together again. The paper's text below eq. (13) requires a positive relative velocity (closing speed).
   This map therefore changes speeds and counts harm only if the relative velocity is positive.
@@ -119,8 +119,9 @@ def held_motion(speed: float, command: float, limit: float, step: float) -> tupl
     """Return speed (m/s) and distance (m) after a step of constant command: ``v + h u`` and ``h v + h^2 u / 2``.
 
     The command u is first limited so that the speed does not go beyond 0 or the speed limit within the step. The
-    distance is computed as h times the mean of the speeds at the start and the end of the step. For constant u this is
-    equal to the formula above. Brakes act against the motion, so they also bring a negative speed back to 0.
+    distance is computed as h times the mean of the speeds at the start and the end of the step. For constant u this
+    distance is equal to ``h v + h^2 u / 2``. Brakes act against the motion, so they also bring a negative speed back to
+    0.
 
     Args:
         speed: speed v at the start, m/s; may be negative after an impact.
@@ -227,8 +228,8 @@ def advance_sampled(
     The first sample is at the time at which the latency of Vehicle 2 has elapsed; samples are ``step_s`` apart. A world
     ends at the first of its samples at or after ``until_s``, or at ``until_s`` itself if this is before the first
     sample. The returned state is the paper's s(n), the state before the impacts of the last sample. The next call
-    applies these impacts, so the result can be passed to this function again. ``Impacts.rows`` is None. The result of a
-    world does not depend on the other worlds.
+    applies the impacts of the last sample, so the result can be passed to this function again. ``Impacts.rows`` is
+    None. The result of a world does not depend on the other worlds.
 
     Gaps of the result may be negative. Advance worlds with negative gaps with this function and not with ``advance``.
 
