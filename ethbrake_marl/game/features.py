@@ -503,8 +503,8 @@ def register_feature(
         scale: number above 0; the observed number is ``clip(value / scale, low, high)``.
         low: smallest number that a vehicle can observe.
         high: largest number that a vehicle can observe, above ``low``.
-        of: ``own``: the feature describes the observing vehicle; ``neighbour``: it describes a neighbour. A vehicle
-            observes the value for a neighbour only if it knows this neighbour.
+        of: which vehicle the feature describes: ``own``, the observing vehicle, or ``neighbour``, a neighbour. The
+            observing vehicle observes the value for a neighbour only if it knows this neighbour.
         unknown: value for an unknown neighbour, in ``unit``; must be 0 if ``of`` is ``own``.
         reads: data in the neighbour's messages that the function needs (the names in ``v2x: tells``). If the observer
             does not know all these data, the feature has the value ``unknown``. If ``reads`` is None, the feature

@@ -68,8 +68,8 @@ def row_features(own: tuple[Feature, ...], appended: Appended | None, scenario: 
 
     Args:
         own: features of the learner's own observation.
-        appended: features to append. ``"number"``: the position of the learner among all learners, from 0; ``"state"``:
-            the full state; None: nothing.
+        appended: which features are appended to ``own``. ``"number"``: the position of the learner among all learners,
+            from 0; ``"state"``: the full state; None: no features.
         scenario: the scenario, which determines the features of the full state.
 
     """

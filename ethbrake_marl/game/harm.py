@@ -91,7 +91,7 @@ class Ledger:
         """Return the harm of each pair of vehicles since the start of the episode, [n, P] m2/s2.
 
         ``harm_count`` selects the harm: ``"first"`` for first-impact harm, ``"total"`` for total harm. Raises
-        ``InvalidInput`` for any other value.
+        ``InvalidInput`` for any other ``harm_count``.
         """
         check_harm_count(harm_count)
         return self.first_impact_harm if harm_count == "first" else self.total_harm
@@ -100,7 +100,7 @@ class Ledger:
         """Return the harm of impacts of Vehicle 1 with the obstacle ahead, [n] m2/s2.
 
         ``harm_count`` selects the harm: ``"first"`` for first-impact harm, ``"total"`` for total harm. Raises
-        ``InvalidInput`` for any other value.
+        ``InvalidInput`` for any other ``harm_count``.
         """
         check_harm_count(harm_count)
         return self.obstacle_first_harm if harm_count == "first" else self.obstacle_total_harm
@@ -148,7 +148,7 @@ class Ledger:
 
     @property
     def collided(self) -> Bools:
-        """Whether each world has had at least one impact, [n]."""
+        """For each world, whether it has had at least one impact, [n]."""
         return self.impacts > 0
 
 

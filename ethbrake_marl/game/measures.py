@@ -152,7 +152,7 @@ def register_measure(name: str, function: MeasureFunction, *, unit: str = "1", b
             docstring of the function describes the measure. If a function with ``by="impacts"`` returns truth values,
             evaluations show the share of worlds (or vehicles) with the value True.
         unit: unit of the numbers that the function returns.
-        by: ``impacts``: the measure is computed from all impacts of an episode; ``step``: it is computed from each
+        by: from which data the measure is computed: ``impacts``, all impacts of an episode, or ``step``, each single
             step.
 
     """

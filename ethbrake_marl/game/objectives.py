@@ -279,10 +279,10 @@ def register_objective(name: str, function: ObjectiveFunction) -> None:
 
 
 def scored(ledger: Ledger, harm_count: HarmCount, declared: Sequence[Declared] | None = None) -> dict[str, Floats]:
-    """Return each vehicle's amount under several objectives, computed from the same harm: ``{"own": [n, N], ...}``.
+    """Return the amounts that vehicles should minimise under several objectives: ``{"own": [n, N], ...}``.
 
-    With this function a policy can be evaluated under objectives for which it was not trained. Amounts are in m2/s2, or
-    injuries in 1,000 lines for the objective ``injury``; less is better.
+    All amounts are computed from the same harm, so a policy can be evaluated under objectives for which it was not
+    trained. Amounts are in m2/s2, or injuries in 1,000 lines for the objective ``injury``; less is better.
 
     Args:
         ledger: harm in n worlds since the start of the episode.

@@ -215,7 +215,7 @@ class Extra(NamedTuple):
     known: int  # column of the neighbour's feature ``known`` among the built-in features
 
     def known_in(self, worlds: Worlds, vehicle: int, neighbour: int) -> NDArray[np.bool_]:
-        """Return whether ``vehicle`` knows all data of ``neighbour`` that the feature reads, in each world, [n].
+        """Return, for each world [n], whether ``vehicle`` knows all data of ``neighbour`` that the feature reads.
 
         Raises ``InvalidInput`` if messages leave out some data and the feature was registered without ``reads``.
         """

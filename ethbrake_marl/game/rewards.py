@@ -105,7 +105,7 @@ class RewardParams(FileModel):
     @model_validator(mode="before")
     @classmethod
     def _own_terms(cls, value: Any) -> Any:
-        """Move the weights of registered measures into ``terms``, if they are written next to the other settings."""
+        """Move into ``terms`` the weights of registered measures that are written next to the other settings."""
         if not isinstance(value, dict):
             return value
         beside = {name: weight for name, weight in value.items() if name in own_terms()}
@@ -122,7 +122,7 @@ class RewardParams(FileModel):
     @field_validator("terms")
     @classmethod
     def _settled(cls, value: dict[str, float]) -> dict[str, float]:
-        """Load the registered measures in ``terms``, and remove measures with weight 0."""
+        """Load the registered measures in ``terms``; return ``terms`` without the measures of weight 0."""
         for name in value:
             if name not in own_terms():
                 raise unknown_name("measure", name, own_terms(), may_be_own=True)

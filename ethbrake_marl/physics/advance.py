@@ -224,7 +224,7 @@ def refuse_bad(worlds: Worlds, command: Floats, until: Floats, in_time: Bools) -
 
 
 def _impact_rows(parts: list[_Part], ahead: int) -> ImpactRows:
-    """Join the recorded impacts of all slices of a batch.
+    """Return the recorded impacts of all slices of a batch as one object.
 
     ``ahead`` is 1 if pair 0 in the recorded rows is the obstacle ahead and Vehicle 1, otherwise 0.
     """

@@ -165,7 +165,7 @@ def plan_force(table: Floats, i: int, wanted: float) -> None:
 
 @compiled
 def force_ranges(force: float, rate: float, speed: float, limit: float) -> tuple[float, float, float, float]:
-    """Return a vehicle's own acceleration for motion forward and for motion backward, and their rates of change.
+    """Return the acceleration by a vehicle's own brakes or engine, forward and backward, and the rates of change.
 
     The result is ``(forward, backward, rate of forward, rate of backward)``: two accelerations in m/s2 and their rates
     in m/s3. The accelerations ``forward`` and ``backward`` differ if the force depends on the direction of motion. For
@@ -209,7 +209,7 @@ def settle_moving(low: float, high: float, low_jerk: float, high_jerk: float) ->
 
 @compiled(apart=True, bare=True)
 def pool_moving(table: Floats, first: int, last: int) -> float:
-    """Set the accelerations and jerks of touching vehicles; return the time (s) until two of them separate.
+    """Set the accelerations and jerks of touching vehicles; return the time (s) until two of these vehicles separate.
 
     The vehicles are the columns ``first..last`` of ``table`` and have the same speed. If the acceleration of a vehicle
     is at least the acceleration of the vehicle in front, up to rounding, both vehicles move as one body with a common

@@ -162,10 +162,10 @@ def step_episode(
 ) -> int:
     """Advance one world from ``time`` to ``until`` under its commands, and add the harm of this step to the table.
 
-    Returns AT_REST, AT_HORIZON (some vehicle is not at rest at the horizon), GOES_ON (neither), or minus the status
-    code of ``FLAG`` if a check of the physics failed. After a failure the table is invalid. The last bits of the result
-    depend on the times at which steps end. To get the same bits as the engine, call the function once for each step
-    from one decision to the next.
+    Returns AT_REST (``at_rest`` is True), AT_HORIZON (``at_rest`` is False at the horizon), GOES_ON (neither of the
+    two), or minus the status code of ``FLAG`` if a check of the physics failed. After a failure the table is invalid.
+    The last bits of the result depend on the times at which steps end. To get the same bits as the engine, call the
+    function once for each step from one decision to the next.
 
     Args:
         table: the world in the layout of ``physics.rows``, with at least ``ROW.OF_EPISODE`` rows; updated.
@@ -191,8 +191,8 @@ def step_episode(
 def step_again(table: Floats, restitution: float, grid: Grid, step: int, end: int, no_rows: Floats) -> int:
     """Advance a world from decision number ``step`` to decision number ``end``; return the result of ``step_episode``.
 
-    Except for commands, the table must be as the previous step left it, or as ``restore`` filled it. For each vehicle,
-    the function computes again when the command takes effect.
+    Apart from the commands, the table must contain what the previous step or ``restore`` wrote into it. For each
+    vehicle, the function computes again when the command takes effect.
 
     Args:
         table: the world in the layout of ``physics.rows``, with at least ``ROW.OF_EPISODE`` rows; updated.

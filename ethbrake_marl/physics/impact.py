@@ -154,9 +154,9 @@ def resolve_impacts(table: Floats, restitution: float) -> bool:
 
 @compiled(bare=True)
 def record_impacts(table: Floats, time_s: float, world: int, rows: Floats, recorded: int) -> int:
-    """Add the impacts of the last ``resolve_impacts`` to the harm in ``table`` and to ``rows``; return their number.
+    """Add the harm of the impacts of the last ``resolve_impacts`` to ``table``; write these impacts to ``rows``.
 
-    The returned number is ``recorded`` plus the number of the added impacts.
+    Returns ``recorded`` plus the number of these impacts.
 
     Args:
         table: one world in the layout of ``physics.rows``, after ``resolve_impacts``.

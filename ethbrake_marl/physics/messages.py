@@ -188,7 +188,7 @@ def _known_pieces(messages: Floats, time: Floats, vehicles: int, receiver: int, 
 
 
 class Told(NamedTuple):
-    """Newest state of every vehicle that one vehicle has received by message or by sight.
+    """For one receiving vehicle: the newest state of every vehicle, received by message or by sight.
 
     Arrays are [n, N] unless stated otherwise, with column j for vehicle j. The arrays are views of the message columns.
     """
@@ -269,7 +269,7 @@ class Messages(NamedTuple):
 
     @property
     def contents(self) -> Bools:
-        """Whether messages of each vehicle contain each quantity of ``PIECES``, [n, N, CONTENTS]."""
+        """For each vehicle and each quantity of ``PIECES``, whether its messages contain it, [n, N, CONTENTS]."""
         usual = np.array([piece in USUAL_PIECES for piece in PIECES])
         n, N = len(self.columns), self.vehicles
         contents = np.broadcast_to(usual, (n, N, CONTENTS)).copy()
@@ -328,7 +328,7 @@ class Messages(NamedTuple):
         return columns
 
     def newest_told(self, vehicle: int) -> Told:
-        """Return the newest state of every vehicle that ``vehicle`` (index from 0) has received.
+        """Return, for every vehicle, the newest state that ``vehicle`` (index from 0) has received.
 
         All worlds must have message columns.
         """
@@ -507,7 +507,7 @@ def _move(
         params: parameters of the world, in the layout of ``physics.columns``; the places of the vehicles are updated.
         column: first column of each group of quantities in ``state`` and ``params``.
         wanted: commands of the vehicles, [N] m/s2.
-        end: time to advance to, s.
+        end: time to which the world is advanced, s.
         pieces: start (s) and command (m/s2) of the K intervals of a fixed sequence of commands, [N, 2 K]; see
             ``Vehicles.pieces``.
         table: working memory in the layout of ``physics.rows``, with N + 1 columns; overwritten.

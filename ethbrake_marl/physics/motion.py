@@ -119,7 +119,7 @@ def speed_event(speed: float, acceleration: float, command: float, limit: float)
 
 @compiled
 def force_range(speed: float, command: float, limit: float) -> tuple[float, float]:
-    """Return a vehicle's own acceleration for motion forward, and its own acceleration for motion backward (m/s2).
+    """Return the acceleration (m/s2) by a vehicle's own brakes or engine for motion forward, and for motion backward.
 
     The acceleration for motion forward differs from the acceleration for motion backward in two cases. The brakes of a
     vehicle at rest act against motion in either direction. A driving vehicle at its speed limit uses only as much force

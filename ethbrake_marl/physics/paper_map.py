@@ -7,9 +7,9 @@ With the sampling period h, one step of a vehicle with command u, from sample n 
 
 where f(n) is the vehicle's speed after the impacts of sample n. If at a sample the gap of a pair is at most 0 and its
 closing speed is above 0, the speeds of the pair change by the paper's eq. (13). In the paper, f3 is the impact of
-Vehicles 2 and 3, and f1 the impact of Vehicles 1 and 2. For Vehicle 2, f is f1 applied after f3: first the impact with
-Vehicle 3, then the impact with Vehicle 1, with the speed that the first impact has changed. Each impact changes the
-speeds of both its vehicles.
+Vehicles 2 and 3, and f1 the impact of Vehicles 1 and 2. For Vehicle 2, f is f1 applied after f3: first comes the impact
+with Vehicle 3, then the impact with Vehicle 1, which uses the speed that Vehicle 2 has after the first impact. Each
+impact changes the speeds of both its vehicles.
 
 The paper leaves some points open. This map resolves these points as follows:
 

@@ -35,7 +35,7 @@ def begin_piece(table: Floats, i: int, now: float) -> None:
 
 @compiled(bare=True)
 def pieces_to_come(table: Floats) -> bool:
-    """Return whether some vehicle has a piece (interval of constant command) that has not begun yet.
+    """Return whether at least one vehicle has a piece (interval of constant command) that has not begun yet.
 
     ``table``: one world in the layout of ``physics.rows``.
     """
@@ -50,7 +50,8 @@ def pieces_to_come(table: Floats) -> bool:
 def force_at(table: Floats, i: int, command: float, latency_s: float, time_s: float) -> float:
     """Return the force (m/s2) of a vehicle at the end of a segment.
 
-    The force is the acceleration by brakes or engine. Until the latency has elapsed, 0 replaces the command.
+    The force is the acceleration by brakes or engine. Until the latency has elapsed, the function uses 0 instead of
+    ``command``.
 
     Args:
         table: the world at the end of the segment, in the layout of ``physics.rows``.

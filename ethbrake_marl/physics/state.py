@@ -363,7 +363,7 @@ class Worlds:
             )
 
     def first_decision_s(self, deciders: Sequence[int]) -> Floats:
-        """Return the time of the first decision, [n] s: the least latency of ``deciders``, or ``time_s`` if later.
+        """Return the time of the first decision, [n] s: the least latency of ``deciders``, but at least ``time_s``.
 
         ``deciders`` are the indices (from 0) of the vehicles that choose their commands. If ``deciders`` is empty, the
         result is ``time_s``.
@@ -378,7 +378,7 @@ class Worlds:
 
     @property
     def obstacle_ahead(self) -> Bools:
-        """Whether each world has an obstacle ahead of Vehicle 1, [n]."""
+        """For each world, whether it has an obstacle ahead of Vehicle 1, [n]."""
         return np.isfinite(self.obstacle_gap_m)
 
     def with_obstacle(self) -> Worlds:
@@ -470,7 +470,7 @@ def _unwritable(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def _span(values: Floats) -> str:
-    """Format the smallest and the largest value; one number if they are equal, ``none`` if there are no values."""
+    """Return a text with the smallest and the largest value, one number if these are equal, ``none`` without values."""
     if not values.size:
         return "none"
     low, high = float(values.min()), float(values.max())
@@ -579,7 +579,8 @@ def make_worlds(
         harm_weight: weight of each vehicle's harm in the objective ``preference``, at least 0, broadcast to [n, N]; in
             each world the weight of one vehicle or more must be at least ``LEAST_WEIGHT``.
 
-    Raises ``InvalidInput``, with the field, its first invalid entry and the valid range, for an invalid value.
+    Raises ``InvalidInput`` for an invalid value; the error names the field, its first invalid entry and the valid
+    range.
 
     """
     speeds = np.atleast_2d(checked_numbers("speeds_mps", speeds_mps))
