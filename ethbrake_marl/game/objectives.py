@@ -346,7 +346,7 @@ def _injured(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
 
 
 def weighted_harm(borne: Floats, weights: Floats) -> Floats:
-    """Return ``N (sum_j w_j H_j) / (sum_j w_j)``, [n] m2/s2. Both sums run over the vehicles from front to rear.
+    """Return ``N (sum_j w_j H_j) / (sum_j w_j)``, [n] m2/s2. Each sum over j runs over the vehicles from front to rear.
 
     ``borne``: harm H_j that each vehicle j bears, [n, N] m2/s2. ``weights``: weight w_j of each vehicle j, [n, N].
     """

@@ -234,10 +234,10 @@ class RewardParams(FileModel):
     def potential(self, worlds: Worlds, learners: Sequence[int], horizon_s: float) -> Floats:
         """Return the potential of the shaping term, [n] m2/s2: minus the least harm by constant braking from now on.
 
-        In this calculation, each learner brakes with a constant deceleration, and all other vehicles brake fully. Nine
-        decelerations are tried, from 0 to the learner's braking capacity in equal steps. A single learner takes the
-        deceleration with the least harm. Several learners begin with full braking and choose their decelerations one
-        after the other, front to rear, in two rounds; they all get the same potential.
+        For the potential, each learner is assumed to brake with a constant deceleration, and all other vehicles fully.
+        Nine decelerations are tried, from 0 to the learner's braking capacity in equal steps. A single learner takes
+        the deceleration with the least harm. Several learners begin with full braking and choose their decelerations
+        one after the other, front to rear, in two rounds; they all get the same potential.
 
         Args:
             worlds: n worlds of N vehicles.

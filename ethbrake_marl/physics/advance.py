@@ -177,7 +177,7 @@ def _advance_part(arrays: tuple[NDArray[Any], ...], at: int, capacity: int, part
     """Advance the worlds of the slice ``part`` in place; return their impacts and whether the input is valid.
 
     Args:
-        arrays: array arguments of ``advance_worlds`` for all worlds, in its order.
+        arrays: the array arguments of ``advance_worlds`` for all worlds, in the order of its signature.
         at: 1 if some world has an obstacle ahead, otherwise 0.
         capacity: largest number of impacts to record.
         part: slice of the world indices to advance.

@@ -139,7 +139,7 @@ def onset_s(latency_s: float, time_s: float) -> float:
 
 @compiled
 def stands(speed_mps: float, command_mps2: float) -> bool:
-    """Return whether a vehicle is at rest and its command (m/s2) does not drive it, that is, is at most 0."""
+    """Return whether a vehicle is at rest and its command (m/s2) is at most 0, so that it does not drive away."""
     return speed_mps == 0.0 and command_mps2 <= 0.0
 
 

@@ -172,7 +172,7 @@ def knows_piece(messages: Floats, vehicles: int, receiver: int, sender: int, pie
 
 @compiled
 def knows_line(messages: Floats, vehicles: int, receiver: int, sender: int, time: float) -> bool:
-    """Return whether ``receiver`` knows everything about ``sender`` that it needs to predict the sender's motion."""
+    """Return whether ``receiver`` knows all data of ``sender`` that are needed to predict the sender's motion."""
     known = True
     for piece in range(INTENT):
         known = known and knows_piece(messages, vehicles, receiver, sender, piece, time)
@@ -341,8 +341,8 @@ class Messages(NamedTuple):
         """Return the age at ``time_s`` [n] of the newest state that vehicle i received from vehicle j, [n, N, N] s.
 
         The age is the time since the state was sampled. The age is infinite if vehicle i has received nothing from
-        vehicle j yet. The age is 0 in a world without periodic messages, because vehicles know the present state there.
-        Vehicle i may use what it has received from the time ``Vehicles.known_from_s`` on.
+        vehicle j yet. In a world without periodic messages the age is 0, because vehicles know the present state. From
+        the time ``Vehicles.known_from_s`` on, vehicle i may use the received state.
         """
         age, periodic = np.zeros((len(time_s), self.vehicles, self.vehicles)), self.periodic
         if periodic.any():

@@ -91,7 +91,8 @@ def drift(gap: float, closing: float, pressing: float, duration: float) -> float
 
 @compiled
 def speed_event(speed: float, acceleration: float, command: float, limit: float) -> tuple[float, float]:
-    """Return the time (s) until a vehicle next comes to rest or reaches its speed limit, and its speed then (m/s).
+    """Return the time (s) until a vehicle next comes to rest or reaches its speed limit, and its speed at this time
+    (m/s).
 
     When the vehicle comes to rest, its brakes hold it there. The speed limit matters only if the command drives the
     vehicle. If the vehicle neither comes to rest nor reaches the limit, the result is ``(inf, 0)``.

@@ -80,10 +80,11 @@ def exchange_at_sample(
     k: int, gaps: Floats, speeds: Floats, mass: Floats, restitution: float, hit: Bools, first_harm: Floats,
     total_harm: Floats, count: Ints,
 ) -> None:  # fmt: skip
-    """Apply the impacts of world ``k`` at a sample, from the rear pair to the front pair, and add their harm.
+    """Apply the impacts of world ``k`` at a sample, from the rear pair to the front pair; add the harm of these
+    impacts.
 
-    As in ``advance``, the harm of an impact is the squared closing speed just before it. Contact with a closing speed
-    of at most ``TOUCH_SPEED_MPS`` is a touch, which does no harm.
+    As in ``advance``, the harm of an impact is the squared closing speed just before the impact. Contact with a closing
+    speed of at most ``TOUCH_SPEED_MPS`` is a touch, which does no harm.
 
     Args:
         k: index of the world in all arrays.
@@ -226,8 +227,8 @@ def advance_sampled(
     """Advance ``worlds`` by the paper's fixed-step map under constant commands; return new worlds and impacts.
 
     The first sample is at the time at which the latency of Vehicle 2 has elapsed; samples are ``step_s`` apart. A world
-    ends at the first of its samples at or after ``until_s``, or at ``until_s`` itself if this is before the first
-    sample. The returned state is the paper's s(n), the state before the impacts of the last sample. The next call
+    ends at the first of its samples at or after ``until_s``, or at ``until_s`` itself if ``until_s`` is before the
+    first sample. The returned state is the paper's s(n), the state before the impacts of the last sample. The next call
     applies the impacts of the last sample, so the result can be passed to this function again. ``Impacts.rows`` is
     None. The result of a world does not depend on the other worlds.
 

@@ -43,8 +43,8 @@ _ON_ROADS = ("braking_capacity_mps2", "driving_capacity_mps2")  # limited by fri
 def as_road_allows(quantities: Mapping[str, Floats], friction: Floats) -> dict[str, Floats]:
     """Return a copy of ``quantities`` with braking and driving capacities limited to ``friction * GRAVITY_MPS2``.
 
-    ``quantities`` maps field names such as ``braking_capacity_mps2`` to arrays; ``friction`` broadcasts to their shape.
-    Entries other than capacities are unchanged.
+    ``quantities`` maps field names such as ``braking_capacity_mps2`` to arrays; ``friction`` is broadcast to the shape
+    of these arrays. Entries other than capacities are unchanged.
     """
     most = friction * GRAVITY_MPS2
     return {key: np.minimum(value, most) if key in _ON_ROADS else value for key, value in quantities.items()}
