@@ -72,7 +72,7 @@ class Game(Protocol):
 
     @property
     def builds_up(self) -> bool:
-        """Whether the brakes of some vehicle may build up gradually instead of acting at once."""
+        """Whether the brakes of at least one vehicle may build up gradually instead of acting at once."""
 
     def sample(self, n: int, seed: int, *, first: int = 0, channel: Literal["list", "training"] = "list") -> Drawn:
         """Draw the worlds with the numbers ``first`` to ``first + n - 1`` from the endless list of worlds of ``seed``.

@@ -39,7 +39,7 @@ MeasureFunction = Callable[[Any], Any]  # maps a ``StepOutcome`` or ``EpisodeImp
 
 @dataclass(frozen=True, slots=True)
 class NamedMeasure:
-    """A measure, with its name, unit and function. Evaluations can show it, and rewards can use it as a term."""
+    """A measure, with its name, unit and function. Evaluations can show a measure, and rewards can use it as a term."""
 
     name: str  # name of the measure, and key of its weight in a reward
     meaning: str  # what it measures, in words
@@ -90,7 +90,7 @@ class NamedMeasure:
         return value
 
     def _numbers(self, given: StepOutcome | EpisodeImpacts, what: str) -> Any:
-        """Call the measure's function; return the result, [n] or [n, N], or raise ``InvalidInput`` if it is unusable.
+        """Call the measure's function; return the result, [n] or [n, N]; raise ``InvalidInput`` for an unusable result.
 
         The result is converted to float64, except truth values of a measure with ``by="impacts"``. If the function
         returns one number per learner, vehicles that do not learn get the number 0. Error messages begin with ``what``.

@@ -147,9 +147,9 @@ def choose_observation(listed: Observation, time_step_s: float | None = None) ->
     """Return the specification of an observation with the listed features.
 
     ``listed`` is a list of groups and features, such as ``["own", "front_1", "rear_1.gap"]``, a mapping with the fields
-    of an ``ObservationSpec``, or an ``ObservationSpec``. ``time_step_s`` is the time between two decisions (s); give it
-    if you use contact features outside an environment. Raises ``UnknownName`` with a suggestion for an unknown name,
-    and ``InvalidInput`` for an invalid list.
+    of an ``ObservationSpec``, or an ``ObservationSpec``. ``time_step_s`` is the time between two decisions (s), which
+    you must give for contact features outside an environment. Raises ``UnknownName`` with a suggestion for an unknown
+    name, and ``InvalidInput`` for an invalid list.
     """
     if isinstance(listed, ObservationSpec):
         spec = listed

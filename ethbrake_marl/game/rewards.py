@@ -237,7 +237,7 @@ class RewardParams(FileModel):
         For the potential, each learner is assumed to brake with a constant deceleration, and all other vehicles fully.
         Nine decelerations are tried, from 0 to the learner's braking capacity in equal steps. A single learner takes
         the deceleration with the least harm. Several learners begin with full braking and choose their decelerations
-        one after the other, front to rear, in two rounds; they all get the same potential.
+        one after the other, front to rear, in two rounds; all learners get the same potential.
 
         Args:
             worlds: n worlds of N vehicles.

@@ -8,9 +8,9 @@ force falls at the rate BRAKE_RATE or rises at the rate RELEASE_RATE until it eq
 latency has elapsed, the force approaches 0 instead of the command. The force also changes while the vehicle is at rest.
 
 A *body* is a vehicle, or several touching vehicles that move together. Between events each body has a constant jerk.
-Two kinds of events occur here but not in ``physics.constant_motion``. In an event of the first kind, a force reaches
-the command or passes 0. In an event of the second kind, touching vehicles separate, or a body that its brakes held at
-rest starts to move.
+Two kinds of events occur in this module but not in ``physics.constant_motion``. In an event of the first kind, a force
+reaches the command or passes 0. In an event of the second kind, touching vehicles separate, or a body that its brakes
+held at rest starts to move.
 """
 
 from __future__ import annotations
@@ -198,7 +198,7 @@ def settle_moving(low: float, high: float, low_jerk: float, high_jerk: float) ->
 
     The body's own forces allow every acceleration in the range ``[low, high]`` (m/s2). The lower end of the range
     changes at the rate ``low_jerk``, the upper end at the rate ``high_jerk`` (m/s3). The body's acceleration is the
-    value in this range that is nearest to 0, as in ``motion.settle``.
+    value in ``[low, high]`` that is nearest to 0, as in ``motion.settle``.
     """
     if low > 0.0 or (low == 0.0 and low_jerk > 0.0):
         return low, low_jerk

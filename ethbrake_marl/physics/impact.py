@@ -162,8 +162,8 @@ def record_impacts(table: Floats, time_s: float, world: int, rows: Floats, recor
         table: one world in the layout of ``physics.rows``, after ``resolve_impacts``.
         time_s: time of the impacts, s.
         world: number of this world, written into ``rows``.
-        rows: array to which the impacts are written, [capacity, LISTED.WIDTH]; if it is full, further impacts are only
-            counted.
+        rows: array to which the impacts are written, [capacity, LISTED.WIDTH]; if the array is full, further impacts
+            are only counted.
         recorded: number of impacts so far, written or only counted.
 
     """

@@ -232,7 +232,7 @@ def _described(kind: Any) -> str:
 
 
 def load_kernel(name: str) -> bytes | None:
-    """Return the content of the cache file ``name`` (as ``keep_kernel`` wrote it); None if it cannot be used.
+    """Return the content of the cache file ``name`` (as ``keep_kernel`` wrote it); None if the file cannot be used.
 
     A file cannot be used if it is missing or damaged, or if its owner is neither this user nor root. The owner is
     checked because the cached code is executed.

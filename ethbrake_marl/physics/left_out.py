@@ -37,9 +37,9 @@ def measured_without_failed(measure: Callable[[Ints], Result], n: int) -> tuple[
 def leaving_out_failed(work: Callable[[Ints], Result], rows: Ints) -> tuple[Result | None, Ints, dict[int, str]]:
     """Call ``work`` for the worlds that do not fail; return the result, these worlds, and {failed world: reason}.
 
-    Worlds are indices. ``work`` is repeated without the failed worlds until no world fails. The results of the other
-    worlds stay the same, because the result of a world does not depend on the other worlds. If every world fails, the
-    returned result is None.
+    Worlds are returned as indices. ``work`` is repeated without the failed worlds until no world fails. The results of
+    the other worlds stay the same, because the result of a world does not depend on the other worlds. If every world
+    fails, the returned result is None.
 
     Args:
         work: function of an array of world indices. If the physics fails, the function must raise a ``PhysicsError``

@@ -158,7 +158,7 @@ def knows_piece(messages: Floats, vehicles: int, receiver: int, sender: int, pie
     The function assumes that by ``time`` the first message has arrived, or the sender is in sight. ``messages`` are the
     message columns of one world; the array may be empty. The receiver knows the intent (the command chosen at the last
     decision) only by a message. The receiver knows every other quantity if the sender's messages contain it. Once the
-    sender is in sight, the receiver also knows its place, speed and acceleration, because it measures them.
+    sender is in sight, the receiver also knows the sender's place, speed and acceleration, because it measures them.
     """
     if not has_contents(messages, vehicles):
         return piece != INTENT
@@ -269,7 +269,7 @@ class Messages(NamedTuple):
 
     @property
     def contents(self) -> Bools:
-        """For each vehicle and each quantity of ``PIECES``, whether its messages contain it, [n, N, CONTENTS]."""
+        """For each vehicle, whether its messages contain each quantity of ``PIECES``, [n, N, CONTENTS]."""
         usual = np.array([piece in USUAL_PIECES for piece in PIECES])
         n, N = len(self.columns), self.vehicles
         contents = np.broadcast_to(usual, (n, N, CONTENTS)).copy()
@@ -365,8 +365,8 @@ def refuse_untold(
     """Raise ``InvalidInput`` if messages lack a quantity that the agent ``who`` needs to control ``vehicles``.
 
     The agent needs messages of every vehicle in ``senders`` (None: of all vehicles), also of vehicles that it controls
-    itself. A single controlled vehicle needs no message of its own. ``needs``: the quantities that these messages must
-    contain. ``who``: name of the agent in the error message.
+    itself. An agent that controls a single vehicle needs no message of this vehicle. ``needs``: the quantities that
+    these messages must contain. ``who``: name of the agent in the error message.
     """
     messages = Messages.of(worlds)
     for sender in (range(worlds.N) if senders is None else senders) if messages.says_contents else ():

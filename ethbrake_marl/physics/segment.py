@@ -35,8 +35,8 @@ def advance_table(
         duration: length of the segment, s.
         start_s: absolute time at the start of the segment, s; used to write the times of impacts into ``rows``.
         world: index of the world, written into ``rows``.
-        rows: array to which the impacts are written, [capacity, LISTED.WIDTH]; if it is full, further impacts are only
-            counted.
+        rows: array to which the impacts are written, [capacity, LISTED.WIDTH]; if the array is full, further impacts
+            are only counted.
         recorded: number of impacts that were recorded before this segment.
 
     """
@@ -90,9 +90,9 @@ def move_apart(table: Floats, duration: float, building: bool) -> bool:
     """Move a world to the end of the segment and return True, or return False if two vehicles may touch.
 
     If the result is False, the world has not moved. If both vehicles of a pair have constant accelerations, the time of
-    their contact is computed exactly. If the acceleration of one of them changes, the function uses an upper bound of
-    the decrease of the gap. Without contact, the speed of a vehicle only rises or only falls within a segment of length
-    T. A gap therefore shrinks by at most ``(max rear speed - min front speed) T``.
+    their contact is computed exactly. If the acceleration of one of the vehicles changes, the function uses an upper
+    bound of the decrease of the gap. Without contact, the speed of a vehicle only rises or only falls within a segment
+    of length T. A gap therefore shrinks by at most ``(max rear speed - min front speed) T``.
 
     Args:
         table: the world in the layout of ``physics.rows``.
@@ -202,7 +202,7 @@ def to_next_event(table: Floats, now: float, duration: float, building: bool) ->
 def begin_commands(table: Floats, now: float, passed: float, building: bool) -> None:
     """Put into effect the commands that begin between ``now`` and ``now + passed``.
 
-    The function does the same for the next command in a vehicle's fixed sequence of commands.
+    If a vehicle follows a fixed sequence of commands, this includes the next command of the sequence.
 
     Args:
         table: the world in the layout of ``physics.rows``.

@@ -247,7 +247,8 @@ class Worlds:
 
     @staticmethod
     def concatenate(parts: Sequence[Worlds]) -> Worlds:
-        """Join the batches ``parts`` into one batch, in this order; all must have the same number of vehicles."""
+        """Join the batches ``parts`` into one batch, in this order; all batches must have the same number of
+        vehicles."""
         parts = _alike(parts)
         return parts[0]._each(lambda *columns: np.concatenate(columns), *parts[1:])
 
@@ -347,8 +348,8 @@ class Worlds:
     def refuse_build_up(self, who: str) -> None:
         """Raise ``InvalidInput`` if any vehicle has a finite brake or release rate, or follows a braking profile.
 
-        Functions whose results are not exact in such worlds call this check. ``who``: name of the calling function in
-        the error message.
+        A function calls this check if its results are not exact for finite rates and braking profiles. ``who``: name of
+        the calling function in the error message.
         """
         slow = self.vehicles.build_up
         if self.vehicles.in_pieces.any():
