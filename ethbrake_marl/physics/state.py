@@ -247,8 +247,7 @@ class Worlds:
 
     @staticmethod
     def concatenate(parts: Sequence[Worlds]) -> Worlds:
-        """Join the batches ``parts`` into one batch, in this order; all batches must have the same number of
-        vehicles."""
+        """Join the batches ``parts`` into one batch, in this order; all must have the same number N of vehicles."""
         parts = _alike(parts)
         return parts[0]._each(lambda *columns: np.concatenate(columns), *parts[1:])
 
