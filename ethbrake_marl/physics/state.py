@@ -347,7 +347,7 @@ class Worlds:
     def refuse_build_up(self, who: str) -> None:
         """Raise ``InvalidInput`` if any vehicle has a finite brake or release rate, or follows a braking profile.
 
-        A function calls this check if its results are not exact for finite rates and braking profiles. ``who``: name of
+        A function calls this check if its results are not exact for finite rates or braking profiles. ``who``: name of
         the calling function in the error message.
         """
         slow = self.vehicles.build_up
