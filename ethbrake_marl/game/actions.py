@@ -1,6 +1,7 @@
 """Conversion between actions in [-1, 1] and commanded accelerations.
 
-Action -1 means full braking, 0 coasting and +1 full driving. Between these values the command is linear in the action.
+Action -1 means full braking, 0 coasting and +1 full driving. The command is linear in the action from -1 to 0 and from
+0 to 1.
 """
 
 from __future__ import annotations

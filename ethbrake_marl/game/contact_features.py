@@ -101,7 +101,7 @@ def observe_contacts(
 
 @compiled
 def _place_known(table: Floats, state: Floats, params: Floats, k: int, i: int, at: int) -> tuple[int, int]:
-    """Write one world into ``table`` as vehicle ``i`` knows it; return the first and last column of a known vehicle.
+    """Write one world into ``table`` as vehicle ``i`` knows it; return the first and last column of the known vehicles.
 
     A vehicle is placed far away if vehicle ``i`` does not know it, or does not know all of its data that a forecast
     needs. A known obstacle is treated as a known vehicle.

@@ -53,7 +53,7 @@ class Game(Protocol):
 
     @property
     def objective(self) -> Declared:
-        """Objective of the vehicles: one name for all vehicles, or one name per vehicle. Rewards may replace it."""
+        """Objective of the vehicles: one name for all, or one name per vehicle. A reward may set another objective."""
 
     @property
     def observation(self) -> Any:
@@ -67,12 +67,12 @@ class Game(Protocol):
     def by_link(self) -> bool:
         """Whether each link between two vehicles has its own delays and losses.
 
-        If no link has them, a vehicle knows everything after its latency.
+        If no link has delays or losses, a vehicle knows everything after its latency.
         """
 
     @property
     def builds_up(self) -> bool:
-        """Whether the brakes of some vehicle may build up gradually instead of acting at once."""
+        """Whether the brakes of at least one vehicle may build up gradually instead of acting at once."""
 
     def sample(self, n: int, seed: int, *, first: int = 0, channel: Literal["list", "training"] = "list") -> Drawn:
         """Draw the worlds with the numbers ``first`` to ``first + n - 1`` from the endless list of worlds of ``seed``.

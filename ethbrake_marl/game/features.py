@@ -206,7 +206,8 @@ class RegisteredFeature:
 def age(worlds: Worlds, vehicle: int, neighbour: int) -> Floats:
     """Return the age of the newest state that ``vehicle`` has received from ``neighbour``, [n] s.
 
-    The age is 0 if ``vehicle`` knows the present state of ``neighbour``. Both arguments are indices (0 = front).
+    The age is 0 if ``vehicle`` knows the present state of ``neighbour``. ``vehicle`` and ``neighbour`` are indices (0 =
+    front).
     """
     ages = Messages.of(worlds).age_s(worlds.time_s)[:, vehicle, neighbour]
     return np.where(np.isfinite(ages), ages, 0.0)
@@ -236,7 +237,7 @@ def release_time(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> 
 
 
 def harm_weight(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> Floats:
-    """Return the weight of a vehicle's harm in the objective ``preference``, divided by all vehicles' weights, [n].
+    """Return the weight of a vehicle's harm in the objective ``preference``, divided by the sum of all weights, [n].
 
     The result is about ``neighbour`` or, if ``neighbour`` is None, about ``vehicle`` (indices, 0 = front).
     """
@@ -409,15 +410,15 @@ def feature_named(name: str) -> Feature:
 
 
 def side_of(name: str) -> tuple[str, int] | None:
-    """Return the neighbour in a full feature name: ``("front", 1)`` for ``front_1.gap``; None for ``own.speed``."""
+    """Return the neighbour that a feature's full name contains: ``front_1.gap``: ("front", 1); ``own.speed``: None."""
     match = _SIDE.fullmatch(name.partition(".")[0])
     return (match[1], int(match[2])) if match and int(match[2]) <= MOST_NEIGHBOURS else None
 
 
 def registered_in(names: Iterable[str]) -> dict[str, RegisteredFeature]:
-    """Return the features among these full names that have a function of their own, as a dictionary.
+    """Return a dictionary of those features in ``names`` (full names) that have a function of their own.
 
-    The key is the name without the neighbour: the key of ``front_1.age`` is ``age``.
+    A key of this dictionary is a name without the neighbour: the key of ``front_1.age`` is ``age``.
     """
     own = [name.partition(".")[2] or name for name in names]
     return {name: FEATURES[name] for name in own if name in FEATURES}
@@ -496,14 +497,14 @@ def register_feature(
             observation lists a feature of the vehicle itself as ``name``, a feature of a neighbour as ``front_1.name``.
         function: ``function(worlds, vehicle)``, or ``function(worlds, vehicle, neighbour)`` for a feature of a
             neighbour, where ``vehicle`` and ``neighbour`` are indices (0 = front). The function returns the value of
-            the feature in each world, [n], in ``unit``. It must work for any number of vehicles, and its result must
-            depend only on its arguments.
+            the feature in each world, [n], in ``unit``. The function must work for any number of vehicles, and its
+            result must depend only on its arguments.
         unit: unit of the value that the function returns.
         scale: number above 0; the observed number is ``clip(value / scale, low, high)``.
         low: smallest number that a vehicle can observe.
         high: largest number that a vehicle can observe, above ``low``.
-        of: ``own``: the feature describes the observing vehicle; ``neighbour``: it describes a neighbour. A vehicle
-            observes the value for a neighbour only if it knows this neighbour.
+        of: which vehicle the feature describes: ``own``, the observing vehicle, or ``neighbour``, a neighbour. The
+            observing vehicle observes the value for a neighbour only if it knows this neighbour.
         unknown: value for an unknown neighbour, in ``unit``; must be 0 if ``of`` is ``own``.
         reads: data in the neighbour's messages that the function needs (the names in ``v2x: tells``). If the observer
             does not know all these data, the feature has the value ``unknown``. If ``reads`` is None, the feature

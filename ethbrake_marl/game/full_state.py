@@ -33,7 +33,8 @@ def state_features(scenario: Game) -> tuple[Feature, ...]:
     """Return the features of the full state in order: own features of each vehicle, features of each pair, and time.
 
     The features of a pair are its gap and its hit flag (1 after an impact of the pair, otherwise 0). If the scenario
-    has an obstacle ahead, two more features follow: the gap from Vehicle 1 to the obstacle, and a hit flag for it.
+    has an obstacle ahead, two more features follow: the gap from Vehicle 1 to the obstacle, and the hit flag of the
+    obstacle.
     """
     vehicles = [replace(f, name=f"{name}.{f.name}") for name in scenario.vehicle_names for f in GROUPS.own]
     pairs = [replace(f, name=f"pair_{p}.{f.name}") for p in range(1, scenario.vehicles) for f in _PAIR_FEATURES]
@@ -68,8 +69,8 @@ def row_features(own: tuple[Feature, ...], appended: Appended | None, scenario: 
 
     Args:
         own: features of the learner's own observation.
-        appended: features to append. ``"number"``: the position of the learner among all learners, from 0; ``"state"``:
-            the full state; None: nothing.
+        appended: which features are appended to ``own``. ``"number"``: the position of the learner among all learners,
+            from 0; ``"state"``: the full state; None: no features.
         scenario: the scenario, which determines the features of the full state.
 
     """

@@ -5,7 +5,7 @@ The harm of an impact of pair (i, i + 1) with closing speed ``w`` is ``w^2`` (m2
 ``H_i = w^2 * m_{i+1} / (m_i + m_{i+1})`` and ``H_{i+1} = w^2 - H_i``.
 
 An impact of Vehicle 1 with an immovable obstacle ahead has the harm ``v_1^2``, where ``v_1`` is the speed of Vehicle 1.
-Vehicle 1 bears all harm of such an impact.
+Vehicle 1 bears all harm of an impact with the obstacle.
 
 *First-impact harm* counts only the first impact of each pair, as the paper does. *Total harm* counts every impact. An
 agent can exploit first-impact harm: after a light early impact, a harder impact of the same pair costs nothing.
@@ -91,7 +91,7 @@ class Ledger:
         """Return the harm of each pair of vehicles since the start of the episode, [n, P] m2/s2.
 
         ``harm_count`` selects the harm: ``"first"`` for first-impact harm, ``"total"`` for total harm. Raises
-        ``InvalidInput`` for any other value.
+        ``InvalidInput`` for any other ``harm_count``.
         """
         check_harm_count(harm_count)
         return self.first_impact_harm if harm_count == "first" else self.total_harm
@@ -100,7 +100,7 @@ class Ledger:
         """Return the harm of impacts of Vehicle 1 with the obstacle ahead, [n] m2/s2.
 
         ``harm_count`` selects the harm: ``"first"`` for first-impact harm, ``"total"`` for total harm. Raises
-        ``InvalidInput`` for any other value.
+        ``InvalidInput`` for any other ``harm_count``.
         """
         check_harm_count(harm_count)
         return self.obstacle_first_harm if harm_count == "first" else self.obstacle_total_harm
@@ -121,8 +121,8 @@ class Ledger:
 
         The changes of speed are computed from each pair's harm, as if a single impact of the pair had caused all of its
         harm. The result is exact for a first impact in which no third vehicle takes part. If the harm comes from
-        several impacts of the pair, the result is larger than the change of speed in the hardest of them.
-        ``harm_count`` selects the harm: ``"first"`` for first-impact harm, ``"total"`` for total harm.
+        several impacts of the pair, the result is larger than the change of speed in the hardest impact. ``harm_count``
+        selects the harm: ``"first"`` for first-impact harm, ``"total"`` for total harm.
         """
         with_obstacle = np.concatenate([self.obstacle_harm(harm_count)[:, np.newaxis], self.pair_harm(harm_count)], 1)
         rebound = (1.0 + self.restitution[:, np.newaxis]) * np.sqrt(with_obstacle)
@@ -148,7 +148,7 @@ class Ledger:
 
     @property
     def collided(self) -> Bools:
-        """Whether each world has had at least one impact, [n]."""
+        """For each world, whether it has had at least one impact, [n]."""
         return self.impacts > 0
 
 
@@ -156,8 +156,8 @@ class Ledger:
 def line_sum(pair_values: Floats, obstacle_values: Floats) -> Floats:
     """Return the sum of ``obstacle_values`` [n] and all pairs of ``pair_values`` [n, P] in each world, [n].
 
-    The order of summation is fixed: first the obstacle, then the pairs from front to rear. So the sum of a world does
-    not depend on the other worlds, to the last bit.
+    The order of summation is fixed: first the obstacle, then the pairs from front to rear. The fixed order makes the
+    sum of a world independent of the other worlds, to the last bit.
     """
     n, pairs = pair_values.shape
     total = np.zeros(n)
@@ -197,8 +197,8 @@ def split(pair_harm: Floats, mass_t: Floats) -> Floats:
 def front_share(harm: float, front_mass: float, rear_mass: float) -> float:
     """Return the part of a pair's ``harm`` that the front vehicle bears.
 
-    This part is ``harm * rear_mass / (front_mass + rear_mass)``. If the rear vehicle bears the larger part, its
-    part is computed by the same kind of formula and subtracted from ``harm``. This subtraction is exact, so the parts
+    The front vehicle bears ``harm * rear_mass / (front_mass + rear_mass)``. If the rear vehicle bears the larger part,
+    the function computes the rear vehicle's part and subtracts it from ``harm``. The subtraction is exact, so the parts
     of the two vehicles add up to ``harm`` without rounding error. The two masses must have the same unit. The result
     has the unit of ``harm``.
     """

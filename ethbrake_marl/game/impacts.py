@@ -30,9 +30,9 @@ class EpisodeImpacts:
 
     @classmethod
     def of(cls, worlds: Worlds, parts: Sequence[ImpactRows] = ()) -> EpisodeImpacts:
-        """Collect the impacts of the episodes that began in ``worlds``.
+        """Return all impacts of the episodes that began in the states ``worlds``.
 
-        ``parts``: the impacts of these episodes, listed separately for consecutive intervals of time.
+        ``parts``: the impacts of these episodes, one item for each of several consecutive time intervals.
         """
         whole = [np.concatenate([getattr(rows, name) for rows in (_NO_ROWS, *parts)]) for name in _OF_ROWS]
         order = np.argsort(whole[0], kind="stable")
@@ -54,12 +54,12 @@ class EpisodeImpacts:
         return change
 
     def and_then(self, way: Iterable[tuple[Worlds, Floats, Floats]], some: Bools) -> EpisodeImpacts:
-        """Return these impacts, extended by the impacts in the next segments (time intervals) of the episodes.
+        """Return these impacts and the impacts in the next segments (time intervals) of the same episodes.
 
         Args:
-            way: consecutive segments from ``Engine.segments``. Each segment is a tuple: the worlds at its start, the
-                constant commands [n, N] m/s2, and its end [n] s.
-            some: mask [n] of the worlds whose new impacts are added.
+            way: consecutive segments from ``Engine.segments``. Each segment is a tuple: the worlds at the start of the
+                segment, the constant commands [n, N] m/s2, and the times [n] s at which the segment ends.
+            some: mask [n], True for each world whose new impacts are added.
 
         """
         parts, blocks = list(way), [self.rows]
@@ -101,10 +101,10 @@ class EpisodeImpacts:
         return {f"impacts.{name}": np.array(array, order="C") for name, array in arrays.items()}
 
     def read(self, arrays: Mapping[str, NDArray[Any]]) -> EpisodeImpacts:
-        """Return the impacts that ``EpisodeImpacts.arrays`` has converted to ``arrays``.
+        """Return an ``EpisodeImpacts`` with the impacts in ``arrays``, a dictionary from ``EpisodeImpacts.arrays``.
 
-        The number of episodes must be the same as in this object. Raises ``InvalidInput`` if an array is missing or has
-        a wrong shape.
+        The dictionary must have the same number of episodes as this object. Raises ``InvalidInput`` if an
+        array is missing or has a wrong shape.
         """
         for name, own in self.arrays().items():
             have = arrays.get(name)
@@ -123,7 +123,7 @@ def _some(rows: ImpactRows, index: NDArray[Any]) -> ImpactRows:
 
 
 def impacts_within(before: Worlds, command_mps2: Floats, until_s: Floats, rows: Ints) -> ImpactRows:
-    """Return every impact in some worlds during a segment (a time interval with constant commands).
+    """Return every impact in the worlds ``rows`` during a segment (a time interval with constant commands).
 
     In the result, ``ImpactRows.world`` is the index of the impact's world in ``before``.
 

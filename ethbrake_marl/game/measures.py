@@ -39,7 +39,7 @@ MeasureFunction = Callable[[Any], Any]  # maps a ``StepOutcome`` or ``EpisodeImp
 
 @dataclass(frozen=True, slots=True)
 class NamedMeasure:
-    """A measure, with its name, unit and function. Evaluations can show it, and rewards can use it as a term."""
+    """A measure, with its name, unit and function. Evaluations can show a measure, and rewards can use it as a term."""
 
     name: str  # name of the measure, and key of its weight in a reward
     meaning: str  # what it measures, in words
@@ -66,8 +66,8 @@ class NamedMeasure:
 
         Args:
             given: the data from which the measure is computed: a step, or the impacts of an episode.
-            counts: whether to use the value in each world, a mask [n]; the result is 0 where ``counts`` is False. None:
-                use the value in all worlds.
+            counts: whether to use the value in each world, a mask [n]; the result is 0 where ``counts`` is False. If
+                ``counts`` is None, the value is used in all worlds.
             steps: number of steps that each episode has taken, [n], for error messages.
 
         """
@@ -90,7 +90,7 @@ class NamedMeasure:
         return value
 
     def _numbers(self, given: StepOutcome | EpisodeImpacts, what: str) -> Any:
-        """Call the measure's function; return the result, [n] or [n, N], or raise ``InvalidInput`` if it is unusable.
+        """Call the measure's function; return the result, [n] or [n, N]; raise ``InvalidInput`` for an unusable result.
 
         The result is converted to float64, except truth values of a measure with ``by="impacts"``. If the function
         returns one number per learner, vehicles that do not learn get the number 0. Error messages begin with ``what``.
@@ -121,7 +121,7 @@ class NamedMeasure:
         return whole
 
     def change(self, before: EpisodeImpacts, after: EpisodeImpacts, steps: Ints) -> Floats:
-        """Return how much the value of this measure has changed during a step, [n] or [n, N]; ``by`` is ``"impacts"``.
+        """Return how much a measure with ``by="impacts"`` has changed during a step, [n] or [n, N].
 
         ``before``: impacts of the episodes up to the beginning of the step. ``after``: impacts of the same episodes up
         to the end of the step. ``steps``: number of steps that each episode has taken, [n], for error messages.
@@ -152,7 +152,7 @@ def register_measure(name: str, function: MeasureFunction, *, unit: str = "1", b
             docstring of the function describes the measure. If a function with ``by="impacts"`` returns truth values,
             evaluations show the share of worlds (or vehicles) with the value True.
         unit: unit of the numbers that the function returns.
-        by: ``impacts``: the measure is computed from all impacts of an episode; ``step``: it is computed from each
+        by: from which data the measure is computed: ``impacts``, all impacts of an episode, or ``step``, each single
             step.
 
     """

@@ -201,14 +201,15 @@ def added_harm(before: Ledger, after: Ledger, harm_count: HarmCount, objectives:
 def aim_of(objective: Objective, line: Weighed, vehicle: int) -> tuple[Floats, bool]:
     """Return the weight of each vehicle's harm in an objective, [n, N], and how the weighted harms are combined.
 
-    The second result is False if the objective is the sum of the weighted harms, and True if it is the largest of them.
+    The second result is False if the objective is the sum of the weighted harms, and True if it is the largest weighted
+    harm.
 
     Args:
         objective: the objective.
         line: masses and weights of the vehicles in n worlds: a ``Vehicles`` or a ``Ledger``.
         vehicle: index of the vehicle that has this objective (0 = front).
 
-    Raises ``InvalidInput`` for an objective that is neither such a sum nor such a maximum, for example ``injury``.
+    Raises ``InvalidInput`` for an objective such as ``injury``, which is neither a sum nor a maximum of weighted harms.
 
     """
     weights = OBJECTIVES[objective.kind].weights
@@ -223,7 +224,7 @@ def aim_of(objective: Objective, line: Weighed, vehicle: int) -> tuple[Floats, b
 
 
 def standard_objectives() -> tuple[str, ...]:
-    """Return the names of the objectives that every scenario can use, including registered ones that are loaded."""
+    """Return the names of the objectives that every scenario can use, including loaded registered objectives."""
     return (*STANDARD, *(name for name, kind in OBJECTIVES.loaded.items() if kind.function is not None))
 
 
@@ -278,16 +279,16 @@ def register_objective(name: str, function: ObjectiveFunction) -> None:
 
 
 def scored(ledger: Ledger, harm_count: HarmCount, declared: Sequence[Declared] | None = None) -> dict[str, Floats]:
-    """Return each vehicle's amount under several objectives, computed from the same harm: ``{"own": [n, N], ...}``.
+    """Return the amounts that vehicles should minimise under several objectives: ``{"own": [n, N], ...}``.
 
-    With this function a policy can be evaluated under objectives for which it was not trained. Amounts are in m2/s2, or
-    injuries in 1,000 lines for the objective ``injury``; less is better.
+    All amounts are computed from the same harm, so a policy can be evaluated under objectives for which it was not
+    trained. Amounts are in m2/s2, or injuries in 1,000 lines for the objective ``injury``; less is better.
 
     Args:
         ledger: harm in n worlds since the start of the episode.
         harm_count: ``"first"``: use first-impact harm; ``"total"``: use total harm.
         declared: list of objectives. Each item is the text of one objective for all vehicles, or a tuple with one text
-            per vehicle. None: the objectives that ``standard_objectives`` returns.
+            per vehicle. If ``declared`` is None, the objectives are those that ``standard_objectives`` returns.
 
     Raises ``InvalidInput`` if ``declared`` is a single text instead of a list.
 
@@ -345,7 +346,7 @@ def _injured(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
 
 
 def weighted_harm(borne: Floats, weights: Floats) -> Floats:
-    """Return ``N (sum_j w_j H_j) / (sum_j w_j)``, [n] m2/s2. Both sums run over the vehicles from front to rear.
+    """Return ``N (sum_j w_j H_j) / (sum_j w_j)``, [n] m2/s2. Each sum over j runs over the vehicles from front to rear.
 
     ``borne``: harm H_j that each vehicle j bears, [n, N] m2/s2. ``weights``: weight w_j of each vehicle j, [n, N].
     """

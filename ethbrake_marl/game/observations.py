@@ -108,7 +108,7 @@ class ObservationSpec:
 
     @property
     def whole(self) -> tuple[Feature, ...]:
-        """All features of the built-in groups from which the features of the observation are selected, in order."""
+        """All features of the built-in groups that the observation uses, in order; it observes some of these."""
         groups = [("own", GROUPS.own), *((prefix, GROUPS.neighbour) for prefix, _ in self.sides)]
         groups += [("role", GROUPS.role)] if self.role else []
         groups += [("obstacle", GROUPS.obstacle)] if self.obstacle else []
@@ -148,9 +148,9 @@ def choose_observation(listed: Observation, time_step_s: float | None = None) ->
     """Return the specification of an observation with the listed features.
 
     ``listed`` is a list of groups and features, such as ``["own", "front_1", "rear_1.gap"]``, a mapping with the fields
-    of an ``ObservationSpec``, or an ``ObservationSpec``. ``time_step_s`` is the time between two decisions (s); give it
-    if you use contact features outside an environment. Raises ``UnknownName`` with a suggestion for an unknown name,
-    and ``InvalidInput`` for an invalid list.
+    of an ``ObservationSpec``, or an ``ObservationSpec``. ``time_step_s`` is the time between two decisions (s), which
+    you must give for contact features outside an environment. Raises ``UnknownName`` with a suggestion for an unknown
+    name, and ``InvalidInput`` for an invalid list.
     """
     if isinstance(listed, ObservationSpec):
         spec = listed
@@ -173,7 +173,7 @@ def choose_observation(listed: Observation, time_step_s: float | None = None) ->
 
 
 def _reach(names: Sequence[str]) -> tuple[int, int, bool, bool, bool]:
-    """Return the fields front, rear, role, obstacle and contact that fit an observation of the features ``names``."""
+    """Return the fields front, rear, role, obstacle and contact of the observation whose features are ``names``."""
     sides = [side for name in names if (side := side_of(name)) is not None]
     front, rear = (max((k for at, k in sides if at == wanted), default=0) for wanted in ("front", "rear"))
     groups = {name.partition(".")[0] for name in names}
@@ -216,7 +216,7 @@ class Extra(NamedTuple):
     known: int  # column of the neighbour's feature ``known`` among the built-in features
 
     def known_in(self, worlds: Worlds, vehicle: int, neighbour: int) -> NDArray[np.bool_]:
-        """Return whether ``vehicle`` knows all data of ``neighbour`` that the feature reads, in each world, [n].
+        """Return, for each world [n], whether ``vehicle`` knows all data of ``neighbour`` that the feature reads.
 
         Raises ``InvalidInput`` if messages leave out some data and the feature was registered without ``reads``.
         """
@@ -433,7 +433,7 @@ def _observe_rows(
 def _hide_untold(
     state: Floats, params: Floats, observers: Ints, offsets: Ints, role: bool, with_obstacle: bool, out: Observations
 ) -> None:
-    """Set the features in ``out`` to 0 for which the observer lacks data that messages do not contain.
+    """Set to 0 in ``out`` each feature for which the observer lacks data, because messages do not contain these data.
 
     If the observer knows no data of a neighbour, all features of this neighbour become 0. An observer knows the
     obstacle only if it knows the place of Vehicle 1.
@@ -466,8 +466,8 @@ def _fitting_deceleration(speed: float, latency_left: float, room: float) -> flo
     """Return the deceleration (m/s2) with which a vehicle stops after the distance ``room``: ``v^2 / (2 b)``.
 
     Here ``b = room - v tau`` is the distance that is left when the vehicle begins to brake. If b is below 1 mm, 1 mm is
-    used instead. In this case the result is at least 20 m/s2, the largest value that is observed, unless the speed is
-    below 0.2 m/s. For a vehicle at rest the result is 0.
+    used instead. If b is below 1 mm, the result is at least 20 m/s2, the largest value that a vehicle can observe,
+    unless the speed is below 0.2 m/s. For a vehicle at rest the result is 0.
 
     Args:
         speed: present speed v of the vehicle, m/s.

@@ -32,7 +32,8 @@ def observations_of(scenario: Game, given: Observation | None = None) -> tuple[O
     Args:
         scenario: the scenario, which may declare observations.
         given: observations that replace the observations of the scenario: one observation for all vehicles, or a
-            mapping for some vehicles, such as ``{"vehicle_2": ["own", "front_1"]}``. None: nothing is replaced.
+            mapping for some vehicles, such as ``{"vehicle_2": ["own", "front_1"]}``. If ``given`` is None, no
+            observation is replaced.
 
     """
     names, step_s, said = scenario.vehicle_names, scenario.time_step_s, scenario.observation
@@ -53,10 +54,10 @@ def observations_of(scenario: Game, given: Observation | None = None) -> tuple[O
 
 
 def common_observation(observations: tuple[ObservationSpec, ...], scenario: Game) -> ObservationSpec:
-    """Return the observation that all learners share; if there are no learners, the one that all vehicles share.
+    """Return the observation that all learners share or, without learners, the observation that all vehicles share.
 
-    Raises ``InvalidInput``, which names two vehicles, if their observations differ. ``observations``: observation of
-    each vehicle, front to rear.
+    Raises ``InvalidInput``, which names two vehicles, if the observations of these vehicles differ. ``observations``:
+    observation of each vehicle, front to rear.
     """
     first, *others = scenario.learners or range(scenario.vehicles)
     for other in others:

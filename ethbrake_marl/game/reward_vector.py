@@ -1,6 +1,6 @@
 """Vector rewards: a reward has several named components, such as the harm of each vehicle, instead of one number.
 
-You can choose from these components. The table shows the value of each component in one step:
+You can choose from the components in this table, which shows the value of each component in one step:
 
 ==========  ========================================================================================
 component   value
@@ -11,7 +11,7 @@ obstacle    minus the harm of impacts of Vehicle 1 with an obstacle ahead, m2/s2
 term name   value of a term of the reward before weighting, for instance ``jerk``
 ==========  ========================================================================================
 
-The reward's setting ``harm_count`` selects whether these harms are first-impact harm or total harm.
+The setting ``harm_count`` of the reward selects whether the harms in this table are first-impact harm or total harm.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ def components_of(vector: RewardVector, params: RewardParams, vehicles: int) -> 
     """Return the names of the components of a vector reward.
 
     Args:
-        vector: ``vehicles`` (the harm of each vehicle), or a list of different names of components.
-        params: the reward, whose terms with a weight can be components.
+        vector: ``vehicles`` (one component for the harm of each vehicle), or a list of names of components, without
+            repetition.
+        params: the reward; each of its terms whose weight is not 0 can be a component.
         vehicles: number of vehicles in the line.
 
     Raises ``InvalidInput`` for an empty list or a repeated name, and ``UnknownName`` for an unknown name.

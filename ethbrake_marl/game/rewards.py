@@ -44,7 +44,7 @@ class WithoutEffect(UserWarning):
 
 
 def own_terms() -> list[str]:
-    """Return the names of the registered measures, without the built-in ones and without loading any package."""
+    """Return the names of the registered measures, without the built-in measures and without loading any package."""
     return [name for name in MEASURES if name not in RewardParams.model_fields]
 
 
@@ -66,8 +66,8 @@ class RewardParams(FileModel):
 
     Args:
         harm, collision, risk, jerk, terminal, shaping: weights of the built-in terms, at least 0. The docstring of the
-            module ``game.rewards`` shows the formula of each term. If you give another weight, you must also give the
-            weight of harm.
+            module ``game.rewards`` shows the formula of each term. If you give a weight for any other term, you must
+            also give the weight of harm.
         harm_count: ``first``: the term harm uses first-impact harm; ``total``: the term harm uses total harm.
         objective: objective of all vehicles, or a list with one objective per vehicle; None: the objective of the
             scenario.
@@ -105,7 +105,7 @@ class RewardParams(FileModel):
     @model_validator(mode="before")
     @classmethod
     def _own_terms(cls, value: Any) -> Any:
-        """Move the weights of registered measures into ``terms``, if they are written next to the other settings."""
+        """Move into ``terms`` the weights of registered measures that are written next to the other settings."""
         if not isinstance(value, dict):
             return value
         beside = {name: weight for name, weight in value.items() if name in own_terms()}
@@ -122,7 +122,7 @@ class RewardParams(FileModel):
     @field_validator("terms")
     @classmethod
     def _settled(cls, value: dict[str, float]) -> dict[str, float]:
-        """Load the registered measures in ``terms``, and remove measures with weight 0."""
+        """Load the registered measures in ``terms``; return ``terms`` without the measures of weight 0."""
         for name in value:
             if name not in own_terms():
                 raise unknown_name("measure", name, own_terms(), may_be_own=True)
@@ -143,8 +143,8 @@ class RewardParams(FileModel):
         """Raise an error if weights are given without the weight of harm, or if an objective is given although
         harm has weight 0.
 
-        If the weight of harm is not given, it is 1; without this error, harm would be added to the given terms without
-        notice.
+        If the weight of harm is not given, it is 1. Without this error, harm would be added without notice to the terms
+        whose weights are given.
         """
         names = {*self.model_fields_set, *(self.terms if "terms" in self.model_fields_set else ())}
         beside = [name for name, weight in self.weights.items() if weight != 0.0 and name in names]
@@ -175,8 +175,8 @@ class RewardParams(FileModel):
     def shared(self, harm: Value, safe_end: Value) -> dict[str, Value]:
         """Return the terms whose values all vehicles of a world share, by name: ``harm`` and ``terminal``.
 
-        A term with weight 0 is left out. The term harm is also left out if there is an objective, because its values
-        then differ between vehicles.
+        A term with weight 0 is left out. If there is an objective, the term harm is also left out, because each vehicle
+        has its own value of this term.
 
         Args:
             harm: harm of the step in m2/s2, for n worlds [n] or as one number for a single world.
@@ -202,7 +202,7 @@ class RewardParams(FileModel):
         return total
 
     def settled(self, of_scenario: Declared, vehicles: int) -> tuple[RewardParams, tuple[Objective, ...]]:
-        """Return a copy of this reward with the objective that applies, and the parsed objective of each vehicle.
+        """Return a copy of this reward with the objective that it uses, and the parsed objective of each vehicle.
 
         The objective comes from the reward or, if the reward has none, from the scenario. If all vehicles have the
         objective ``total``, or if harm has weight 0, ``objective`` becomes None and the tuple of parsed objectives is
@@ -213,7 +213,7 @@ class RewardParams(FileModel):
             of_scenario: objective that the scenario declares.
             vehicles: number of vehicles in the line.
 
-        Raises ``InvalidInput`` if the reward's objective is not made for this number of vehicles.
+        Raises ``InvalidInput`` if the objective of the reward contains texts or weights for another number of vehicles.
 
         """
         declared = of_scenario if self.objective is None else self.objective
@@ -234,10 +234,10 @@ class RewardParams(FileModel):
     def potential(self, worlds: Worlds, learners: Sequence[int], horizon_s: float) -> Floats:
         """Return the potential of the shaping term, [n] m2/s2: minus the least harm by constant braking from now on.
 
-        In this calculation, each learner brakes with a constant deceleration, and all other vehicles brake fully. Nine
-        decelerations are tried, from 0 to the learner's braking capacity in equal steps. A single learner takes the
-        deceleration with the least harm. Several learners begin with full braking and choose their decelerations one
-        after the other, front to rear, in two rounds; they all get the same potential.
+        For the potential, each learner is assumed to brake with a constant deceleration, and all other vehicles fully.
+        Nine decelerations are tried, from 0 to the learner's braking capacity in equal steps. A single learner takes
+        the deceleration with the least harm. Several learners begin with full braking and choose their decelerations
+        one after the other, front to rear, in two rounds; all learners get the same potential.
 
         Args:
             worlds: n worlds of N vehicles.
@@ -295,5 +295,5 @@ def reward_params(reward: Reward) -> RewardParams:
 
 
 def setting_names() -> list[str]:
-    """Return the keys that a mapping of reward settings may have: fields of ``RewardParams``, registered measures."""
+    """Return the keys that reward settings may have: the fields of ``RewardParams`` and the registered measures."""
     return [*RewardParams.model_fields, *own_terms()]

@@ -36,7 +36,7 @@ def advance_worlds(
     command: Floats, until: Floats, braking: Floats, driving: Floats, latency: Floats, mass: Floats, limit: Floats,
     restitution: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats, failed: Ints, at: int, rows: Floats,
 ) -> tuple[int, bool]:  # fmt: skip
-    """Advance every world to its time ``until``, in place; return the number of impacts, and False for bad input.
+    """Advance every world to its time ``until``, in place; return the number of impacts, and whether input is valid.
 
     A world in which a check of the physics fails keeps its state; the other worlds are advanced. The second result is
     True if all entries of ``until`` and ``command`` are valid, otherwise False. Arguments that are not listed are
@@ -177,7 +177,7 @@ def _advance_part(arrays: tuple[NDArray[Any], ...], at: int, capacity: int, part
     """Advance the worlds of the slice ``part`` in place; return their impacts and whether the input is valid.
 
     Args:
-        arrays: array arguments of ``advance_worlds`` for all worlds, in its order.
+        arrays: the array arguments of ``advance_worlds`` for all worlds, in the order of its signature.
         at: 1 if some world has an obstacle ahead, otherwise 0.
         capacity: largest number of impacts to record.
         part: slice of the world indices to advance.
@@ -224,7 +224,7 @@ def refuse_bad(worlds: Worlds, command: Floats, until: Floats, in_time: Bools) -
 
 
 def _impact_rows(parts: list[_Part], ahead: int) -> ImpactRows:
-    """Join the recorded impacts of all slices of a batch.
+    """Return the recorded impacts of all slices of a batch as one object.
 
     ``ahead`` is 1 if pair 0 in the recorded rows is the obstacle ahead and Vehicle 1, otherwise 0.
     """

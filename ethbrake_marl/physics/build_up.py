@@ -5,11 +5,12 @@ vehicle or pair.
 
 The *force* of a vehicle (row FORCE) is the acceleration that its brakes or engine alone would cause at the moment. The
 force falls at the rate BRAKE_RATE or rises at the rate RELEASE_RATE until it equals the command. Until the vehicle's
-latency has elapsed, 0 replaces the command. The force also changes while the vehicle is at rest.
+latency has elapsed, the force approaches 0 instead of the command. The force also changes while the vehicle is at rest.
 
 A *body* is a vehicle, or several touching vehicles that move together. Between events each body has a constant jerk.
-Two kinds of events occur here but not in ``physics.constant_motion``. In the first, a force reaches the command or
-passes 0. In the second, touching vehicles separate, or a body that its brakes held at rest starts to move.
+Two kinds of events occur in this module but not in ``physics.constant_motion``. In an event of the first kind, a force
+reaches the command or passes 0. In an event of the second kind, touching vehicles separate, or a body that its brakes
+held at rest starts to move.
 """
 
 from __future__ import annotations
@@ -47,8 +48,8 @@ def built_up(table: Floats) -> bool:
 def first_return(value: float, rate: float, jerk: float) -> float:
     """Return the first time t > 0 at which ``value + rate t + jerk t^2 / 2`` is 0, in s; infinite if there is none.
 
-    For a speed, ``value`` is in m/s, ``rate`` in m/s2 and ``jerk`` in m/s3. The result is later than 0 even if the
-    expression is 0 at t = 0.
+    For a speed, ``value`` is in m/s, ``rate`` in m/s2 and ``jerk`` in m/s3. The result is later than 0 even if this
+    polynomial is 0 at t = 0.
     """
     if value == 0.0:
         return -2.0 * rate / jerk if rate * jerk < 0.0 else math.inf
@@ -89,9 +90,10 @@ def contact_within(gap: float, closing: float, pressing: float, jerk: float, end
     """Return time (s) and closing speed (m/s) of a pair's first contact before ``end``; ``(inf, 0)`` if there is none.
 
     The closing jerk is constant; ``motion.contact`` is the function for a constant closing acceleration. The closing
-    speed ``w + b t + j t^2 / 2`` has at most two roots, and between them the gap is monotone. The contact lies in the
-    first monotone interval that ends with a gap of at most 0. Newton's method finds the time of the contact in this
-    interval. If a step of Newton's method leaves the interval, a bisection step replaces it.
+    speed ``w + b t + j t^2 / 2`` has at most two roots, and the gap is monotone between one root and the next. The
+    contact lies in the first of these monotone intervals that ends with a gap of at most 0. Newton's method finds the
+    time of the contact in this interval. If a step of Newton's method leaves the interval, a bisection step replaces
+    it.
 
     Args:
         gap: present gap of the pair, m.
@@ -163,11 +165,11 @@ def plan_force(table: Floats, i: int, wanted: float) -> None:
 
 @compiled
 def force_ranges(force: float, rate: float, speed: float, limit: float) -> tuple[float, float, float, float]:
-    """Return a vehicle's own acceleration for motion forward and for motion backward, and their rates of change.
+    """Return the acceleration by a vehicle's own brakes or engine, forward and backward, and the rates of change.
 
     The result is ``(forward, backward, rate of forward, rate of backward)``: two accelerations in m/s2 and their rates
-    in m/s3. The accelerations differ if the force depends on the direction of motion. For example, the brakes of a
-    vehicle at rest act against motion in either direction (see ``motion.force_range``).
+    in m/s3. The accelerations ``forward`` and ``backward`` differ if the force depends on the direction of motion. For
+    example, the brakes of a vehicle at rest act against motion in either direction (see ``motion.force_range``).
 
     Args:
         force: present acceleration by brakes or engine, m/s2.
@@ -196,7 +198,7 @@ def settle_moving(low: float, high: float, low_jerk: float, high_jerk: float) ->
 
     The body's own forces allow every acceleration in the range ``[low, high]`` (m/s2). The lower end of the range
     changes at the rate ``low_jerk``, the upper end at the rate ``high_jerk`` (m/s3). The body's acceleration is the
-    value in this range that is nearest to 0, as in ``motion.settle``.
+    value in ``[low, high]`` that is nearest to 0, as in ``motion.settle``.
     """
     if low > 0.0 or (low == 0.0 and low_jerk > 0.0):
         return low, low_jerk
@@ -207,7 +209,7 @@ def settle_moving(low: float, high: float, low_jerk: float, high_jerk: float) ->
 
 @compiled(apart=True, bare=True)
 def pool_moving(table: Floats, first: int, last: int) -> float:
-    """Set the accelerations and jerks of touching vehicles; return the time (s) until two of them separate.
+    """Set the accelerations and jerks of touching vehicles; return the time (s) until two of these vehicles separate.
 
     The vehicles are the columns ``first..last`` of ``table`` and have the same speed. If the acceleration of a vehicle
     is at least the acceleration of the vehicle in front, up to rounding, both vehicles move as one body with a common
@@ -252,7 +254,8 @@ def settle_block(table: Floats, block: int, out: int) -> None:
     """Write the common acceleration and jerk of a block into column ``out`` of the table.
 
     A block consists of touching vehicles that move as one body. ``block`` is the block's column in the rows whose names
-    begin with BLOCK. These rows contain the mass of the block and the sums of mass times force and of mass times jerk.
+    begin with BLOCK. The rows whose names begin with BLOCK contain the mass of the block and the sums of mass times
+    force and of mass times jerk.
     """
     mass = table[ROW.BLOCK_MASS, block]
     table[ROW.ACCELERATION, out], table[ROW.JERK, out] = settle_moving(

@@ -86,7 +86,7 @@ class Packed(NamedTuple):
     def of(cls, worlds: Worlds) -> Packed:
         """Pack ``worlds`` as at the start of an episode, with harm 0.
 
-        The columns of an obstacle, and those of *news by link* (see ``Columns``), exist only if some world needs them.
+        The columns of an obstacle and the columns *news by link* (see ``Columns``) exist only if a world needs them.
         """
         v, (n, N) = worlds.vehicles, worlds.speeds_mps.shape
         none = np.zeros((n, 3 * (N - 1)))
@@ -106,7 +106,7 @@ class Packed(NamedTuple):
 
     @property
     def column(self) -> Columns:
-        """First column of each group of quantities in these rows."""
+        """First column of each group of quantities in the rows of the two arrays."""
         return _known_columns((self.state.shape[1] + 4) // 8)
 
     @property
@@ -126,7 +126,7 @@ class Packed(NamedTuple):
 
     @property
     def builds_up(self) -> bool:
-        """Whether the brakes of some vehicle build up at a finite rate."""
+        """Whether the brakes of at least one vehicle build up at a finite rate."""
         column = self.column
         return bool(np.isfinite(self.params[:, column.brake_rate : column.harm_weight]).any())
 
@@ -153,7 +153,7 @@ class Packed(NamedTuple):
     def worlds(self, vehicles: Vehicles | None = None) -> Worlds:
         """Unpack the two arrays into ``Worlds`` with new arrays.
 
-        ``vehicles``: parameters of the result; None: unpack the parameters, too.
+        ``vehicles``: parameters of the returned worlds; if None, the parameters are also unpacked from the arrays.
         """
         (state, params), column, far = self, self.column, not self.has_obstacle
         return Worlds(
@@ -195,7 +195,7 @@ class Packed(NamedTuple):
         """Return harm and number of impacts since the start of the episode, of the pairs and of the obstacle.
 
         The first three arrays, [n, P], are first-impact harm (m2/s2), total harm (m2/s2) and number of impacts of each
-        pair. The other three arrays, [n], are first-impact harm, total harm and number of impacts of Vehicle 1 with the
+        pair. The last three arrays, [n], are first-impact harm, total harm and number of impacts of Vehicle 1 with the
         obstacle.
         """
         state, column, pairs = self.state, self.column, self.column.vehicles - 1

@@ -18,7 +18,7 @@ from ethbrake_marl.physics.state import Floats
 def accelerate(table: Floats) -> None:
     """Set the acceleration of every vehicle, and mark the pairs of touching vehicles that move as one body.
 
-    The function uses the speeds, commands and gaps in ``table``. It writes the rows ACCELERATION and JOINED.
+    The function uses the speeds, commands and gaps in ``table``. The function writes the rows ACCELERATION and JOINED.
     """
     vehicles = table.shape[1]
     for i in range(vehicles):

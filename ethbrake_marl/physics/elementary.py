@@ -76,7 +76,7 @@ _FRACTIONS = 150  # terms of the continued fraction: for x >= 2 its remainder is
 
 @compiled
 def _polynomial(coefficients: tuple[float, ...], x: float) -> float:
-    """Evaluate the polynomial with these coefficients (highest power first) at ``x``, by Horner's rule."""
+    """Return the value at ``x`` of the polynomial with ``coefficients`` (highest power first), by Horner's rule."""
     total = 0.0
     for coefficient in coefficients:
         total = total * x + coefficient
@@ -101,7 +101,7 @@ def exp_rest(x: float, k: int) -> float:
     """Return ``e^x / 2^k`` for the whole number k nearest to ``x / ln 2``.
 
     The result is the sum of Taylor's series of ``e^y`` to the 13th power of ``y = x - k ln 2``. The absolute value of y
-    is at most ``ln(2) / 2``. The relative error of cutting the series there is 5e-18.
+    is at most ``ln(2) / 2``. The relative error of cutting the series after the 13th power is 5e-18.
     """
     return _polynomial(_EXP, (x - k * _LN2_HIGH) - k * _LN2_LOW)
 
@@ -153,9 +153,9 @@ def log(x: float) -> float:
 def normal_quantile(p: float) -> float:
     """Return the number x below which a standard normal variable lies with probability p, within 1.5 ulp.
 
-    p is clipped to [1e-22, 1 - 1e-22]. For p outside [1/4, 3/4], with the smaller of p and 1 - p in place of p, the
-    function represents ``r = sqrt(-2 ln p)`` as the sum of two numbers. The first of them has 24 bits, so its square is
-    exact.
+    p is clipped to [1e-22, 1 - 1e-22]. For p outside [1/4, 3/4], let q be the smaller of p and 1 - p. The function
+    represents ``r = sqrt(-2 ln q)`` as the sum of two numbers. The first of these two numbers has 24 bits, so its
+    square is exact.
     """
     q = p - 0.5
     if abs(q) <= 0.25:
@@ -181,8 +181,9 @@ def normal_probability(x: float) -> float:
     """Return the probability that a standard normal variable is below x; the relative error is 1e-13 for x > -30.
 
     Let phi be the standard normal density. For ``0 <= x <= 2``, the probability of a value above x is computed by the
-    series ``1/2 - phi(x) (x + x^3 / 3 + x^5 / 15 + ...)``. For larger x, it is computed by the continued fraction
-    ``phi(x) / (x + 1 / (x + 2 / (x + ...)))``. For ``x < 0``, the result is the probability of a value above -x.
+    series ``1/2 - phi(x) (x + x^3 / 3 + x^5 / 15 + ...)``. For larger x, this probability is computed by the continued
+    fraction ``phi(x) / (x + 1 / (x + 2 / (x + ...)))``. For ``x < 0``, the result is the probability of a value above
+    -x.
     """
     a = abs(x)
     density = _PER_SQRT_2PI * exp(-0.5 * a * a)

@@ -1,9 +1,10 @@
 """Compiled rules of one step of an episode: when commands take effect, motion, harm, rest, and decision times.
 
 Searches and shields copy one world at a time into a table in the layout of ``physics.rows``, and advance this world
-with ``step_episode``. The engine stores all its worlds in the rows of two arrays and advances them in its own loop.
-This loop uses the same rules (``step_end_s``, ``onset_s``, ``force_at``, ``stands``) and the same ``advance_table``.
-Therefore engine, searches and shields compute results that are equal to the last bit (decision 0025).
+with ``step_episode``. The engine stores all its worlds in the rows of two arrays and advances them in its own loop. The
+engine's loop uses the same rules (``step_end_s``, ``onset_s``, ``force_at``, ``stands``) and the same function
+``advance_table`` as ``step_episode``. Therefore engine, searches and shields compute results that are equal to the last
+bit (decision 0025).
 
 A *profile* is a sequence of constant commands of the controlled vehicles. A *phase* is the time interval of one of
 these commands. Phases begin and end at decisions, so an agent can carry out a profile. This module uses the following
@@ -112,7 +113,7 @@ def step_end_s(step: float, last_step: float, first_s: float, time_step_s: float
 
     Args:
         step: number of the step; a step is the time between two decisions.
-        last_step: number of the last step.
+        last_step: number of the last step of the episode.
         first_s: time of the first decision, s.
         time_step_s: time between two decisions, s.
         horizon_s: end of the last step, s.
@@ -131,14 +132,14 @@ def time_of(grid: Grid, step: int) -> float:
 def onset_s(latency_s: float, time_s: float) -> float:
     """Return the time (s) from ``time_s`` until a vehicle's command takes effect; 0 or less if it acts at once.
 
-    ``latency_s`` and ``time_s`` are in seconds from the alert. Commands take effect from ``latency_s`` on.
+    ``latency_s`` and ``time_s`` are in seconds from the alert. Commands take effect from the time ``latency_s`` on.
     """
     return latency_s - time_s
 
 
 @compiled
 def stands(speed_mps: float, command_mps2: float) -> bool:
-    """Return whether a vehicle is at rest and its command (m/s2) does not drive it, that is, is at most 0."""
+    """Return whether a vehicle is at rest and its command (m/s2) is at most 0, so that it does not drive away."""
     return speed_mps == 0.0 and command_mps2 <= 0.0
 
 
@@ -159,12 +160,12 @@ def at_rest(table: Floats) -> bool:
 def step_episode(
     table: Floats, restitution: float, time: float, until: float, horizon_s: float, no_rows: Floats
 ) -> int:
-    """Advance one world from ``time`` to ``until`` under its commands, and add the harm of this step.
+    """Advance one world from ``time`` to ``until`` under its commands, and add the harm of this step to the table.
 
-    Returns AT_REST, AT_HORIZON (some vehicle is not at rest at the horizon), GOES_ON (neither), or minus the status
-    code of ``FLAG`` if a check of the physics failed. After a failure the table is invalid. The last bits of the result
-    depend on the times at which steps end. To get the same bits as the engine, call the function once for each step
-    from one decision to the next.
+    Returns AT_REST (``at_rest`` is True), AT_HORIZON (``at_rest`` is False at the horizon), GOES_ON (neither of the
+    two), or minus the status code of ``FLAG`` if a check of the physics failed. After a failure the table is invalid.
+    The last bits of the result depend on the times at which steps end. To get the same bits as the engine, call the
+    function once for each step from one decision to the next.
 
     Args:
         table: the world in the layout of ``physics.rows``, with at least ``ROW.OF_EPISODE`` rows; updated.
@@ -190,8 +191,8 @@ def step_episode(
 def step_again(table: Floats, restitution: float, grid: Grid, step: int, end: int, no_rows: Floats) -> int:
     """Advance a world from decision number ``step`` to decision number ``end``; return the result of ``step_episode``.
 
-    Except for commands, the table must be as the previous step left it, or as ``restore`` filled it. For each vehicle,
-    the function computes again when the command takes effect.
+    Apart from the commands, the table must contain what the previous step or ``restore`` wrote into it. For each
+    vehicle, the function computes again when the command takes effect.
 
     Args:
         table: the world in the layout of ``physics.rows``, with at least ``ROW.OF_EPISODE`` rows; updated.
@@ -225,16 +226,17 @@ def harm_so_far(table: Floats, total: float) -> float:
 
 @compiled
 def value_of(table: Floats, clock: Floats, other_weight: float = OTHER_WEIGHT) -> float:
-    """Return the harm of the episode so far that a search minimises, m2/s2; it never decreases during an episode.
+    """Return the harm that a search minimises, of the episode so far, m2/s2; this harm never decreases in an episode.
 
-    The harm is one of three: the harm of the line, the weighted sum of the vehicles' harms, or the largest weighted
-    harm of a vehicle. It uses one of the two counts, first-impact harm or total harm. To break ties, the function adds
-    ``other_weight`` times the line's harm in the other count.
+    The result is one of three harms: the harm of the line, the weighted sum of the vehicles' harms, or the largest
+    weighted harm of a vehicle. Each of these harms can be computed as first-impact harm or as total harm. To break
+    ties, the function adds ``other_weight`` times the line's harm in the other count (total harm if the result is
+    first-impact harm, and vice versa).
 
     Args:
         table: one world in the layout of ``physics.rows``, with at least ``ROW.OF_EPISODE`` rows.
-        clock: settings, [CLOCK.WIDTH]: ``HARM_IS_TOTAL`` chooses the count of harm, and ``AIM`` chooses one of the
-            three harms.
+        clock: settings of the episode, [CLOCK.WIDTH]: the entry ``HARM_IS_TOTAL`` chooses the count of harm, and the
+            entry ``AIM`` chooses one of the three harms.
         other_weight: weight of the line's harm in the other count, a number without unit.
 
     """
@@ -302,14 +304,14 @@ def follow_whole(world: Episode, ends: Ints, commands: Floats, states: Floats, b
 def follow(world: Episode, ends: Ints, commands: Floats, states: Floats, phase: int, bound: float) -> tuple[float, int]:
     """Simulate a profile from ``phase`` on; return its harm (m2/s2) and the number of phases until the simulation ends.
 
-    A profile is a sequence of constant commands; a phase is the time interval of one command. The harm is the harm that
-    a search minimises (``value_of``). The number of phases is -1 if a check of the physics failed. If
+    A profile is a sequence of constant commands; a phase is the time interval of one command. The returned harm is the
+    harm that a search minimises (``value_of``). The number of phases is -1 if a check of the physics failed. If
     ``world.clock[CLOCK.STEPWISE]`` is 1, the simulation moves from decision to decision, and the result has the same
-    bits as in the engine. If this entry is 0, the simulation moves from phase to phase, which is several times faster,
-    and the result differs by rounding.
+    bits as in the engine. If ``STEPWISE`` is 0, the simulation moves from phase to phase, which is several times
+    faster, and the result differs from the engine's by rounding errors.
 
     Args:
-        world: the world and its decision times; its table is overwritten.
+        world: the world, with its decision times; the table of the world is overwritten.
         ends: for each phase, the number of the decision at which it ends, [K].
         commands: for each phase, the commands of the C controlled vehicles, [K, C] m/s2.
         states: states as ``save`` writes them, [K + 1, S]. The simulation starts from ``states[phase]`` and writes the

@@ -1,6 +1,6 @@
 """Forecast of harm under constant commands, for many candidate commands of one vehicle.
 
-The forecast uses the physics of ``advance``. It is fast because it returns only the harm, not the motion.
+The forecast uses the physics of ``advance``. The forecast is fast because it returns only the harm, not the motion.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ def forecast(
 ) -> tuple[Floats, Floats]:
     """Return the first-impact harm and the total harm up to ``until_s`` for each candidate command of ``vehicle``.
 
-    Both results are [n, K] in m2/s2. Harm is summed over all pairs and the obstacle ahead, if there is one. If the
-    present time of a world is ``until_s`` or later, its harm is 0. A pair that has already had an impact adds no
-    first-impact harm.
+    The first-impact harm and the total harm are [n, K] in m2/s2. The harm is summed over all pairs; if there is an
+    obstacle ahead, the harm of impacts with it is included. If the present time of a world is ``until_s`` or later, the
+    harm of this world is 0. A pair that has already had an impact adds no first-impact harm.
 
     Args:
         worlds: n worlds of N vehicles.

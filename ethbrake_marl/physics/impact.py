@@ -1,9 +1,9 @@
 """Impacts and resting contact of touching vehicles, resolved by one law for all pairs at once.
 
-If pairs were resolved one after another, the result would depend on their order. Here all vehicles of a *cluster* (a
-sequence of touching vehicles) are resolved together. The law uses P, the mass-weighted isotonic regression (pool
-adjacent violators) of the vehicles' speeds or accelerations, from front to rear. With the speeds v- before and v+ after
-the impact, and the restitution e:
+If pairs were resolved one after another, the result would depend on their order. This module therefore resolves all
+impacts and pushes in a *cluster* (a sequence of touching vehicles) together. The law uses an operator P, the
+mass-weighted isotonic regression (pool adjacent violators) of the vehicles' speeds or accelerations, from front to
+rear. With the speeds v- before and v+ after the impact, and the restitution e:
 
 * impact: ``v+ = (1 + e) P(v-) - e v-``; for two vehicles this is the paper's eq. (13);
 * resting contact: the accelerations are ``P`` of the vehicles' own accelerations; a pooled block of vehicles with
@@ -33,17 +33,17 @@ def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) ->
 
     A vehicle whose value (speed or acceleration) is above the value of the vehicle in front forms a *block* with this
     vehicle. All vehicles of a block get the same value, the mean weighted by mass. Therefore no vehicle has a larger
-    value than the vehicle in front of it. The function writes the values to row ``out``, and the blocks to the rows
-    whose names begin with BLOCK. A vehicle of infinite mass (the obstacle) and its block get the value 0.
+    value than the vehicle in front of it. The function writes the vehicles' new values to row ``out``, and the blocks
+    to the rows whose names begin with BLOCK. A vehicle of infinite mass (the obstacle) and its block get the value 0.
 
     Args:
         table: one world in the layout of ``physics.rows``.
-        low: row with the lower bound of each vehicle's own value (m/s or m/s2).
-        high: row with the upper bound of each vehicle's own value; the same row as ``low`` if the value is known
-            exactly.
+        low: number of the table row that contains a lower bound of each vehicle's own value (m/s or m/s2).
+        high: number of the table row that contains an upper bound of each vehicle's own value; the same as ``low`` if
+            the value is known exactly.
         first: column of the first of the touching vehicles, from the front.
         last: column of the last of the touching vehicles.
-        out: row into which the results are written.
+        out: number of the table row into which the results are written.
 
     """
     count = 0
@@ -116,7 +116,7 @@ def resolve_cluster(table: Floats, restitution: float, first: int, last: int) ->
 
 @compiled(bare=True)
 def resolve_impacts(table: Floats, restitution: float) -> bool:
-    """Resolve every cluster in which a pair has a closing speed above 0, once each; return False if there is none.
+    """Resolve once every cluster in which a pair has a closing speed above 0; return False if there is no such cluster.
 
     A cluster is a sequence of touching vehicles. ``table``: one world in the layout of ``physics.rows``;
     ``restitution``: coefficient of restitution in [0, 1]. If the result is True, the function has updated row SPEED,
@@ -154,16 +154,16 @@ def resolve_impacts(table: Floats, restitution: float) -> bool:
 
 @compiled(bare=True)
 def record_impacts(table: Floats, time_s: float, world: int, rows: Floats, recorded: int) -> int:
-    """Add the impacts of the last ``resolve_impacts`` to the harm in ``table`` and to ``rows``; return their number.
+    """Add the harm of the impacts of the last ``resolve_impacts`` to ``table``; write these impacts to ``rows``.
 
-    The number is ``recorded`` plus the number of the added impacts.
+    Returns ``recorded`` plus the number of these impacts.
 
     Args:
         table: one world in the layout of ``physics.rows``, after ``resolve_impacts``.
         time_s: time of the impacts, s.
         world: number of this world, written into ``rows``.
-        rows: array to which the impacts are written, [capacity, LISTED.WIDTH]; if it is full, further impacts are only
-            counted.
+        rows: array to which the impacts are written, [capacity, LISTED.WIDTH]; if the array is full, further impacts
+            are only counted.
         recorded: number of impacts so far, written or only counted.
 
     """

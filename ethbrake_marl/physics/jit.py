@@ -1,15 +1,15 @@
 """The decorator ``compiled``, which compiles functions with strict floating point and caches the machine code on disk.
 
-A compiled function is called a *kernel*. Numba's own cache has two problems. First, it checks only the file that
-contains the kernel. If a kernel calls a function of another file and this file is edited, numba still uses the old
+A compiled function is called a *kernel*. Numba's own cache has two problems. First, numba's cache checks only the file
+that contains the kernel. If a kernel calls a function of another file and this file is edited, numba still uses the old
 machine code. Second, each process reads numba's index file, changes it and writes it back, which is not safe if several
 processes share a folder.
 
 The cache of this module has one file for each kernel and signature. The name of the file is a hash of everything that
-determines the machine code: sources, versions, signature and processor. The name does not depend on the location of the
-package. After an edit, only the kernels that may use the edited code are compiled again. A second Python environment,
-or a copy of the package in another folder, reuses the existing files. A file is written under a temporary name and
-renamed when it is complete, so any number of processes may share a folder.
+determines the machine code: sources, versions, signature and processor. The name of the file does not depend on the
+folder of the package. After an edit, only the kernels that may use the edited code are compiled again. A second Python
+environment, or a copy of the package in another folder, reuses the existing files. A file is written under a temporary
+name and renamed when it is complete, so any number of processes may share a folder.
 """
 
 from __future__ import annotations
@@ -232,7 +232,7 @@ def _described(kind: Any) -> str:
 
 
 def load_kernel(name: str) -> bytes | None:
-    """Return the content of the cache file ``name`` (as ``keep_kernel`` wrote it); None if it cannot be used.
+    """Return the content of the cache file ``name`` (as ``keep_kernel`` wrote it); None if the file cannot be used.
 
     A file cannot be used if it is missing or damaged, or if its owner is neither this user nor root. The owner is
     checked because the cached code is executed.
@@ -293,9 +293,9 @@ def _alone(name: str) -> Iterator[None]:
 def digest_of_sources(source: Path) -> str:
     """Return a hash of all files that determine the kernels in the file ``source``; empty if there is no valid hash.
 
-    There is no valid hash for code that is not in a file, such as code typed in an interactive shell. There is also
-    none if one of the files was edited after this process started, because the process may have imported the older
-    version. A file with a date in the future is treated as edited, and the function warns.
+    There is no valid hash for code that is not in a file, such as code typed in an interactive shell. There is also no
+    valid hash if one of the files was edited after this process started, because the process may have imported the
+    older version. A file with a date in the future is treated as edited, and the function warns.
     """
     digest = hashlib.sha256()
     for file in kernel_sources(source) if source.is_file() else ():
@@ -321,8 +321,8 @@ def kernel_sources(source: Path) -> list[Path]:
     """Return ``source`` and all other files of this package whose code its kernels may contain, sorted by name.
 
     A file with kernels is in the result if ``source`` imports it, directly or through other files with kernels. A file
-    without kernels is in the result if ``source`` or one of these files imports a constant (a name in capitals) from
-    it.
+    without kernels is in the result if a constant (a name in capitals) is imported from it by ``source``, or by a file
+    with kernels that is in the result.
     """
     sources, follow = {source}, [source]
     while follow:
@@ -373,15 +373,15 @@ def compiled(function: Any = None, *, apart: bool = False, within: bool = False,
     """Compile a function with numba: no fast-math, no bounds checks, no GIL, cached on disk.
 
     By default a compiled function (*kernel*) is inlined into its callers (numba's option ``forceinline``). If a call is
-    not inlined, numba counts the references to its arrays with atomic operations. This counting takes more than half as
-    long as the physics itself.
+    not inlined, numba counts the references to its arrays with atomic operations. This counting of references takes
+    more than half as long as the physics itself.
 
     Args:
         function: the function to compile; None if the decorator is used with arguments.
         apart: do not inline this kernel. Use this option for a large kernel that many kernels call, but rarely. If such
-            a kernel were inlined, numba would compile it once per caller, which takes minutes instead of seconds.
+            a large kernel were inlined, numba would compile it once per caller, which takes minutes instead of seconds.
         within: inline this kernel into the code of its callers before numba compiles them. In contrast to
-            ``forceinline``, this option avoids the counting of references in each function that passes an array on.
+            ``forceinline``, ``within`` avoids the counting of references in each function that passes an array on.
         bare: compile this kernel without any counting of references. Use this option for kernels that neither create
             nor return arrays. A kernel that is inlined into a bare kernel still counts references unless it is bare,
             too.

@@ -17,14 +17,14 @@ LeftOutRows = tuple[tuple[int, str], ...]  # row of each world that was left out
 
 
 def measured_without_failed(measure: Callable[[Ints], Result], n: int) -> tuple[Result, Ints, LeftOutRows]:
-    """Call ``measure`` for the worlds that do not fail; return its result, their indices, and the failed worlds.
+    """Call ``measure`` for the worlds that do not fail; return the result, these worlds, and the failed worlds.
 
-    The failed worlds are returned as pairs (index of the world, reason), in ascending order. The function works like
-    ``leaving_out_failed``, but raises ``PhysicsError`` if every world fails.
+    The worlds that do not fail are returned as indices, and the failed worlds as pairs (index of the world, reason), in
+    ascending order. The function works like ``leaving_out_failed``, but raises ``PhysicsError`` if every world fails.
 
     Args:
-        measure: function of an array of world indices (from 0 to n - 1). If the physics fails, it must raise a
-            ``PhysicsError`` that lists the failed worlds by their position in this array.
+        measure: function of an array of world indices (from 0 to n - 1). If the physics fails, the function must raise
+            a ``PhysicsError`` that lists the positions of the failed worlds in this array.
         n: number of worlds.
 
     """
@@ -35,15 +35,15 @@ def measured_without_failed(measure: Callable[[Ints], Result], n: int) -> tuple[
 
 
 def leaving_out_failed(work: Callable[[Ints], Result], rows: Ints) -> tuple[Result | None, Ints, dict[int, str]]:
-    """Call ``work`` for the worlds that do not fail; return its result, their indices, and {failed index: reason}.
+    """Call ``work`` for the worlds that do not fail; return the result, these worlds, and {failed world: reason}.
 
-    ``work`` is repeated without the failed worlds until no world fails. The results of the other worlds stay the same,
-    because the result of a world does not depend on the other worlds. If every world fails, the returned result is
-    None.
+    Worlds are returned as indices. ``work`` is repeated without the failed worlds until no world fails. The results of
+    the other worlds stay the same, because the result of a world does not depend on the other worlds. If every world
+    fails, the returned result is None.
 
     Args:
-        work: function of an array of world indices. If the physics fails, it must raise a ``PhysicsError`` that lists
-            the failed worlds by their position in this array.
+        work: function of an array of world indices. If the physics fails, the function must raise a ``PhysicsError``
+            that lists the positions of the failed worlds in this array.
         rows: indices of the worlds for the first call of ``work``, [k].
 
     """

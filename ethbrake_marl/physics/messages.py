@@ -1,8 +1,8 @@
 """Periodic messages: the information that each vehicle has received about each other vehicle, and its age.
 
 A vehicle samples its state at every decision, starting at the alert. A message contains the sender's newest sample. On
-each link (from one vehicle to another) a message is sent once per period. The link's channel is good or bad
-(Gilbert-Elliott model): with each message after the first message that arrives, a good channel turns bad with
+each link (from one vehicle to another) a message is sent once per period. The link's channel is either good or bad
+(Gilbert-Elliott model). With each message after the first message that arrives, a good channel turns bad with
 probability p, and a bad channel turns good with probability r. A message sent while the channel is bad is lost. The
 random number that decides whether a message is lost depends only on the world's key (a seed), the link and the number
 of the message. A vehicle measures a neighbour in sight, so it knows the neighbour's present state.
@@ -18,9 +18,10 @@ links   N * N times the columns of ``_Link``, ordered by receiver, then sender
 ring    the newest samples in a ring buffer, RING_HEAD + 3 N columns each: time, whether Vehicle 1 has hit the obstacle,
         and places, speeds and commands in force of all vehicles
 
-A scenario can say what a message contains (``v2x: tells``). A flag in the columns of the link from Vehicle 1 to itself
-then marks such a world, and each sample also contains the *intents*: the commands of the N vehicles chosen at the last
-decision. Such a world has three more groups of columns between *links* and *ring*, even if it has no periodic messages:
+A scenario can say what a message contains (``v2x: tells``). Worlds of such a scenario are marked by a flag in the
+columns of the link from Vehicle 1 to itself. In these worlds, each sample also contains the *intents*: the commands
+of the N vehicles chosen at the last decision. These worlds have three more groups of columns between *links* and
+*ring*, even if they have no periodic messages:
 
 contents    N * CONTENTS: 1 if messages of this vehicle contain this quantity (see ``PIECES``), else 0
 intents     N, present intent of each vehicle (m/s2)
@@ -130,7 +131,7 @@ def intent_at(vehicles: int) -> int:
 
 @compiled
 def has_contents(messages: Floats, vehicles: int) -> bool:
-    """Return whether a row of message columns has the group *contents*, which says what messages contain."""
+    """Return whether the message columns of a world have the group *contents*, which says what messages contain."""
     return bool(messages.shape[0] > 0 and messages[link_at(0, 0, vehicles) + LINK.NUMBER] == 1.0)
 
 
@@ -152,12 +153,12 @@ def sample_width(messages: Floats, vehicles: int) -> int:
 
 @compiled
 def knows_piece(messages: Floats, vehicles: int, receiver: int, sender: int, piece: int, time: float) -> bool:
-    """Return whether ``receiver`` knows the quantity number ``piece`` in ``PIECES`` of ``sender`` at ``time`` (s).
+    """Return whether, at ``time`` (s), ``receiver`` knows the quantity ``PIECES[piece]`` of ``sender``.
 
     The function assumes that by ``time`` the first message has arrived, or the sender is in sight. ``messages`` are the
     message columns of one world; the array may be empty. The receiver knows the intent (the command chosen at the last
-    decision) only by a message. The receiver knows every other quantity if the sender's messages contain it. It also
-    knows place, speed and acceleration once the sender is in sight, because it measures them.
+    decision) only by a message. The receiver knows every other quantity if the sender's messages contain it. Once the
+    sender is in sight, the receiver also knows the sender's place, speed and acceleration, because it measures them.
     """
     if not has_contents(messages, vehicles):
         return piece != INTENT
@@ -171,7 +172,7 @@ def knows_piece(messages: Floats, vehicles: int, receiver: int, sender: int, pie
 
 @compiled
 def knows_line(messages: Floats, vehicles: int, receiver: int, sender: int, time: float) -> bool:
-    """Return whether ``receiver`` knows everything about ``sender`` that it needs to predict the sender's motion."""
+    """Return whether ``receiver`` knows all data of ``sender`` that are needed to predict the sender's motion."""
     known = True
     for piece in range(INTENT):
         known = known and knows_piece(messages, vehicles, receiver, sender, piece, time)
@@ -187,7 +188,7 @@ def _known_pieces(messages: Floats, time: Floats, vehicles: int, receiver: int, 
 
 
 class Told(NamedTuple):
-    """Newest state of every vehicle that one vehicle has received by message or by sight.
+    """For one receiving vehicle: the newest state of every vehicle, received by message or by sight.
 
     Arrays are [n, N] unless stated otherwise, with column j for vehicle j. The arrays are views of the message columns.
     """
@@ -214,7 +215,7 @@ class Messages(NamedTuple):
 
     @staticmethod
     def ring_length(delay_s: float, time_step_s: float) -> int:
-        """Return the number of samples that the ring buffer must store: those of one message delay, and three more.
+        """Return how many samples the ring buffer must store: the samples of one message delay, and three more.
 
         ``delay_s``: time from sending a message to its use (s); ``time_step_s``: time between two samples (s).
         """
@@ -263,12 +264,12 @@ class Messages(NamedTuple):
 
     @property
     def periodic(self) -> Bools:
-        """Whether vehicles of each world send messages periodically, so that received information can be old, [n]."""
+        """For each world, whether its vehicles send periodic messages, so that received information can be old, [n]."""
         return np.asarray((self.columns[:, CHANNEL.PERIOD : CHANNEL.PERIOD + 1] > 0.0).any(axis=1))
 
     @property
     def contents(self) -> Bools:
-        """Whether messages of each vehicle contain each quantity of ``PIECES``, [n, N, CONTENTS]."""
+        """For each vehicle, whether its messages contain each quantity of ``PIECES``, [n, N, CONTENTS]."""
         usual = np.array([piece in USUAL_PIECES for piece in PIECES])
         n, N = len(self.columns), self.vehicles
         contents = np.broadcast_to(usual, (n, N, CONTENTS)).copy()
@@ -278,27 +279,27 @@ class Messages(NamedTuple):
 
     @property
     def says_contents(self) -> bool:
-        """Whether the message columns contain the group *contents*; all worlds of a batch have it, or none."""
+        """Whether message columns contain the group *contents*; either all worlds of a batch have it, or none has."""
         marked: bool = self.columns.shape[1] > 0 and bool((self.links[:, 0, 0, LINK.NUMBER] == 1.0).any())
         return marked
 
     def lacks(self, sender: int, pieces: Sequence[Piece] = USUAL_PIECES) -> tuple[Piece, ...]:
-        """Return the quantities among ``pieces`` that messages of ``sender`` do not contain in at least one world."""
+        """Return the quantities in ``pieces`` that are missing from messages of ``sender`` in one world or more."""
         always: Bools = np.logical_and.reduce(self.contents[:, sender])
         return tuple(piece for piece in pieces if not always[PIECES.index(piece)])
 
     def withhold_from(self, vehicle: int) -> Bools:
-        """Return whether messages of any vehicle but ``vehicle`` lack a quantity of ``USUAL_PIECES``, [n]."""
+        """Return, for each world [n], whether messages of a vehicle but ``vehicle`` lack any of ``USUAL_PIECES``."""
         others = np.delete(self.contents, vehicle, axis=1)[:, :, : len(USUAL_PIECES)]
         return np.asarray(~others.all(axis=(1, 2)))
 
     def seen_from_s(self, vehicle: int, other: int) -> Floats:
-        """Return the time from which ``vehicle`` measures ``other``, [n] s; infinite: never, or without messages."""
+        """Return the time from which ``vehicle`` measures ``other``, [n] s; infinite if never or without messages."""
         seen = self.links[:, vehicle, other, LINK.SEEN_FROM] if self.columns.shape[1] else None
         return np.full(len(self.columns), np.inf) if seen is None else seen
 
     def known_pieces(self, vehicle: int, time_s: Floats) -> Bools:
-        """Return whether ``vehicle`` knows each of ``PIECES`` of each vehicle at ``time_s`` [n], [n, N, CONTENTS].
+        """Return a mask [n, N, CONTENTS]: whether ``vehicle`` knows ``PIECES[c]`` of vehicle j at ``time_s`` [n].
 
         The result is valid for a vehicle whose first message has arrived by ``time_s``, and for a vehicle in sight.
         """
@@ -318,7 +319,7 @@ class Messages(NamedTuple):
     def with_intents(self, intents_mps2: Floats) -> Floats:
         """Return a copy of the message columns with the present intents ``intents_mps2`` [n, N].
 
-        If the columns have no group *intents*, the function returns the columns themselves.
+        If the columns have no group *intents*, the function returns the message columns themselves, not a copy.
         """
         if not self.says_contents:
             return self.columns
@@ -327,7 +328,7 @@ class Messages(NamedTuple):
         return columns
 
     def newest_told(self, vehicle: int) -> Told:
-        """Return the newest state of every vehicle that ``vehicle`` (index from 0) has received.
+        """Return, for every vehicle, the newest state that ``vehicle`` (index from 0) has received.
 
         All worlds must have message columns.
         """
@@ -340,8 +341,8 @@ class Messages(NamedTuple):
         """Return the age at ``time_s`` [n] of the newest state that vehicle i received from vehicle j, [n, N, N] s.
 
         The age is the time since the state was sampled. The age is infinite if vehicle i has received nothing from
-        vehicle j yet. The age is 0 in a world without periodic messages, because vehicles know the present state there.
-        Vehicle i may use the state from the time ``Vehicles.known_from_s`` on.
+        vehicle j yet. In a world without periodic messages the age is 0, because vehicles know the present state. From
+        the time ``Vehicles.known_from_s`` on, vehicle i may use the received state.
         """
         age, periodic = np.zeros((len(time_s), self.vehicles, self.vehicles)), self.periodic
         if periodic.any():
@@ -364,8 +365,8 @@ def refuse_untold(
     """Raise ``InvalidInput`` if messages lack a quantity that the agent ``who`` needs to control ``vehicles``.
 
     The agent needs messages of every vehicle in ``senders`` (None: of all vehicles), also of vehicles that it controls
-    itself. A single controlled vehicle needs no message of its own. ``needs``: the quantities that these messages must
-    contain. ``who``: name of the agent in the error message.
+    itself. An agent that controls a single vehicle needs no message of this vehicle. ``needs``: the quantities that
+    these messages must contain. ``who``: name of the agent in the error message.
     """
     messages = Messages.of(worlds)
     for sender in (range(worlds.N) if senders is None else senders) if messages.says_contents else ():
@@ -481,7 +482,7 @@ def _choose(params: Floats, column: Columns, wanted: Floats, time: float) -> Non
     """Write the intents of all vehicles at ``time`` (s): the commands ``wanted`` that were chosen at the last decision.
 
     If the V2X channel extends a vehicle's latency, the vehicle does not know of the emergency until the latency has
-    elapsed. The intent of this vehicle is 0 until its latency has elapsed.
+    elapsed. Until the latency has elapsed, the intent of this vehicle is 0.
     """
     messages, N = params[column.messages :], column.vehicles
     if not has_contents(messages, N):
@@ -499,14 +500,14 @@ def _move(
 ) -> bool:  # fmt: skip
     """Advance one world, and the places of its vehicles, to the time ``end``; return whether this succeeded.
 
-    If the physics cannot advance the world, state and places are unchanged.
+    If the physics cannot advance the world, its state and the places of its vehicles are unchanged.
 
     Args:
         state: state of the world, [S], in the layout of ``physics.columns``; updated.
         params: parameters of the world, in the layout of ``physics.columns``; the places of the vehicles are updated.
         column: first column of each group of quantities in ``state`` and ``params``.
         wanted: commands of the vehicles, [N] m/s2.
-        end: time to advance to, s.
+        end: time to which the world is advanced, s.
         pieces: start (s) and command (m/s2) of the K intervals of a fixed sequence of commands, [N, 2 K]; see
             ``Vehicles.pieces``.
         table: working memory in the layout of ``physics.rows``, with N + 1 columns; overwritten.

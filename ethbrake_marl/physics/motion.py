@@ -91,10 +91,11 @@ def drift(gap: float, closing: float, pressing: float, duration: float) -> float
 
 @compiled
 def speed_event(speed: float, acceleration: float, command: float, limit: float) -> tuple[float, float]:
-    """Return the time (s) until a vehicle next comes to rest or reaches its speed limit, and its speed then (m/s).
+    """Return the time (s) until a vehicle next comes to rest or reaches its speed limit, and its speed at this time
+    (m/s).
 
-    At rest the brakes hold the vehicle. The speed limit matters only if the command drives the vehicle. If the vehicle
-    neither comes to rest nor reaches the limit, the result is ``(inf, 0)``.
+    When the vehicle comes to rest, its brakes hold it there. The speed limit matters only if the command drives the
+    vehicle. If the vehicle neither comes to rest nor reaches the limit, the result is ``(inf, 0)``.
 
     Args:
         speed: present speed, m/s.
@@ -119,10 +120,11 @@ def speed_event(speed: float, acceleration: float, command: float, limit: float)
 
 @compiled
 def force_range(speed: float, command: float, limit: float) -> tuple[float, float]:
-    """Return a vehicle's own acceleration for motion forward, and its own acceleration for motion backward (m/s2).
+    """Return the acceleration (m/s2) by a vehicle's own brakes or engine for motion forward, and for motion backward.
 
-    The two accelerations differ in two cases. The brakes of a vehicle at rest act against motion in either direction. A
-    driving vehicle at its speed limit uses only as much force as keeps it at this speed.
+    The acceleration for motion forward differs from the acceleration for motion backward in two cases. The brakes of a
+    vehicle at rest act against motion in either direction. A driving vehicle at its speed limit uses only as much force
+    as keeps it at this speed.
 
     Args:
         speed: present speed, m/s.
@@ -164,8 +166,8 @@ def solo_motion(
 ) -> tuple[float, float, float]:
     """Move a vehicle without contact; return its final speed (m/s), distance travelled (m) and acceleration (m/s2).
 
-    The vehicle coasts until ``onset``. It then brakes until it is at rest, or drives up to the speed limit. If the
-    acceleration changes during the motion, the returned acceleration is NaN.
+    The vehicle coasts until ``onset``. From ``onset`` on, the vehicle brakes until it is at rest, or drives up to the
+    speed limit. If the acceleration changes during the motion, the returned acceleration is NaN.
 
     Args:
         speed: present speed, m/s, at least 0.
@@ -200,8 +202,8 @@ def solo_motion(
 def stopping_distance(speed: float, latency_left: float, capacity: float) -> float:
     """Return the distance (m) until a vehicle is at rest: ``v tau`` in the remaining latency plus ``v^2 / (2 a)``.
 
-    The vehicle coasts during the remaining latency and then brakes fully. If it does not move forward, the distance is
-    0.
+    The vehicle coasts during the remaining latency and then brakes fully. If the vehicle does not move forward, the
+    distance is 0.
 
     Args:
         speed: present speed v, m/s.

@@ -7,15 +7,15 @@ With the sampling period h, one step of a vehicle with command u, from sample n 
 
 where f(n) is the vehicle's speed after the impacts of sample n. If at a sample the gap of a pair is at most 0 and its
 closing speed is above 0, the speeds of the pair change by the paper's eq. (13). In the paper, f3 is the impact of
-Vehicles 2 and 3, and f1 the impact of Vehicles 1 and 2. For Vehicle 2, f is f1 applied after f3: first the impact with
-Vehicle 3, then the impact with Vehicle 1, with the speed that the first impact has changed. Each impact changes the
-speeds of both its vehicles.
+Vehicles 2 and 3, and f1 the impact of Vehicles 1 and 2. For Vehicle 2, f is f1 applied after f3: first comes the impact
+with Vehicle 3, then the impact with Vehicle 1, which uses the speed that Vehicle 2 has after the first impact. Each
+impact changes the speeds of both its vehicles.
 
-The paper leaves some points open. This map resolves them as follows:
+The paper leaves some points open. This map resolves these points as follows:
 
 * f1 uses the state that f3 has changed. The closing speed of the front impact, and its harm (the square of this closing
-  speed), therefore depend on f3. The paper's formula of J_harm uses the speeds before both impacts. This makes a
-  difference only if both pairs have an impact at the same sample.
+  speed), therefore depend on f3. The paper's formula of J_harm uses the speeds before both impacts. The two formulas
+  differ only if both pairs have an impact at the same sample.
 * The paper's formulas of f1 and f3 also change the speeds of overlapping vehicles that are separating, and would pull
   these vehicles together again. The paper's text below eq. (13) requires a positive relative velocity (closing speed).
   This map therefore changes speeds and counts harm only if the relative velocity is positive.
@@ -80,10 +80,11 @@ def exchange_at_sample(
     k: int, gaps: Floats, speeds: Floats, mass: Floats, restitution: float, hit: Bools, first_harm: Floats,
     total_harm: Floats, count: Ints,
 ) -> None:  # fmt: skip
-    """Apply the impacts of world ``k`` at a sample, from the rear pair to the front pair, and add their harm.
+    """Apply the impacts of world ``k`` at a sample, from the rear pair to the front pair; add the harm of these
+    impacts.
 
-    As in ``advance``, the harm of an impact is the squared closing speed just before it. Contact with a closing speed
-    of at most ``TOUCH_SPEED_MPS`` is a touch, which does no harm.
+    As in ``advance``, the harm of an impact is the squared closing speed just before the impact. Contact with a closing
+    speed of at most ``TOUCH_SPEED_MPS`` is a touch, which does no harm.
 
     Args:
         k: index of the world in all arrays.
@@ -119,8 +120,9 @@ def held_motion(speed: float, command: float, limit: float, step: float) -> tupl
     """Return speed (m/s) and distance (m) after a step of constant command: ``v + h u`` and ``h v + h^2 u / 2``.
 
     The command u is first limited so that the speed does not go beyond 0 or the speed limit within the step. The
-    distance is computed as h times the mean of the speeds at the start and the end of the step. For constant u this is
-    equal to the formula above. Brakes act against the motion, so they also bring a negative speed back to 0.
+    distance is computed as h times the mean of the speeds at the start and the end of the step. For constant u this
+    distance is equal to ``h v + h^2 u / 2``. Brakes act against the motion, so they also bring a negative speed back to
+    0.
 
     Args:
         speed: speed v at the start, m/s; may be negative after an impact.
@@ -225,10 +227,10 @@ def advance_sampled(
     """Advance ``worlds`` by the paper's fixed-step map under constant commands; return new worlds and impacts.
 
     The first sample is at the time at which the latency of Vehicle 2 has elapsed; samples are ``step_s`` apart. A world
-    ends at the first of its samples at or after ``until_s``, or at ``until_s`` itself if this is before the first
-    sample. The returned state is the paper's s(n), the state before the impacts of the last sample. The next call
-    applies these impacts, so the result can be passed to this function again. ``Impacts.rows`` is None. The result of a
-    world does not depend on the other worlds.
+    ends at the first of its samples at or after ``until_s``, or at ``until_s`` itself if ``until_s`` is before the
+    first sample. The returned state is the paper's s(n), the state before the impacts of the last sample. The next call
+    applies the impacts of the last sample, so the result can be passed to this function again. ``Impacts.rows`` is
+    None. The result of a world does not depend on the other worlds.
 
     Gaps of the result may be negative. Advance worlds with negative gaps with this function and not with ``advance``.
 

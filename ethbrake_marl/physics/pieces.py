@@ -1,7 +1,8 @@
 """Braking profiles: after its latency, a vehicle follows a fixed sequence of commands (it *brakes in pieces*).
 
-A *piece* is a time interval in which the command of such a vehicle is constant. The functions for brakes that build up
-(``physics.build_up``) advance worlds with such vehicles, even if all brakes act at once.
+A *piece* is a time interval in which the command of a vehicle with a braking profile is constant. A world in which a
+vehicle follows a braking profile is advanced by the functions for brakes that build up (``physics.build_up``), even if
+all brakes act at once.
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ from ethbrake_marl.physics.state import Floats
 def begin_piece(table: Floats, i: int, now: float) -> None:
     """Set the command of vehicle ``i`` to the command of its piece (interval of constant command) at the time ``now``.
 
-    The function also writes the time at which the vehicle's next piece begins into the table (row NEXT_PIECE). Both
-    times are in seconds from the start of the segment. ``table``: one world in the layout of ``physics.rows``.
+    The function also writes the time at which the vehicle's next piece begins into the table (row NEXT_PIECE). ``now``
+    and the time that the function writes are in seconds from the start of the segment. ``table``: one world in the
+    layout of ``physics.rows``.
     """
     count = (table.shape[0] - ROW.PIECES) // 2
     table[ROW.NEXT_PIECE, i] = math.inf
@@ -33,7 +35,7 @@ def begin_piece(table: Floats, i: int, now: float) -> None:
 
 @compiled(bare=True)
 def pieces_to_come(table: Floats) -> bool:
-    """Return whether some vehicle has a piece (interval of constant command) that has not begun yet.
+    """Return whether at least one vehicle has a piece (interval of constant command) that has not begun yet.
 
     ``table``: one world in the layout of ``physics.rows``.
     """
@@ -48,7 +50,8 @@ def pieces_to_come(table: Floats) -> bool:
 def force_at(table: Floats, i: int, command: float, latency_s: float, time_s: float) -> float:
     """Return the force (m/s2) of a vehicle at the end of a segment.
 
-    The force is the acceleration by brakes or engine. Until the latency has elapsed, 0 replaces the command.
+    The force is the acceleration by brakes or engine. Until the latency has elapsed, the function uses 0 instead of
+    ``command``.
 
     Args:
         table: the world at the end of the segment, in the layout of ``physics.rows``.
@@ -69,8 +72,8 @@ def force_at(table: Floats, i: int, command: float, latency_s: float, time_s: fl
 def force_now(force: float, wanted: float, brake_rate: float, release_rate: float) -> float:
     """Return a vehicle's force (m/s2) just after a command takes effect.
 
-    The force is the acceleration by brakes or engine. If its rate of change towards the command is infinite, the result
-    is the command. If this rate is finite, the force is unchanged.
+    The force is the acceleration by brakes or engine. If the rate at which the force moves towards the command is
+    infinite, the result is the command. If this rate is finite, the result is ``force``.
 
     Args:
         force: force just before the command takes effect, m/s2.

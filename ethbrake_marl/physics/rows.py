@@ -104,7 +104,7 @@ class _Flags(NamedTuple):
         """Return the error that lists every world whose status is not DONE.
 
         Args:
-            status: status of each world, [n].
+            status: status code of each world (a constant of ``FLAG``), [n].
             from_s: start of each world's segment, [n] s, for the error message.
             until_s: end of each world's segment, [n] s, for the error message.
 
@@ -142,7 +142,7 @@ LISTED = _Listed()
 
 @compiled(bare=True)
 def builds_up(table: Floats) -> bool:
-    """Return whether the brakes of some vehicle build up at a finite rate or follow a fixed sequence of commands.
+    """Return whether brakes build up at a finite rate, or a vehicle follows a fixed sequence of commands.
 
     ``table``: one world in the layout of ``_Rows``.
     """
@@ -164,7 +164,8 @@ def place_rates(table: Floats, brake_rate: Floats, release_rate: Floats, pieces:
     """Write brake rates, release rates and sequences of commands of one world's vehicles into its table.
 
     If all rates are infinite and no vehicle follows a fixed sequence of commands, the function sets the entry BUILDS_UP
-    to 0, and the rows of forces are not used. In all other cases, the function sets BUILDS_UP to 1.
+    to 0, and the rows of forces are not used. If a rate is finite or a vehicle follows a fixed sequence of commands,
+    the function sets BUILDS_UP to 1.
 
     Args:
         table: table to fill, [rows_for(2 K), N or N + 1]; with N + 1 columns, column 0 is an obstacle.

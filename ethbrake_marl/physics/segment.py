@@ -35,8 +35,8 @@ def advance_table(
         duration: length of the segment, s.
         start_s: absolute time at the start of the segment, s; used to write the times of impacts into ``rows``.
         world: index of the world, written into ``rows``.
-        rows: array to which the impacts are written, [capacity, LISTED.WIDTH]; if it is full, further impacts are only
-            counted.
+        rows: array to which the impacts are written, [capacity, LISTED.WIDTH]; if the array is full, further impacts
+            are only counted.
         recorded: number of impacts that were recorded before this segment.
 
     """
@@ -49,7 +49,7 @@ def advance_table(
 def advance_on_cubics(
     table: Floats, restitution: float, duration: float, start_s: float, world: int, rows: Floats, recorded: int
 ) -> tuple[int, int]:
-    """Do the work of ``advance_table`` for brakes that build up or follow a fixed sequence of commands.
+    """Do the work of ``advance_table`` if brakes build up or a vehicle follows a fixed sequence of commands.
 
     The arguments and the result are the same as in ``advance_table``.
     """
@@ -90,14 +90,14 @@ def move_apart(table: Floats, duration: float, building: bool) -> bool:
     """Move a world to the end of the segment and return True, or return False if two vehicles may touch.
 
     If the result is False, the world has not moved. If both vehicles of a pair have constant accelerations, the time of
-    their contact is computed exactly. In other cases the function uses a bound. Without contact, the speed of a vehicle
-    only rises or only falls within a segment of length T. A gap therefore shrinks by at most
-    ``(max rear speed - min front speed) T``.
+    their contact is computed exactly. If the acceleration of one of the vehicles changes, the function uses an upper
+    bound of the decrease of the gap. Without contact, the speed of a vehicle only rises or only falls within a segment
+    of length T. A gap therefore shrinks by at most ``(max rear speed - min front speed) T``.
 
     Args:
         table: the world in the layout of ``physics.rows``.
         duration: length T of the segment, s.
-        building: result of ``builds_up``: whether brakes build up or follow a fixed sequence of commands.
+        building: result of ``builds_up``: whether brakes build up or a vehicle follows a fixed sequence of commands.
 
     """
     if building:
@@ -135,7 +135,7 @@ def start_events(table: Floats, building: bool) -> None:
 
     Args:
         table: the world in the layout of ``physics.rows``.
-        building: result of ``builds_up``: whether brakes build up or follow a fixed sequence of commands.
+        building: result of ``builds_up``: whether brakes build up or a vehicle follows a fixed sequence of commands.
 
     """
     for i in range(table.shape[1]):
@@ -157,7 +157,7 @@ def to_next_impact(table: Floats, restitution: float, now: float, duration: floa
         restitution: coefficient of restitution of every impact.
         now: present time, counted from the start of the segment, s.
         duration: length of the segment, s.
-        building: result of ``builds_up``: whether brakes build up or follow a fixed sequence of commands.
+        building: result of ``builds_up``: whether brakes build up or a vehicle follows a fixed sequence of commands.
 
     """
     for _ in range(BOUND.MOST_EVENTS):
@@ -182,7 +182,7 @@ def to_next_event(table: Floats, now: float, duration: float, building: bool) ->
         table: the world in the layout of ``physics.rows``; it is advanced.
         now: present time, counted from the start of the segment, s.
         duration: length of the segment, s.
-        building: result of ``builds_up``: whether brakes build up or follow a fixed sequence of commands.
+        building: result of ``builds_up``: whether brakes build up or a vehicle follows a fixed sequence of commands.
 
     """
     if building and not built_up(table):
@@ -202,14 +202,13 @@ def to_next_event(table: Floats, now: float, duration: float, building: bool) ->
 def begin_commands(table: Floats, now: float, passed: float, building: bool) -> None:
     """Put into effect the commands that begin between ``now`` and ``now + passed``.
 
-    If a vehicle follows a fixed sequence of commands, and its next command begins in this interval, the function puts
-    this command into effect.
+    If a vehicle follows a fixed sequence of commands, this includes the next command of the sequence.
 
     Args:
         table: the world in the layout of ``physics.rows``.
         now: start of the interval, counted from the start of the segment, s.
         passed: length of the interval, s.
-        building: result of ``builds_up``: whether brakes build up or follow a fixed sequence of commands.
+        building: result of ``builds_up``: whether brakes build up or a vehicle follows a fixed sequence of commands.
 
     """
     for i in range(table.shape[1]):

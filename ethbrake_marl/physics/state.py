@@ -43,8 +43,8 @@ _ON_ROADS = ("braking_capacity_mps2", "driving_capacity_mps2")  # limited by fri
 def as_road_allows(quantities: Mapping[str, Floats], friction: Floats) -> dict[str, Floats]:
     """Return a copy of ``quantities`` with braking and driving capacities limited to ``friction * GRAVITY_MPS2``.
 
-    ``quantities`` maps field names such as ``braking_capacity_mps2`` to arrays; ``friction`` broadcasts to their shape.
-    Entries other than capacities are unchanged.
+    ``quantities`` maps field names such as ``braking_capacity_mps2`` to arrays; ``friction`` is broadcast to the shape
+    of these arrays. Entries other than capacities are unchanged.
     """
     most = friction * GRAVITY_MPS2
     return {key: np.minimum(value, most) if key in _ON_ROADS else value for key, value in quantities.items()}
@@ -127,19 +127,19 @@ class Vehicles:
 
     @property
     def build_up(self) -> Bools:
-        """Whether some vehicle of each world has a finite brake or release rate, or follows a braking profile, [n]."""
+        """For each world, whether a vehicle has a finite brake or release rate, or follows a braking profile, [n]."""
         rates = np.minimum(self.brake_rate_mps3, self.release_rate_mps3)
         return np.asarray(np.isfinite(rates).any(axis=1) | self.in_pieces)
 
     @property
     def in_pieces(self) -> Bools:
-        """Whether some vehicle of each world follows a braking profile, that is, a fixed sequence of commands, [n]."""
+        """For each world, whether one of its vehicles follows a braking profile (a fixed sequence of commands), [n]."""
         return np.asarray(np.isfinite(self.pieces).any(axis=(1, 2)))
 
     def piece_commands(self, command_mps2: Floats, time_s: Floats) -> Floats:
-        """Return the commands of all vehicles at ``time_s``, [n, N] m/s2, with the commands of their braking profiles.
+        """Return the commands of all vehicles at ``time_s``, [n, N] m/s2, including commands from braking profiles.
 
-        A vehicle that follows a braking profile (a fixed sequence of commands) gets the profile's command of this time.
+        A vehicle with a braking profile (a fixed sequence of commands) has the command of its profile at ``time_s``.
 
         Args:
             command_mps2: commands of all vehicles, [n, N] m/s2; used for vehicles without a braking profile.
@@ -229,7 +229,8 @@ class Worlds:
     def _each(self, change: Callable[..., NDArray[Any]], *others: Worlds) -> Worlds:
         """Return new worlds with ``change`` applied to each field: ``change(field of self, field of others[0], ...)``.
 
-        ``change`` is called with one array per batch of worlds. It returns one array, with selected or joined rows.
+        ``change`` is called with one array per batch of worlds. ``change`` returns one array, with selected or joined
+        rows.
         """
         parts = (self, *others)
         columns = (change(*(getattr(w, name) for w in parts)) for name in _OF_WORLDS)
@@ -246,7 +247,7 @@ class Worlds:
 
     @staticmethod
     def concatenate(parts: Sequence[Worlds]) -> Worlds:
-        """Join the batches ``parts`` into one batch, in this order; all must have the same number of vehicles."""
+        """Join the batches ``parts`` into one batch, in this order; all must have the same number N of vehicles."""
         parts = _alike(parts)
         return parts[0]._each(lambda *columns: np.concatenate(columns), *parts[1:])
 
@@ -327,7 +328,7 @@ class Worlds:
         return value
 
     def play_pieces(self, pieces: Mapping[int, Sequence[tuple[float, float]]]) -> Worlds:
-        """Return these worlds with the vehicles in ``pieces`` following a braking profile.
+        """Return these worlds with braking profiles for the vehicles in ``pieces``.
 
         A braking profile is a fixed sequence of commands. ``pieces`` maps a vehicle (index from 0) to a sequence of
         pairs (start, deceleration), one for each command. The start is in s after the vehicle's latency; the first
@@ -344,10 +345,10 @@ class Worlds:
         return replace(self, vehicles=replace(self.vehicles, pieces=commands.reshape(self.n, self.N, 2 * most)))
 
     def refuse_build_up(self, who: str) -> None:
-        """Raise ``InvalidInput`` if some vehicle has a finite brake or release rate, or follows a braking profile.
+        """Raise ``InvalidInput`` if any vehicle has a finite brake or release rate, or follows a braking profile.
 
-        Functions whose results are not exact in such worlds call this check. ``who``: name of the calling function in
-        the error message.
+        A function calls this check if its results are not exact for finite rates or braking profiles. ``who``: name of
+        the calling function in the error message.
         """
         slow = self.vehicles.build_up
         if self.vehicles.in_pieces.any():
@@ -362,7 +363,7 @@ class Worlds:
             )
 
     def first_decision_s(self, deciders: Sequence[int]) -> Floats:
-        """Return the time of the first decision, [n] s: the least latency of ``deciders``, or ``time_s`` if later.
+        """Return the time of the first decision, [n] s: the least latency of ``deciders``, but at least ``time_s``.
 
         ``deciders`` are the indices (from 0) of the vehicles that choose their commands. If ``deciders`` is empty, the
         result is ``time_s``.
@@ -377,7 +378,7 @@ class Worlds:
 
     @property
     def obstacle_ahead(self) -> Bools:
-        """Whether each world has an obstacle ahead of Vehicle 1, [n]."""
+        """For each world, whether it has an obstacle ahead of Vehicle 1, [n]."""
         return np.isfinite(self.obstacle_gap_m)
 
     def with_obstacle(self) -> Worlds:
@@ -415,13 +416,13 @@ class Worlds:
         )
 
     def with_post_ahead(self, duration_s: Floats) -> Worlds:
-        """Return these worlds with an obstacle added where there is none, out of reach for ``duration_s`` [n].
+        """Return these worlds; a world without an obstacle gets one that no vehicle reaches within ``duration_s`` [n].
 
         The change of the gap to an added obstacle is the distance that Vehicle 1 travels, which worlds do not store. An
-        added obstacle changes no motion, because its gap is larger than ``T sqrt(2 E / m_1)``. This is the distance
-        that Vehicle 1, of mass m_1, would travel in the duration T if it had all the energy E that the line can have
-        within T. Impacts and brakes only remove energy. A vehicle of mass m that drives at the speed v with the
-        acceleration a adds at most the energy ``m a v`` per second, and only up to the speed limit.
+        added obstacle changes no motion, because its gap is larger than ``T sqrt(2 E / m_1)``. The distance
+        ``T sqrt(2 E / m_1)`` is what Vehicle 1, of mass m_1, would travel in the time T if it had all the energy E that
+        the line can have within T. Impacts and brakes only remove energy. A vehicle of mass m that drives at the speed
+        v with the acceleration a adds at most the energy ``m a v`` per second, and only up to the speed limit.
         """
         vehicles = self.vehicles
         driving = vehicles.driving_capacity_mps2 * vehicles.speed_limit_mps * duration_s[:, np.newaxis]
@@ -433,8 +434,8 @@ class Worlds:
 def _alike(parts: Sequence[Worlds]) -> Sequence[Worlds]:
     """Return the batches ``parts`` with arrays of equal width, so that they can be joined.
 
-    In all batches the array ``Vehicles.pieces`` (fixed sequences of commands) gets the width of the widest. If some
-    batches model the friction of the road, the other batches get infinite friction.
+    In all batches, the array ``Vehicles.pieces`` (fixed sequences of commands) gets the width of the widest of these
+    arrays. If some batches model the friction of the road, the other batches get infinite friction.
     """
     most = max(part.vehicles.pieces.shape[2] for part in parts)
     if any(part.vehicles.pieces.shape[2] < most for part in parts):
@@ -449,8 +450,8 @@ def _alike(parts: Sequence[Worlds]) -> Sequence[Worlds]:
 def _padded(pieces: Floats, most: int) -> Floats:
     """Return ``pieces`` [n, N, 2 K] with infinite entries added, so that the result is [n, N, most].
 
-    A piece is a time interval of constant command; its two entries are the start and the command. Infinite entries mean
-    that there is no such piece. ``most`` is even.
+    A piece is a time interval of constant command; its two entries are the start and the command. Infinite entries
+    stand in the places of pieces that a vehicle does not have. ``most`` is even.
     """
     n, N, width = pieces.shape
     halves = pieces.reshape(n, N, 2, width // 2)
@@ -469,7 +470,7 @@ def _unwritable(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def _span(values: Floats) -> str:
-    """Format the smallest and the largest value; one number if they are equal, ``none`` if there are no values."""
+    """Return a text with the smallest and the largest value, one number if these are equal, ``none`` without values."""
     if not values.size:
         return "none"
     low, high = float(values.min()), float(values.max())
@@ -479,9 +480,9 @@ def _span(values: Floats) -> str:
 def _combined(change: Callable[..., NDArray[Any]], *parts: Vehicles) -> Vehicles:
     """Return new vehicles with ``change`` applied to each field: ``change(field of parts[0], field of parts[1], ...)``.
 
-    ``change`` is called with one array per entry of ``parts``. It returns one array, with selected or joined rows. If
-    no entry of ``parts`` has a V2X channel, ``latency_s``, ``own_latency_s`` and ``known_from_s`` of the result share
-    memory, as in ``at_once``.
+    ``change`` is called with one array per entry of ``parts``. ``change`` returns one array, with selected or joined
+    rows. If no entry of ``parts`` has a V2X channel, ``latency_s``, ``own_latency_s`` and ``known_from_s`` of the
+    result share memory, as in ``at_once``.
     """
     at_once = all(part._is_view for part in parts)
     columns = [
@@ -578,7 +579,8 @@ def make_worlds(
         harm_weight: weight of each vehicle's harm in the objective ``preference``, at least 0, broadcast to [n, N]; in
             each world the weight of one vehicle or more must be at least ``LEAST_WEIGHT``.
 
-    Raises ``InvalidInput``, with the field, its first invalid entry and the valid range, for an invalid value.
+    Raises ``InvalidInput`` for an invalid value; the error names the field, its first invalid entry and the valid
+    range.
 
     """
     speeds = np.atleast_2d(checked_numbers("speeds_mps", speeds_mps))

@@ -24,7 +24,7 @@ def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) ->
     """Write the state at the start of each interval of constant jerk into ``rows``; return the number of intervals.
 
     The state consists of time, gaps, speeds, accelerations and jerks. If ``rows`` is full, further intervals are only
-    counted. If a contact was missed, the returned number is negative.
+    counted. If a contact was missed, the returned number of intervals is negative.
 
     Args:
         table: one world in the layout of ``physics.rows``; updated.
