@@ -2,7 +2,7 @@
 
 Each of n worlds is a row of the arrays ``state`` and ``params``, whose columns ``physics.columns`` defines. The array
 ``clock`` [n, 4] contains, for each world, the time of the first decision, the number of steps taken, the number of the
-last step, and whether the episode has ended.
+step that ends at the horizon, and whether the episode has ended.
 """
 
 from __future__ import annotations
@@ -121,11 +121,11 @@ class Step(NamedTuple):
 
 @compiled(apart=True, bare=True)
 def place_row(table: Floats, state: Floats, params: Floats, k: int, pieces: Floats) -> None:
-    """Fill in those quantities in the ``table`` of world ``k`` that matter only if brakes take time to build up.
+    """Write into ``table`` the quantities of world ``k`` that are needed only if brakes take time to build up.
 
     The present accelerations come from row ``k`` of ``state``, and the rates of build-up from row ``k`` of ``params``.
-    ``pieces`` [N, 2 K] are braking profiles with K intervals of constant command. If this code were inside the loop of
-    ``step_worlds``, it would slow down worlds without build-up.
+    ``pieces`` [N, 2 K] are braking profiles with K intervals of constant command. Inside the loop of ``step_worlds``,
+    this code would slow down the simulation of worlds whose brakes act at once.
     """
     column, N = columns(state), pieces.shape[0]
     command, brake_rate, release_rate = column.command, column.brake_rate, column.release_rate
@@ -148,8 +148,8 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
     Args:
         state: motion and harm of the worlds, [n, S]; changed in place.
         params: parameters of the vehicles, one row per world, in the layout of ``physics.columns``.
-        clock: first decision, steps taken, last step and end of each episode (see the module docstring),
-            [n, CLOCK_WIDTH]; changed in place.
+        clock: times and numbers of the steps of each episode (see the module docstring), [n, CLOCK_WIDTH]; changed in
+            place.
         actions: actions of the learners, [n, L].
         learners: indices of the learners (0 = front), [L].
         settings: five numbers with the indices ``TIME_STEP``, ``HORIZON``, ``HARM_WEIGHT``, ``HARM_IS_TOTAL`` and
@@ -162,8 +162,8 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
         outcome: array that receives the harm of the step in each world and whether the episode has ended,
             [OUTCOME_ROWS, n].
 
-    Returns ``(-1, FLAG.DONE)`` if all worlds were advanced. If not all were advanced, returns the row number of a
-    world that was not advanced, and ``BAD_ACTION`` or the status code of the physics.
+    Returns ``(-1, FLAG.DONE)`` if all worlds were advanced. If some world was not advanced, returns the row number of
+    such a world, and ``BAD_ACTION`` or the status code of the physics.
 
     """
     n, N = wanted.shape
@@ -281,16 +281,17 @@ class Rules(NamedTuple):
 
         Args:
             worlds: n packed worlds, one row per world; changed in place.
-            clock: first decision, steps taken, last step and end of each episode (see the module docstring),
-                [n, CLOCK_WIDTH]; changed in place.
+            clock: times and numbers of the steps of each episode (see the module docstring), [n, CLOCK_WIDTH]; changed
+                in place.
             actions: actions of the learners in [-1, 1], [n, L].
             wanted: commands of all vehicles, [n, N] m/s2; this function overwrites the learners' commands.
             reward: array that receives the reward of each vehicle, [n, N].
             outcome: array that receives the harm of the step in each world and whether the episode has ended,
                 [OUTCOME_ROWS, n].
 
-        The status code is ``FLAG.DONE`` if all worlds were advanced. It is ``BAD_ACTION`` if an action is outside
-        [-1, 1]; no world was moved then. Any other code names a check of the physics that failed in some world.
+        The status code is ``FLAG.DONE`` if all worlds were advanced. The status code is ``BAD_ACTION`` if an action is
+        outside [-1, 1]; in this case no world was moved. Any other code names a check of the physics that failed in
+        some world.
 
         """
         _, status = step_worlds(

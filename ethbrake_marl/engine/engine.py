@@ -51,8 +51,8 @@ class Watcher(Protocol):
     """Observer that follows an engine's episodes without changing them, for example to record them for a picture.
 
     The engine stores the watcher's memory together with the state of its episodes, and replaces both in a single
-    assignment. If a step fails or is interrupted, neither has changed. For this reason a watcher must never change its
-    memory in place.
+    assignment. If a step fails or is interrupted, memory and state stay as they were before the step. For this reason a
+    watcher must never change its memory in place.
     """
 
     def begun(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
@@ -84,8 +84,8 @@ class Guard(Protocol):
 
     The engine calls the guard in every ``Engine.step``, so no action can bypass the guard. The engine stores the
     guard's memory and answer together with the state of its episodes, and replaces all three in a single assignment. If
-    a step fails or is interrupted, none of the three has changed. For this reason a guard must never change its memory
-    in place.
+    a step fails or is interrupted, memory, answer and state stay as they were before the step. For this reason a guard
+    must never change its memory in place.
     """
 
     def begin(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
@@ -139,7 +139,8 @@ class Now(NamedTuple):
     def kept(self, packed: Packed) -> Packed:
         """Return the packed worlds ``packed``, with the same columns as the worlds of this engine.
 
-        Columns for an obstacle and columns for messages are added if the engine's worlds have them.
+        Columns for an obstacle and columns for messages are added to ``packed`` if the engine's worlds have such
+        columns.
         """
         return packed.widened(self.obstacle, self.by_link)
 
@@ -319,8 +320,8 @@ class Engine:
 
         ``actions`` contains a number in [-1, 1] for each learner: an array [n, L] with columns in the order of
         ``learners``, or a mapping from vehicle index to [n]. If the engine has a guard, the mapping may leave out
-        learners that propose no action. An episode that has ended stands still until ``renew`` or ``reset`` starts a
-        new one. If the guard raises ``UncertifiedStep``, the engine stays as it was before the step.
+        learners that propose no action. The world of an ended episode does not move until ``renew`` or ``reset`` starts
+        a new episode. If the guard raises ``UncertifiedStep``, the engine stays as it was before the step.
         """
         columns = self._columns(actions)
         if self._nobody_refuses_steps:
@@ -346,7 +347,8 @@ class Engine:
     def _columns(self, actions: Actions) -> Floats:
         """Return the learners' actions, which are an array or a mapping as in ``step``, as an array [n, L].
 
-        For a float or integer array of this shape, ``_columns`` does not check whether the actions are in [-1, 1].
+        If ``actions`` is an array [n, L] of floats or integers, ``_columns`` does not check whether they are in [-1,
+        1].
         """
         shape = (self.n, len(self.learners))
         if type(actions) is np.ndarray and actions.shape == shape and actions.dtype.kind in "fiu":
@@ -405,9 +407,9 @@ class Engine:
         return step
 
     def _ask_scripts(self) -> dict[int, Memory]:
-        """Write the commands of the scripts that have a memory and decide once per step to ``state.wanted``.
+        """Write commands into ``state.wanted``: those of the scripts that have a memory and decide once per step.
 
-        Returns the new memories of these scripts: dictionary from vehicle index to memory.
+        Returns the scripts' new memories: dictionary from vehicle index to memory.
         """
         asked: dict[int, Memory] = {}
         own_grid = self._own_grid.scripts
@@ -443,9 +445,9 @@ class Engine:
         return Step(reward, outcome, self.reward, {}), some_failed
 
     def _drive_own_grid(self, columns: Floats) -> Way:
-        """Advance the worlds through the decisions that scripts make within the step, up to the last one.
+        """Advance the worlds to the last of the decisions that scripts make within the step.
 
-        Returns the results of this first part of the step. ``columns`` [n, L] contains the learners' actions.
+        Returns the results of the step up to this last decision. ``columns`` [n, L] contains the learners' actions.
         """
         way = self._own_grid.drive_step(self.state, self._now.rules, self._in_range(columns))
         self._change(memories=way.memories)
@@ -471,7 +473,7 @@ class Engine:
         self._now = self._now._replace(state=state)
 
     def _change(self, **fields: Any) -> None:
-        """Replace the fields of ``self.state`` that ``fields`` names."""
+        """Replace fields of ``self.state`` by the values in ``fields`` (field name -> new value)."""
         self._now = self._now._replace(state=self._now.state._replace(**fields))
 
     def observe(self, vehicle: int) -> Observations:
@@ -533,7 +535,7 @@ class Engine:
     def cut(self, step: Step, most_steps: int) -> None:
         """Truncate the episodes that have taken ``most_steps`` steps or more.
 
-        ``step`` is the result of the last step; it is changed in place to show that these episodes were truncated.
+        ``step`` is the result of the last step; ``cut`` marks the truncated episodes in ``step``, in place.
         """
         cut = (self.steps >= most_steps) & (step.ended | ~self.ended)
         step.outcome[TRUNCATED, cut] = self._now.state.clock[cut, ENDED] = 1.0
@@ -547,7 +549,7 @@ class Engine:
 
         Args:
             before: the worlds at the start of the step.
-            last_mps2: commands of the last segment, [n, N] m/s2.
+            last_mps2: the vehicles' commands in the last segment, [n, N] m/s2.
 
         """
         for motion, wanted in self._now.stops:
@@ -564,7 +566,7 @@ class Engine:
     def remember(self, guarded: Any) -> None:
         """Set the guard's memory to ``guarded``, which ``Guard.begin`` or ``Guard.check`` has returned.
 
-        A caller that moves the worlds by ``place`` instead of ``step`` must set the memory itself.
+        A caller that moves the worlds by ``place`` instead of ``step`` must set the guard's memory by this method.
         """
         self._now = self._now._replace(state=self._now.state._replace(guarded=guarded))
 
@@ -618,8 +620,8 @@ class Engine:
     def _rules_for(self, state: State) -> Rules:
         """Return the settings of the compiled step (``Rules``) for the worlds of ``state``.
 
-        The result differs from the settings for this engine's own worlds if brakes take time to build up only in the
-        worlds of ``state``.
+        The settings take into account whether brakes take time to build up in a world of ``state``, even if brakes act
+        at once in all worlds of this engine.
         """
         builds_up = self.scenario.builds_up or state.packed.builds_up or self.in_pieces
         return self._now.rules._replace(builds_up=builds_up)
@@ -664,10 +666,7 @@ class Engine:
         return self.state.copy()
 
     def first_moments(self, count: int) -> tuple[Worlds, State]:
-        """Return the first ``count`` worlds of the training stream twice: at the alert, and as a ``State``.
-
-        The ``State`` contains the worlds at their first decision.
-        """
+        """Return the first ``count`` worlds of the training stream, and these worlds at their first decision."""
         stream = copy.copy(self._now.stream)
         stream.restart(self.seed)
         alert, new = stream.take(count).alert, self._unwatched(count, self._now)
@@ -748,7 +747,10 @@ class Engine:
 
     @property
     def observation(self) -> ObservationSpec:
-        """Observation that all learners share. Raises ``InvalidInput`` if learners observe different features."""
+        """Observation (list of features) that all learners have in common.
+
+        Raises ``InvalidInput`` if learners observe different features.
+        """
         return common_observation(self.observations, self.scenario)
 
     @property

@@ -23,9 +23,9 @@ class Script(Protocol):
       can include worlds in which no decision is due at this moment; the results for these worlds are ignored.
 
     A memory is None, an array with one row per world, or a tuple or mapping of memories. The caller may select or
-    replace rows of a memory, or use it several times. For this reason a script must never change a memory in place. If
-    a memory is a mapping with the key ``predicted_harm``, its value [n] (m2/s2) is the harm that the agent predicted
-    when the episode began.
+    replace rows of a memory, or pass the same memory to several calls. For this reason a script must never change a
+    memory in place. If a memory is a mapping with the key ``predicted_harm``, its value [n] (m2/s2) is the harm that
+    the agent predicted when the episode began.
 
     For a script with the attribute ``state_free = True``, ``act`` is called only once per episode, right after
     ``begin``, because its command never changes.

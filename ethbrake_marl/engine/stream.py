@@ -34,7 +34,7 @@ class Start(NamedTuple):
 
     @property
     def alert(self) -> Worlds:
-        """The worlds of the new episodes at the alert, t = 0, n of them."""
+        """The n worlds of the new episodes at the alert, t = 0."""
         return self.origin.take(np.arange(self.first, self.first + len(self.clock)))
 
     def part(self, first: int, count: int) -> Start:

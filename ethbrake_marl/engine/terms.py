@@ -23,8 +23,8 @@ class Terms:
     """The reward terms that the compiled step cannot compute; ``add`` adds them to the reward of a step.
 
     An *objective* says whose harm a vehicle's reward includes. If neither the reward nor the scenario has an objective,
-    each vehicle's reward includes the harm of the whole line. *Shaping* adds to the reward the change of a function of
-    the state, the *potential*.
+    each vehicle's reward includes the harm of the whole line. *Shaping* adds to the reward the change of the
+    *potential*, a function of the state.
 
     Args:
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
@@ -87,7 +87,8 @@ class Terms:
             before: harm of each pair before the step; None if there are no objectives.
             impacts_before: impacts of the episodes before the step; None if no reward term is computed from single
                 impacts.
-            worlds: worlds after the step, from which new potentials are computed; None if the reward is not shaped.
+            worlds: worlds after the step, from which the new potentials (see the class) are computed; None if the
+                reward is not shaped.
 
         """
         if before is not None and self.params.harm > 0.0:
@@ -112,7 +113,7 @@ class Terms:
         return state
 
     def _outcome(self, step: Step, state: State, time_step_s: float) -> StepOutcome:
-        """Return the ``StepOutcome`` of a step, from which measures are computed; ``state`` is the state afterwards."""
+        """Return the ``StepOutcome`` of the step that led to ``state``, from which measures are computed."""
         motion, params, column = state.motion, state.params, state.packed.column
         return StepOutcome(
             step.first_impact_harm,

@@ -171,7 +171,10 @@ class Attached:
             raise InvalidInput(f"{self.options.where}: this shield was closed; put a new shield around the environment")
 
     def close(self) -> None:
-        """Remove this shield from the environment. After the call, ``memory`` and ``shield`` keep their last values."""
+        """Remove this shield from the environment.
+
+        After ``close``, the attributes ``memory`` and ``shield`` keep their last values.
+        """
         if self.engine.guard is self.guard:
             self._left = self.memory
             self.engine.protect(None)

@@ -126,7 +126,7 @@ def copy_action(action: Floats, to: Floats) -> None:
 
 @compiled
 def is_planned(action: Floats, planned: Floats) -> bool:
-    """Return whether ``action`` [K] equals the ``planned`` action [K] for each of K shielded vehicles."""
+    """Return whether the actions ``action`` [K] of all K shielded vehicles equal their ``planned`` actions [K]."""
     for c in range(planned.shape[0]):  # noqa: SIM110  # all() is not compiled
         if action[c] != planned[c]:
             return False
@@ -185,14 +185,14 @@ def try_action(
 def tell_action(out: Floats, action: Floats, bound: float, margin: float) -> None:
     """Write the applied action, bound and margin of each shielded vehicle into its row of ``out``.
 
-    The margin of a vehicle whose proposal was rejected is left unchanged.
+    If a vehicle's proposal was rejected, the vehicle's margin in ``out`` does not change.
 
     Args:
         out: columns ``APPLIED``, ``REASON``, ``BOUND`` and ``MARGIN`` for each vehicle, [K, 4]; changed in place. The
             caller must have filled in the column ``REASON``.
         action: applied actions, [K].
         bound: harm that the episode will not exceed, m2/s2.
-        margin: budget minus the harm of the plan, m2/s2.
+        margin: budget minus the harm of the plan after this decision, m2/s2.
 
     """
     for c in range(action.shape[0]):
@@ -208,9 +208,9 @@ def decide_world(
 ) -> bool:  # fmt: skip
     """Decide in one world: accept the proposed actions, or replace them by the actions of the plan.
 
-    The proposals of all vehicles are first tried together. If no plan after these actions stays within the budget, the
-    proposals are tried one by one, front to rear, while the other vehicles act as planned. An accepted proposal becomes
-    part of the plan before the next vehicle's proposal is tried.
+    The proposals of all vehicles are first tried together. If no plan after all proposals together stays within the
+    budget, the proposals are tried one by one, front to rear, while the other vehicles act as planned. An accepted
+    proposal becomes part of the plan before the next vehicle's proposal is tried.
 
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).
@@ -282,7 +282,7 @@ def certify_worlds(
         running: the episodes at this decision, n worlds with M possible worlds each.
         proposed: proposed actions, [n, K]; NaN for a vehicle without a proposal.
         budget: largest harm that is accepted in each episode, [n] m2/s2.
-        certified: harm of each plan, [n] m2/s2.
+        certified: harm of each of the present ``plans``, [n] m2/s2.
         constants: constant actions that may replace the rest of a plan, [C, K].
         plans: plan of each world, with the actions of each decision, [n, L, K]; changed in place.
         after: receives the state of each possible world after the step, [n * M, S].
@@ -363,7 +363,7 @@ def descend_constants(running: Running, grid: Floats, rounds: int, action: Float
     Args:
         running: the episodes, n worlds with exactly one possible world each.
         grid: actions to try for each vehicle, [G].
-        rounds: number of passes over all vehicles.
+        rounds: how often the descent tries all actions of all vehicles.
         action: constant action of each vehicle, [n, K]; changed in place.
 
     """

@@ -34,7 +34,7 @@ def seen_columns(packed: Packed) -> Floats:
 
 
 def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
-    """Return a copy of ``worlds`` with the speeds, gaps and hit flags in ``states``.
+    """Return a copy of ``worlds`` with the speeds, gaps and hit flags (1: the pair had an impact) of ``states``.
 
     ``states`` [n, S] has the layout of ``Running.states``. The gap to an obstacle ahead and its hit flag also come from
     ``states``.

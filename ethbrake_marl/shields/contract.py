@@ -199,10 +199,11 @@ class ShieldGuard(ABC):
         return spread
 
     def _of_step(self, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos that all modes report: mode, proposed action, applied action, and if the shield intervened.
+        """Return the infos that all modes report: mode, proposed and applied action, and whether the action was
+        replaced.
 
-        ``ruling`` is the decision in the last step. Before the first step ``ruling`` is None; the proposed and the
-        applied action are then 0.
+        ``ruling`` is the decision in the last step. Before the first step ``ruling`` is None, and the infos report 0 as
+        the proposed and the applied action.
         """
         infos: dict[str, Any] = {"mode": self.mode}
         if ruling is None:
@@ -218,8 +219,8 @@ class ShieldGuard(ABC):
         Args:
             worlds: the n worlds that the policies observe; may be None if no policy is called.
             memories: vehicle index -> memory of this vehicle's policy.
-            proposed: actions that the caller proposes, [n, L]. A column of NaN is replaced by the actions that this
-                learner's policy proposes.
+            proposed: actions that the caller proposes, [n, L]. A column of NaN is replaced by the actions that the
+                policy of the column's learner proposes.
 
         """
         left_out = np.isnan(proposed).all(axis=0)

@@ -25,7 +25,7 @@ class ShieldedDriver(ByPolicy):
     the policy from the state after the action. The shield decides on all proposals of a team together.
 
     Args:
-        policy: the agent or team that proposes.
+        policy: the agent or team that proposes actions.
         scenario: the scenario in which actions are certified.
         later_rollouts: whether a rollout of the policy from a later decision on may certify an action.
         told: the worlds at the alert, as the shield assumes them. If ``told`` is None, the shield knows the true
@@ -73,12 +73,12 @@ class ShieldedDriver(ByPolicy):
 
     @property
     def adds(self) -> Source:
-        """Knowledge (``Source``) that the shield uses to certify actions, in addition to the policy's own knowledge."""
+        """Knowledge (``Source``) that the shield uses to certify actions, beyond what the policy knows."""
         return self.options.adds
 
     @property
     def knows(self) -> Knowledge:
-        """Everything that the policy or the shield knows."""
+        """Knowledge of the policy and the shield together."""
         return Knowledge.of(self.policy, also=self.adds)
 
     @classmethod

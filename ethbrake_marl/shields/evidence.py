@@ -41,17 +41,17 @@ class Review(NamedTuple):
 
 
 def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
-    """Compare each intervention with the same episode in which ``policy`` drives unshielded from that decision on.
+    """For each intervention, compare the episode with the same episode if ``policy`` drives unshielded from then on.
 
     An intervention is *needed* if the episode without it does more harm, *costly* if the episode without it does less
-    harm, and *harmless* if both episodes do equal harm. The episode with the interventions is also simulated again, so
-    that both harms are computed in ``worlds``, even if the shield assumed other worlds.
+    harm, and *harmless* if both episodes do equal harm. The episode with the interventions is also simulated again in
+    ``worlds``, because the shield may have assumed other worlds.
 
     Args:
         shield: a shield made with ``logging=True``, after it has run the episodes in ``worlds``. Log entries of earlier
             episodes are ignored.
-        policy: the agent, or the team of all shielded vehicles, that proposed the actions in these episodes.
-        worlds: the worlds of these episodes at the alert.
+        policy: the agent, or the team of all shielded vehicles, that proposed the actions in the reviewed episodes.
+        worlds: the worlds of the reviewed episodes, as they were at the alert.
 
     Raises ``InvalidInput`` if the shield has no log, or if ``worlds`` and the shield's batch differ in the number of
     worlds.
@@ -86,11 +86,11 @@ def _released_harm(shield: StepShield, policy: Driver, worlds: Worlds, world: In
     Before the given decision, the vehicles repeat the actions that the shield applied.
 
     Args:
-        shield: the shield after the episodes; its plans contain the applied actions.
+        shield: the shield after it has run the episodes; its plans then contain the actions that were applied.
         policy: the agent or team that drives from the given decision on.
         worlds: the n worlds of the batch at the alert.
         world: index (in ``worlds``) of the world of each of the m episodes, [m].
-        step: number of the first decision at which the policy drives, [m].
+        step: number of the first decision at which the policy drives, in each of the m episodes, [m].
 
     """
     scenario, plan = shield.scenario, shield.memory.backup.plan[world]

@@ -1,14 +1,14 @@
-"""The first plan of a step shield at the alert: the constant actions that do the least harm.
+"""The plan that a step shield makes at the alert: the constant actions that do the least harm.
 
-For one shielded vehicle the plan repeats the action of E-V2X-BM (the coupled optimum). For several vehicles the plan is
-the one of the following plans that does the least harm:
+For one shielded vehicle the plan repeats the action of E-V2X-BM (the coupled optimum). For several shielded vehicles,
+the following plans are compared, and the one that does the least harm is used:
 
-- All vehicles brake fully.
+- Full braking: all shielded vehicles brake fully.
 
-- One vehicle repeats the action of E-V2X-BM while the others brake fully.
+- E-V2X-BM for one vehicle: this vehicle repeats the action of E-V2X-BM, and the other shielded vehicles brake fully.
 
-- All vehicles repeat the actions that a coordinate descent over the vehicles finds; it starts from the best of the
-  other plans.
+- Coordinate descent: each shielded vehicle repeats the action that a coordinate descent over the vehicles finds. The
+  descent starts from the best of the other plans.
 """
 
 from __future__ import annotations

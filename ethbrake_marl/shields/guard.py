@@ -20,7 +20,7 @@ from ethbrake_marl.shields.step import StepShield
 
 
 class MovingAtHorizon(UserWarning):
-    """Warning: a vehicle may still be moving at the horizon; the shield's bound does not cover the time after it."""
+    """Warning: a vehicle may still be moving at the horizon; the bound does not cover the time after the horizon."""
 
 
 class StepGuard(ShieldGuard):
@@ -38,8 +38,8 @@ class StepGuard(ShieldGuard):
         later_rollouts: whether a rollout of the policy from a later decision on may certify an action.
         told: the worlds at the alert, as the shield assumes them. If ``told`` is None, the shield knows the true
             worlds. Policies always observe the true worlds.
-        warns: whether to warn with ``MovingAtHorizon``, once, if a vehicle still moves at the horizon under the first
-            plan.
+        warns: whether to warn once with ``MovingAtHorizon`` if a vehicle would still move at the horizon under the plan
+            made at the alert.
 
     """
 
@@ -140,7 +140,8 @@ class StepGuard(ShieldGuard):
         return memory._replace(shield=shield)
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos of a step by name: actions, reason, margin, bound, whether each world is trusted, shares.
+        """Return the infos of a step by name: actions, reason, margin, bound, trusted, settles, and shares if asked
+        for.
 
         ``memory`` is the guard's memory. ``ruling`` is the decision in the step, None before the first decision. Each
         value is a number, or an array with one number per world [n], learner [n, L] or vehicle [n, N].

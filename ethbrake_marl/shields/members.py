@@ -64,7 +64,7 @@ def all_members(running: Running) -> Members:
 
 @compiled
 def members_from(every: Members, a: int, b: int) -> Members:
-    """Return the possible worlds in the rows ``a`` to ``b - 1`` of ``every``, as views (without a copy)."""
+    """Return the rows ``a`` to ``b - 1`` of ``every``, the possible worlds of all worlds, as views (without a copy)."""
     clock, bounds, lines, pieces = every.clock[a:b], every.bounds[a:b], every.lines[a:b], every.pieces[a:b]
     return Members(every.table, clock, bounds, lines, pieces, every.vehicles, every.critical)
 
@@ -194,7 +194,7 @@ def worst_so_far(world: Members, states: Floats) -> float:
 def follow_plan(world: Members, m: int, state: Floats, ended: bool, step: int, plan: Floats, most: float) -> float:
     """Return the harm of the whole episode if a plan is executed in one possible world from now on, m2/s2.
 
-    The harm equals the engine's harm to the bit, because both are computed with the same operations.
+    The harm equals, to the bit, the harm that the engine would count, because the operations are the same.
 
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).
@@ -203,8 +203,8 @@ def follow_plan(world: Members, m: int, state: Floats, ended: bool, step: int, p
         ended: whether the episode has ended in this possible world.
         step: number of the present decision.
         plan: actions of each decision, [L, K].
-        most: largest harm of interest, m2/s2. The simulation stops when the harm exceeds ``most``, because harm never
-            falls during an episode.
+        most: the simulation stops as soon as the harm exceeds this number, m2/s2, because harm never falls during an
+            episode.
 
     Returns infinity if the harm exceeds ``most``, if a vehicle bears more than its cap, or if the physics fails.
 
@@ -236,7 +236,7 @@ def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan:
         ended: whether the episode has ended in each possible world, [M].
         step: number of the present decision.
         plan: actions of each decision, [L, K]; executed from the present decision on.
-        most: largest harm of interest, m2/s2.
+        most: the simulation stops as soon as the harm exceeds this number, m2/s2.
 
     Returns infinity if the harm exceeds ``most`` in a possible world, if a vehicle bears more than its cap, or if the
     physics fails.

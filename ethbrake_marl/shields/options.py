@@ -106,7 +106,7 @@ class ShieldOptions:
 
     @property
     def adds(self) -> Source:
-        """Knowledge that the shield uses, in addition to the policy's own knowledge."""
+        """Knowledge that the shield uses beyond what the policy knows."""
         return Source.MODEL
 
     def shield(
@@ -175,7 +175,7 @@ def misplaced(name: str, value: object, mode: str, takers: list[str], where: str
 
 
 def shielded_vehicle(engine: Engine, several: bool) -> int | tuple[int, ...]:
-    """Return the index of the engine's only learner, or a tuple of indices for several learners or if ``several``."""
+    """Return the index of the engine's only learner; a tuple if several vehicles learn or ``several`` is True."""
     vehicles = tuple(engine.learners)
     return vehicles if several or len(vehicles) > 1 else vehicles[0]
 

@@ -35,12 +35,13 @@ Bound = Literal["coupled", "pairwise"]  # method to compute H* and a*: the engin
 
 
 class HybridAgent(AgentAround):
-    """Agent that drives by ``policy`` in worlds where the harm of its rollout is at most ``H*``, otherwise by E-V2X-BM.
+    """Agent that drives by ``policy`` in worlds where the policy's rollout does at most the harm ``H*``, else by
+    E-V2X-BM.
 
     The rollout simulates the policy from the alert on. ``H*`` is the harm of E-V2X-BM's constant deceleration.
 
     Args:
-        policy: the agent that is chosen or rejected in each world.
+        policy: the agent that is compared with E-V2X-BM in each world, and chosen or rejected.
         scenario: the scenario in which ``policy`` and E-V2X-BM are compared.
         bound: method to compute ``H*`` and the deceleration: ``coupled`` (the engine's physics) or ``pairwise`` (the
             paper's closed form).
@@ -160,10 +161,10 @@ class EpisodeGuard(ShieldGuard):
         return np.asarray(abs(ruling.applied - ruling.proposed) > ROUNDING, np.bool_)
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos by name: chosen driver and compared harms, each [n], and the actions.
+        """Return the infos by name: chosen driver, harm of the policy, harm of E-V2X-BM (each [n]), and the actions.
 
-        ``memory`` is the guard's memory; ``ruling`` is the decision in the last step, None before the first step.
-        ``proposed_action`` is NaN where nothing was proposed.
+        ``memory`` is the guard's memory; ``ruling`` is the decision in the last step, None before the first step. The
+        info ``proposed_action`` is NaN where no action was proposed.
         """
         compared = {name: memory.shield[name] for name in ("chosen_policy", "policy_harm", "bound_harm")}
         return self._of_step(ruling) | compared

@@ -93,9 +93,9 @@ def certify_rollouts(
     """Decide again in worlds whose proposals were rejected, with rollouts of the policy as plans.
 
     In each world one plan is tried: the proposal, clipped to [-1, 1], followed by the policy's actions in a simulation
-    from the next state on. If this plan stays within the budget and the caps, it becomes the backup, and the proposal
-    is accepted. If the plan exceeds the budget or a cap, the reason stays ``NO_CERTIFICATE``. A vehicle whose proposal
-    is NaN executes its planned action.
+    from the next state on. If this plan stays within the budget and the caps, the plan becomes the backup, and the
+    proposal is accepted. If the plan exceeds the budget or a cap, the reason stays ``NO_CERTIFICATE``. A vehicle whose
+    proposal is NaN executes its planned action.
 
     Args:
         running: the n episodes of the whole batch.
@@ -179,7 +179,7 @@ def _later_plan(
 
 
 def no_constants(plan: Floats) -> Floats:
-    """Return an empty array of constant actions for ``Backup``, with an axis K if ``plan`` has one."""
+    """Return an array that contains no constant action, for ``Backup``: [0], or [0, K] if ``plan`` has the axis K."""
     return np.zeros((0, *plan.shape[2:]))
 
 
@@ -206,7 +206,7 @@ def proposed_action(policy: Agent, worlds: Worlds, memory: Memory, vehicle: int)
 
 
 class _Rounded(AgentAround):
-    """Policy whose commands are converted to actions and back, as in a plan.
+    """Policy whose commands are converted to actions and back, so that they are rounded as in a plan.
 
     ``memory["action"]`` contains the last actions of the policy.
     """

@@ -72,7 +72,7 @@ class Running(NamedTuple):
 
 
 def begin_running(problem: ProfileProblem, members: int = 1) -> Running:
-    """Return the episodes of ``problem`` at their first decision.
+    """Return running episodes in the worlds of ``problem``, at their first decision.
 
     ``problem`` contains the states of the worlds at the first decision, and the commands of the unshielded vehicles.
     ``members`` is the number M of possible worlds of each world. M consecutive rows of ``problem`` belong to the same

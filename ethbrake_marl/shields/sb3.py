@@ -20,8 +20,9 @@ class ShieldedVecEnv(SeededInside, VecEnvWrapper):
     """The environment of ``make_sb3_vec_env`` behind a shield, by default in mode ``step``.
 
     Each row belongs to one learner. The shield decides on all learners of one world together. At every step the infos
-    of each row contain ``shield_bound_harm`` and the other ``shield_...`` keys. ``reset_infos`` contains these keys for
-    the alert. The episode's return in ``infos[row]["episode"]`` does not include the intervention penalty.
+    of each row contain ``shield_bound_harm`` and the other ``shield_...`` keys. ``reset_infos`` contains the
+    ``shield_...`` keys for the alert. The episode's return in ``infos[row]["episode"]`` does not include the
+    intervention penalty.
 
     Args:
         venv: an environment made by ``make_sb3_vec_env``.

@@ -1,9 +1,9 @@
 """Mode ``step`` of the shield: keep the harm of the episode within a bound, whatever actions are proposed.
 
 **Claim.** The *bound* is the harm that the episode will not exceed. Let ``B`` be the bound at the first decision: the
-harm of the first plan. If every step applies the action that ``certify`` returns, then the harm at the end of the
-episode is at most ``B``, whatever actions are proposed. The bound never rises during the episode. An episode ends at
-rest or at the scenario's horizon. The claim does not cover anything that happens after the horizon.
+harm of the plan made at the alert. If every step applies the action that ``certify`` returns, then the harm at the end
+of the episode is at most ``B``, whatever actions are proposed. The bound never rises during the episode. An episode
+ends at rest or at the scenario's horizon. The claim does not cover anything that happens after the horizon.
 
 **Induction.** Between two decisions the shield has a *plan* with an action for every decision up to the horizon. Let
 ``c`` be the harm of the plan: the harm of the whole episode if the plan is executed from the present state. ``c``
@@ -35,7 +35,7 @@ the last bound are the same floating-point number.
 vehicle. The shield first tries all proposals together. If no plan after all proposals stays within the budget, the
 shield tries the proposals one by one, front to rear: one vehicle's proposal replaces that vehicle's action in the plan.
 This single proposal is accepted if some plan after it stays within the budget; if not, the vehicle's planned action
-remains. Before and after each attempt the shield has a plan whose harm is at most the budget.
+remains. Before and after each proposal is tried, the shield has a plan whose harm is at most the budget.
 
 **Several members.** The shield may consider several possible worlds, the *members* of a world. With several members,
 each harm in the proof is the largest harm over the members, and the same actions are executed in all members. So the
@@ -76,13 +76,14 @@ Cap = Literal["baseline"]  # plan that sets the caps: a vehicle may bear at most
 class StepShield:
     """Bound the harm of a batch of episodes: call ``begin`` when episodes start and ``decide`` before every step.
 
-    ``begin`` and ``decide`` replace ``memory`` as a whole and change no array in place. If one of these methods raises
-    an error, the shield keeps its old memory. A copy of the shield by ``copy.copy`` is independent of the original.
+    ``begin`` and ``decide`` replace ``memory`` as a whole and change no array in place. If ``begin`` or ``decide``
+    raises an error, the shield keeps its old memory. A copy of the shield by ``copy.copy`` is independent of the
+    original.
 
     At the alert the bound is the harm of E-V2X-BM's constant deceleration, executed decision by decision. In worlds
-    where ``policy``, simulated from the alert, does less harm, the bound is the policy's harm. The bound never rises,
-    and covers the time up to the scenario's horizon. ``memory.settles`` [n] says for each world whether all vehicles
-    are at rest at the horizon under the first plan.
+    where ``policy``, simulated from the alert, does less harm than E-V2X-BM, the bound is the policy's harm. The bound
+    never rises, and covers the time up to the scenario's horizon. ``memory.settles`` [n] says for each world whether
+    all vehicles are at rest at the horizon if the plan made at the alert is executed.
 
     At each decision the observed worlds are compared with the prediction, bit by bit. If a world differs from its
     prediction (a vehicle brakes beyond its capacity, a number is NaN, a message is missing), this world is marked in
@@ -239,7 +240,7 @@ class StepShield:
     def _begun(
         self, worlds: Worlds, rows: Ints, policy: Agent | Mapping[int, Agent] | None, possible: Worlds
     ) -> StepMemory:
-        """Return the memory of new episodes, with the first plan and the bound of each world.
+        """Return the shield's memory of new episodes, with the plan and the bound of each world at the alert.
 
         Args:
             worlds: n worlds at the alert.
@@ -313,16 +314,16 @@ class StepShield:
     def _bound_at_alert(
         self, possible: Worlds, problem: ProfileProblem, rows: Ints, plan: Floats, harm: Floats
     ) -> tuple[Floats, Any]:
-        """Return the bound of each episode at the alert, [n] m2/s2, and a subclass's memory (``StepMemory.enclosure``).
+        """Return the bound of each episode at the alert, [n] m2/s2, and further memory (``StepMemory.enclosure``).
 
-        This class returns ``harm`` as the bound, and None as the memory.
+        This class returns ``harm`` as the bound, and no further memory (None); a subclass may return both.
 
         Args:
             possible: the M possible worlds of each world at the alert.
             problem: the possible worlds, as input for the functions of ``engine.profiles``.
             rows: indices of the batch rows in which the new episodes start.
-            plan: first plan of each world, [n, L] or [n, L, K].
-            harm: largest harm of each first plan over the possible worlds, [n] m2/s2.
+            plan: plan made for each world at the alert, [n, L] or [n, L, K].
+            harm: harm of the plan made at the alert, the largest over the possible worlds, [n] m2/s2.
 
         """
         return harm, None
@@ -399,9 +400,10 @@ class StepShield:
     def _also_certified(
         self, now: Running, memory: StepMemory, budget: Floats, decision: Decision, asked: Bools
     ) -> Decision:
-        """Return the final decision; ``decision`` already stays within the budget in every possible world.
+        """Return the decision to apply: ``decision``, in which a subclass may replace further actions.
 
-        This class returns ``decision`` unchanged; a subclass may replace more actions.
+        The plans of ``decision`` already stay within the budget in every possible world. This class returns
+        ``decision`` unchanged.
 
         Args:
             now: the running episodes before the decision.
@@ -434,7 +436,7 @@ class StepShield:
 
         With a single possible world, each observed number must equal the predicted number to the bit. With several
         possible worlds, each observed number must lie within the range of its predictions in the possible worlds. Once
-        an impact has happened in a possible world, every finite number is accepted.
+        an impact has happened in one of the possible worlds, every finite observed number agrees.
         """
         running = self.memory.running
         assert running is not None
@@ -448,7 +450,7 @@ class StepShield:
         return np.asarray(within | (self._leaves_range(running) & np.isfinite(seen).all(axis=1)), np.bool_)
 
     def _leaves_range(self, running: Running) -> Bools:
-        """Return whether an impact has happened in any possible world of each world, [n].
+        """For each world: return whether an impact has happened in at least one of its possible worlds, [n].
 
         After an impact in a possible world, the true world may lie outside the range of the possible worlds.
         ``running`` contains the predicted episodes.
