@@ -146,7 +146,7 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
     episode is truncated with the reward 0, and ``outcome`` contains the status code of the failure.
 
     Args:
-        state: motion and harm of the worlds, [n, S]; changed in place.
+        state: present motion and harm so far of the worlds, [n, S]; changed in place.
         params: parameters of the vehicles, one row per world, in the layout of ``physics.columns``.
         clock: times and numbers of the steps of each episode (see the module docstring), [n, CLOCK_WIDTH]; changed in
             place.
@@ -154,12 +154,12 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
         learners: indices of the learners (0 = front), [L].
         settings: five numbers with the indices ``TIME_STEP``, ``HORIZON``, ``HARM_WEIGHT``, ``HARM_IS_TOTAL`` and
             ``TERMINAL_WEIGHT``.
-        no_rows: ``NO_ROWS``, an empty array: the physics then keeps no list of single impacts.
+        no_rows: ``NO_ROWS``, an empty array, so that the physics keeps no list of single impacts.
         builds_up: True if brakes take time to build up in some world, or if a script follows a braking profile.
         pieces: braking profiles with K intervals of constant command, [N, 2 K]; used only if ``builds_up`` is True.
         wanted: commands of all vehicles, [n, N] m/s2; this function overwrites the learners' commands.
         reward: array that receives the reward of each vehicle, [n, N].
-        outcome: array that receives the harm of the step in each world and whether the episode has ended,
+        outcome: array that receives, for each world, the harm of the step and whether the episode has ended,
             [OUTCOME_ROWS, n].
 
     Returns ``(-1, FLAG.DONE)`` if all worlds were advanced. If some world was not advanced, returns the row number of
@@ -286,7 +286,7 @@ class Rules(NamedTuple):
             actions: actions of the learners in [-1, 1], [n, L].
             wanted: commands of all vehicles, [n, N] m/s2; this function overwrites the learners' commands.
             reward: array that receives the reward of each vehicle, [n, N].
-            outcome: array that receives the harm of the step in each world and whether the episode has ended,
+            outcome: array that receives, for each world, the harm of the step and whether the episode has ended,
                 [OUTCOME_ROWS, n].
 
         The status code is ``FLAG.DONE`` if all worlds were advanced. The status code is ``BAD_ACTION`` if an action is

@@ -156,18 +156,18 @@ class Engine:
     Args:
         scenario: the scenario of all episodes, or another ``Game``.
         n: number of worlds that are advanced together, at least 1.
-        learners: indices of the vehicles (0 = front) that need an action in every step.
+        learners: indices of the learners (0 = front): the vehicles whose actions the caller passes to ``step``.
         scripts: dictionary from the index of every vehicle that does not learn to the vehicle's script.
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
-        observation: observation of all vehicles, or a dictionary vehicle name -> observation; None: the observation of
-            the scenario.
+        observation: the features that vehicles observe: one observation for all vehicles, or a dictionary vehicle name
+            -> observation; None: the observation of the scenario.
         seed: seed of the training stream, from which the worlds come if ``worlds`` is None.
         deciders: indices of the vehicles at whose decisions each step begins and ends; None: the learners. In an
             evaluation the engine has no learners; there ``deciders`` are the vehicles that the evaluated agent drives.
         worlds: worlds of the first episodes, at t = 0; None: the first worlds of the training stream.
         guard: function that receives this engine and returns its guard (shield); None: the engine applies the
             learners' actions unchanged.
-        reward_vector: components of the vector reward that each step returns besides the reward
+        reward_vector: components of a vector reward, which each step returns in addition to the reward
             (``game.reward_vector``); None: no vector reward.
 
     >>> import ethbrake_marl as eb
@@ -244,7 +244,8 @@ class Engine:
         """Start a new episode in each of the n worlds. If this call fails, the running episodes continue.
 
         Args:
-            seed: seed whose first world becomes the next world of the training stream; None: the stream continues.
+            seed: seed of a new training stream, from whose beginning the next worlds come; None: the present stream
+                continues.
             worlds: worlds of the new episodes, n worlds at t = 0; None: the next worlds of the training stream.
 
         """
@@ -459,9 +460,10 @@ class Engine:
 
         Args:
             step: results of the step; changed in place.
-            harm_before: harm of each pair before the step; None if every vehicle's reward counts the harm of the whole
-                line.
-            start: the worlds before the step; None if no term of the reward is computed from single impacts.
+            harm_before: harm of each pair from the alert to the beginning of the step; None if every vehicle's reward
+                counts the harm of the whole line.
+            start: the worlds before the step, needed for reward terms that are computed from single impacts; None if
+                there are no such terms.
 
         """
         impacts = self.state.impacts
@@ -548,7 +550,7 @@ class Engine:
         time at the end of the segment ([n] s).
 
         Args:
-            before: the worlds at the start of the step.
+            before: the worlds at the start of the last step (after a reset: at the alert).
             last_mps2: the vehicles' commands in the last segment, [n, N] m/s2.
 
         """
@@ -634,9 +636,9 @@ class Engine:
 
         Args:
             worlds: n worlds at any time of their episodes.
-            ledger: harm and impacts since the episodes began; None: no harm and no impacts.
-            ended: whether each episode has ended, [n]; steps do not move the world of an ended episode. None: an
-                episode has ended if its time is at or after the horizon.
+            ledger: harm and number of impacts of each pair since the episodes began; None: no harm and no impacts.
+            ended: whether each episode has ended, [n]; steps do not move the world of an ended episode. If ``ended`` is
+                None, an episode has ended if its time is at or after the horizon.
 
         Raises ``InvalidInput`` if ``worlds`` has another number of worlds or vehicles than the engine, or if a term of
         the reward is computed from single impacts.

@@ -247,7 +247,7 @@ def _named(error: Exception, script: Script, what: str, worlds: Worlds, vehicle:
     Args:
         error: the exception that the script raised.
         script: the script.
-        what: name of the script's method that raised the error.
+        what: name of the method of the script that raised the error.
         worlds: the worlds that were passed to the script's method.
         vehicle: index of the script's vehicle (0 = front).
 

@@ -51,7 +51,7 @@ class Way(NamedTuple):
         """Add the results up to the last decision of a script to the results of the rest of the step, in place.
 
         Args:
-            motion: state of the worlds after the step, [n, S].
+            motion: state of the worlds after the whole step, [n, S].
             column: number of the column of ``motion`` that contains each quantity (``physics.columns``).
             reward: reward of each vehicle in the rest of the step (after the last decision of a script), [n, N].
             outcome: other results of the rest of the step, as the compiled step returns them, [OUTCOME_ROWS, n].
@@ -103,10 +103,10 @@ class OwnGrid:
         Until the first step the learners and deciders coast, and the scripts observe that these vehicles coast.
 
         Args:
-            state: all running episodes; the new episodes are at the alert. ``drive_to_start`` moves the new episodes to
-                their first step, in place.
+            state: state of all running episodes; the new episodes are at the alert. ``drive_to_start`` moves the new
+                episodes to their first step, in place.
             rules: settings of the engine's steps.
-            rows: row numbers of the new episodes in ``state``.
+            rows: numbers of the rows of ``state`` in which the new episodes start.
             start_s: time at which the first step of each new episode begins, [len(rows)] s.
 
         Raises ``PhysicsError``, which lists the worlds that could not be advanced.
@@ -180,7 +180,7 @@ class OwnGrid:
                 nothing else in ``state`` changes.
             rules: settings of the engine's steps.
             until_s: time to which each world is advanced, [n] s; a world that has reached this time does not move.
-            decision_s: time of the deciders' next decision, [n] s; the delivery of periodic messages depends on it.
+            decision_s: time of the deciders' next decision, [n] s, on which the delivery of periodic messages depends.
             actions: actions of the learners, [n, L]; L may be 0.
 
         """

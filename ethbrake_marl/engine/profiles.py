@@ -122,7 +122,8 @@ class ProfileProblem(NamedTuple):
         The harm count (first-impact or total harm) and the field ``identity`` stay the same.
 
         Args:
-            weights: weight of the harm that each vehicle bears, at least 0, [n, N]; an obstacle has no weight.
+            weights: for each vehicle, the weight (at least 0) of the harm that the vehicle bears, [n, N]; an obstacle
+                has no weight.
             largest: True: minimise the largest weighted harm of a vehicle; False: minimise the sum of all weighted
                 harms.
 
@@ -243,9 +244,10 @@ def profile_problem(
             full braking.
         deciders: indices of vehicles; the first decision is at the shortest latency of these vehicles. If this latency
             has already elapsed in a world, the first decision is at the world's present time. None: ``vehicles``.
-        written_out: whether the arrays contain an obstacle, as an additional vehicle in front, even if no world has an
-            obstacle (``Worlds.with_obstacle``). If some world has an obstacle, the arrays always contain one. If the
-            arrays contain an obstacle, worlds without an obstacle get one that no vehicle can reach.
+        written_out: whether the arrays always contain an obstacle, as an additional vehicle in front
+            (``Worlds.with_obstacle``), even if no world has an obstacle. If some world has an obstacle, the arrays
+            always contain one. If the arrays contain an obstacle, worlds without an obstacle get one that no vehicle
+            can reach.
 
     Raises ``InvalidInput`` if ``vehicles`` is empty, repeats an index or contains an unknown index, if the harm count
     is unknown, if a command exceeds a capacity, or if the horizon is not after the first decision.

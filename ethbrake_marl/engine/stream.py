@@ -53,10 +53,10 @@ class Roster:
 
     Args:
         n: number of rows, one per world.
-        seed: seed of the stream of worlds.
-        first: number of the world in row 0, counted from the beginning of the stream; row k has world ``first + k``.
-            None: the worlds do not come from the stream.
-        given: the worlds at the alert, if they do not come from the stream; None: they come from the stream.
+        seed: seed of the stream from which the worlds come.
+        first: number of the world in row 0, counted from the beginning of the stream; row k has world ``first + k``. If
+            ``first`` is None, the worlds do not come from the stream.
+        given: the worlds at the alert, if the caller has passed worlds; None: the worlds come from the stream.
 
     """
 
@@ -87,8 +87,8 @@ class Roster:
 
         Args:
             status: status code of the physics for each world that could not be advanced, 0 for all other worlds, [n].
-            from_s: time at which the step began in each world, [n] s.
-            until_s: time at which the step should have ended in each world, [n] s.
+            from_s: time at which the last step began in each world, [n] s.
+            until_s: time at which the last step should have ended in each world, [n] s.
 
         """
         new = FLAG.failure(np.where(status == 0, FLAG.DONE, status), from_s, until_s).worlds

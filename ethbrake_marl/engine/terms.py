@@ -61,7 +61,8 @@ class Terms:
     def vector(self, step: Step, before: Ledger, state: State) -> Floats:
         """Return the vector reward of a step, [n, N, K]; 0 for episodes that had ended before the step.
 
-        ``step``: results of the step. ``before``: harm before the step. ``state``: state after the step.
+        ``step``: results of the step. ``before``: harm of each pair from the alert to the beginning of the step.
+        ``state``: state after the step.
         """
         vector = vector_of(self.components, state.ledger.since(before), self.params.harm_count, step.terms)
         vector[state.ended & ~step.ended] = 0.0
@@ -84,9 +85,9 @@ class Terms:
             step: results of the compiled step; its fields ``further`` and ``reward`` are changed in place.
             state: state after the step.
             scenario: the scenario of the episodes.
-            before: harm of each pair before the step; None if there are no objectives.
-            impacts_before: impacts of the episodes before the step; None if no reward term is computed from single
-                impacts.
+            before: harm of each pair from the alert to the beginning of the step; None if there are no objectives.
+            impacts_before: impacts from the alert to the beginning of the step; None if no reward term is computed from
+                single impacts.
             worlds: worlds after the step, from which the new potentials (see the class) are computed; None if the
                 reward is not shaped.
 

@@ -39,7 +39,7 @@ def proposing_agents(
     """Return the proposing agent of each shielded vehicle: vehicle index -> agent.
 
     Args:
-        policy: a team, a mapping from vehicle name to policy, or one policy that proposes for all vehicles.
+        policy: a team, a mapping from vehicle name to policy, or one policy that proposes the actions of all vehicles.
         vehicles: indices of the shielded vehicles.
         where: name with which error messages begin: the function or class that the user called.
 
@@ -104,9 +104,10 @@ class Attached:
     Args:
         env: the environment to shield.
         interface: class of which ``env`` must be an instance, such as ``gymnasium.Env``.
-        maker: code that makes such an environment, such as ``eb.parallel_env``; error messages name this code.
+        maker: code that makes an environment of the right kind, such as ``eb.parallel_env``; error messages contain
+            this code.
         policy: policy that proposes the actions that the caller leaves out; None: no policy.
-        where: name with which error messages begin: the shield wrapper.
+        where: name with which error messages begin: the name of the shield wrapper.
         options: keywords of ``ShieldOptions``.
 
     An ``Attached`` object has the attributes ``engine``, ``guard`` and ``options``. Raises ``InvalidInput`` if ``env``

@@ -60,7 +60,7 @@ def best_constant(world: Members, states: Floats, ended: Bools, step: int, const
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).
         states: present state of each possible world, [M, S], in the layout of ``Running.states``.
-        ended: whether the episode has ended in each possible world, [M].
+        ended: for each possible world, True if the episode has ended, [M].
         step: number of the present decision.
         constants: C constant actions to try, each with one number per shielded vehicle, [C, K].
 
@@ -90,13 +90,13 @@ def better_plan(
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).
         states: present state of each possible world, [M, S], in the layout of ``Running.states``.
-        ended: whether the episode has ended in each possible world, [M].
+        ended: for each possible world, True if the episode has ended, [M].
         step: number of the present decision; actions from this decision on are replaced.
         constants: C constant actions to try, each with one number per shielded vehicle, [C, K].
         value: harm of the present ``plan``, the largest over the possible worlds, m2/s2.
         most: largest harm that the new plan may have, m2/s2.
         plan: the present plan, with the actions of each decision, [L, K]; changed in place.
-        trial: workspace for a plan to try, [L, K].
+        trial: workspace for the plan that is tried, [L, K].
 
     Returns the harm of the resulting plan, and the least harm of any plan tried, accepted or not (both m2/s2).
 
@@ -146,17 +146,17 @@ def try_action(
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).
         states: present state of each possible world, [M, S], in the layout of ``Running.states``.
-        ended: whether the episode has ended in each possible world, [M].
+        ended: for each possible world, True if the episode has ended, [M].
         step: number of the present decision.
-        action: the actions to try, one per shielded vehicle, [K].
-        budget: largest harm of the episode that is accepted, m2/s2.
+        action: actions whose consequences are tried, one per shielded vehicle, [K].
+        budget: largest harm of the whole episode that the shield accepts, m2/s2.
         certified: harm of the present ``plan``, m2/s2.
         constants: C constant actions to try, each with one number per shielded vehicle, [C, K].
-        plan: present plan, [L, K]; if the search succeeds, ``plan`` is changed to the tried action followed by the
-            actions found for the later decisions.
+        plan: the shield's present plan, [L, K]. If the search succeeds, ``plan`` is replaced in place by the plan
+            found, which begins with ``action``.
         room: workspace for two plans, [2, L, K].
         after: receives the state of each possible world after the step, [M, S].
-        over: receives whether the episode has ended after the step in each possible world, [M].
+        over: for each possible world, receives True if the episode has ended after the step, [M].
 
     Returns the harm of the resulting plan, the least harm of any plan tried (both m2/s2), and the reason (a code of
     ``ShieldReason``). The search succeeded if the harm of the resulting plan is at most ``budget``.
@@ -215,19 +215,19 @@ def decide_world(
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).
         states: present state of each possible world, [M, S], in the layout of ``Running.states``.
-        ended: whether the episode has ended in each possible world, [M].
+        ended: for each possible world, True if the episode has ended, [M].
         step: number of the present decision.
         proposed: proposed actions, [K]; NaN for a vehicle without a proposal.
-        budget: largest harm of the episode that is accepted, m2/s2.
+        budget: largest harm of the whole episode that the shield accepts, m2/s2.
         certified: harm of the present ``plan``, m2/s2.
         constants: constant actions that may replace the rest of a plan, [C, K].
         plan: the present plan, with the actions of each decision, [L, K]; replaced in place by the new plan, whose harm
             is the bound in ``out``.
         room: workspace for two plans, [2, L, K].
-        tried: workspace for the actions to try, [2, K].
+        tried: workspace for the actions that are tried, [2, K].
         after: receives the state of each possible world after the step, [M, S].
-        over: receives whether the episode has ended after the step in each possible world, [M].
-        out: receives applied action, reason, bound and margin of each vehicle, [K, 4].
+        over: for each possible world, receives True if the episode has ended after the step, [M].
+        out: receives, for each shielded vehicle, the applied action, reason, bound and margin, [K, 4].
 
     Returns False if the physics fails with the applied actions, otherwise True.
 
@@ -279,16 +279,16 @@ def certify_worlds(
     A world whose episode has ended keeps its state and its plan.
 
     Args:
-        running: the episodes at this decision, n worlds with M possible worlds each.
+        running: the running episodes at this decision, in n worlds with M possible worlds each.
         proposed: proposed actions, [n, K]; NaN for a vehicle without a proposal.
-        budget: largest harm that is accepted in each episode, [n] m2/s2.
+        budget: largest harm of the whole episode that the shield accepts in each world, [n] m2/s2.
         certified: harm of each of the present ``plans``, [n] m2/s2.
         constants: constant actions that may replace the rest of a plan, [C, K].
         plans: plan of each world, with the actions of each decision, [n, L, K]; changed in place.
         after: receives the state of each possible world after the step, [n * M, S].
-        out: receives applied action, reason, bound and margin of each vehicle, [n, K, 4].
-        over: receives whether the episode has ended after the step in each possible world, [n * M].
-        failed: receives whether the physics failed in each world, [n].
+        out: receives, for each shielded vehicle, the applied action, reason, bound and margin, [n, K, 4].
+        over: for each possible world, receives True if the episode has ended after the step, [n * M].
+        failed: for each world, receives True if the physics failed, [n].
 
     """
     n, every = running.steps.shape[0], all_members(running)
@@ -361,7 +361,7 @@ def descend_constants(running: Running, grid: Floats, rounds: int, action: Float
     horizon is simulated in one go, not decision by decision.
 
     Args:
-        running: the episodes, n worlds with exactly one possible world each.
+        running: the running episodes, in n worlds with exactly one possible world each.
         grid: actions to try for each vehicle, [G].
         rounds: how often the descent tries all actions of all vehicles.
         action: constant action of each vehicle, [n, K]; changed in place.
@@ -472,10 +472,12 @@ def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) 
     does not change its arguments.
 
     Args:
-        running: the episodes at this decision.
+        running: the running episodes at this decision.
         proposed: proposed actions, [n] or [n, K]; clipped to [-1, 1]. NaN is replaced by the planned action.
-        backup: the present plan, which is followed where a proposal cannot be certified, and its harm.
-        budget: largest harm that is accepted in each episode, [n] m2/s2; at least the harm of ``backup``.
+        backup: the present plan of each world, and the plan's harm; where a proposal cannot be certified, the plan is
+            executed.
+        budget: largest harm of the whole episode that the shield accepts in each world, [n] m2/s2; at least the harm of
+            ``backup``.
 
     Raises ``InvalidInput`` if the shapes of the arrays do not fit, or if a budget is below the harm of ``backup``.
     Raises ``PhysicsError``, which names the worlds, if the physics fails with the applied action.

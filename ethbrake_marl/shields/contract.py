@@ -91,8 +91,8 @@ class ShieldGuard(ABC):
 
     Args:
         engine: the engine that gets this guard. All learners of the engine are shielded.
-        policies: vehicle index -> policy that proposes if the caller gives no action. A policy with a memory is called
-            at every decision, even if its proposal is not needed, to update its memory.
+        policies: vehicle index -> policy that proposes an action if the caller gives no action for the vehicle. A
+            policy with a memory is called at every decision, even if its proposal is not needed, to update its memory.
         shield: initial state of the shield, before any episode; its type depends on the mode.
         mode: mode of the shield; the infos report the number of the mode.
         where: name with which error messages begin: the function or class that the user called.

@@ -106,7 +106,8 @@ def shielded(driver: Driver, scenario: Scenario, mode: str, **options: Any) -> D
     """Return an agent or a team behind a shield.
 
     Args:
-        driver: the agent or team. If the scenario has several learners, a copy of the agent drives each of them.
+        driver: the agent or team to shield. If the scenario has several learners, a copy of the agent drives each of
+            them.
         scenario: the scenario in which actions are certified.
         mode: ``step``, ``episode`` or a mode of an extension.
         options: further keywords of ``ShieldOptions``.

@@ -63,7 +63,7 @@ def drive_shielded(driver: Driver, worlds: Worlds, task: Task, **settings: Any) 
     """Drive in every world with a copy of ``driver`` behind a step shield, and return the results.
 
     Args:
-        driver: an agent or a team.
+        driver: the agent or team to shield.
         worlds: n worlds at the alert, simulated in groups of at most ``CHUNK`` worlds.
         task: scenario, shielded vehicles and harm count.
         settings: further keywords of ``ShieldedDriver``.

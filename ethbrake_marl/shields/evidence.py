@@ -89,7 +89,7 @@ def _released_harm(shield: StepShield, policy: Driver, worlds: Worlds, world: In
         shield: the shield after it has run the episodes; its plans then contain the actions that were applied.
         policy: the agent or team that drives from the given decision on.
         worlds: the n worlds of the batch at the alert.
-        world: index (in ``worlds``) of the world of each of the m episodes, [m].
+        world: for each of the m episodes, the index of its world in ``worlds``, [m].
         step: number of the first decision at which the policy drives, in each of the m episodes, [m].
 
     """
@@ -107,7 +107,7 @@ class _Released(AgentAround):
     """Agent that repeats recorded actions until a given decision, and follows a policy from that decision on.
 
     Args:
-        policy: the policy that drives from decision ``release`` on.
+        policy: the policy that drives from the decision with the number ``release`` on.
         actions: recorded actions of m episodes, one for each of L decisions, [m, L].
         release: number of the first decision at which the policy drives, in each of the m episodes, [m].
         deciding: indices of all shielded vehicles, which decide at the same times.

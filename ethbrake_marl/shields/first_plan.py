@@ -44,10 +44,10 @@ def best_constants(
 
     Args:
         worlds: n worlds at the alert.
-        running: the episodes of these worlds, with all possible worlds of each world.
+        running: the episodes in ``worlds``, with all possible worlds of each world.
         vehicle: index of the shielded vehicle (0 = front), or indices of several.
         width: number of decisions of a plan.
-        scenario: the scenario of these worlds.
+        scenario: the scenario of ``worlds``.
         harm_count: which harm is minimised: ``first`` (first impact of each pair) or ``total`` (every impact).
 
     """
@@ -74,7 +74,8 @@ def _best_joint_action(running: Running, optima: list[Floats], width: int) -> Fl
 
     Args:
         running: n episodes at the alert.
-        optima: for each of the K vehicles, its best constant action while the other vehicles brake fully; K arrays [n].
+        optima: for each of the K vehicles, the constant action that does the least harm while the other K - 1 vehicles
+            brake fully; K arrays [n].
         width: number of decisions of a plan.
 
     """

@@ -28,13 +28,13 @@ class StepGuard(ShieldGuard):
 
     Args:
         engine: the engine that gets this guard.
-        policies: vehicle index -> policy that is rolled out (simulated) from each alert, and that proposes if the
-            caller gives no action.
-        shield: the shield of the engine's learners, before any episode.
+        policies: vehicle index -> policy that is simulated from each alert, and that proposes an action if the caller
+            gives no action for the vehicle.
+        shield: the shield for the engine's learners, in the state before any episode.
         mode: mode of the shield; the infos report the number of the mode.
         where: name with which error messages begin: the function or class that the user called.
-        shares: whether the infos contain the harm that each vehicle bears; if the shield has a cap, they always contain
-            this harm.
+        shares: whether the infos contain the harm that each vehicle bears; if the shield has a cap, the infos always
+            contain this harm.
         later_rollouts: whether a rollout of the policy from a later decision on may certify an action.
         told: the worlds at the alert, as the shield assumes them. If ``told`` is None, the shield knows the true
             worlds. Policies always observe the true worlds.

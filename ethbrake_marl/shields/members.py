@@ -86,11 +86,11 @@ def take_step(world: Members, m: int, state: Floats, step: int, action: Floats, 
 
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).
-        m: index of the possible world to advance.
+        m: index of the possible world that is advanced.
         state: present state of this possible world, [S].
         step: number of the present decision.
         action: actions of the shielded vehicles, [K].
-        after: receives the new state, [S].
+        after: receives the state of this possible world after the step, [S].
 
     Returns ``GOES_ON`` (0) if the episode continues, a positive code if the episode ended, or a negative code if the
     physics failed.
@@ -118,11 +118,11 @@ def take_steps(
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).
         states: present state of each possible world, [M, S], in the layout of ``Running.states``.
-        ended: whether the episode has ended in each possible world, [M].
+        ended: for each possible world, True if the episode has ended, [M].
         step: number of the present decision.
         action: actions of the shielded vehicles, [K].
         after: receives the state of each possible world after the step, [M, S].
-        over: receives whether the episode has ended after the step in each possible world, [M].
+        over: for each possible world, receives True if the episode has ended after the step, [M].
 
     Returns the number of possible worlds whose episode continues, or -1 if the physics failed.
 
@@ -233,7 +233,7 @@ def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan:
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).
         states: present state of each possible world, [M, S], in the layout of ``Running.states``.
-        ended: whether the episode has ended in each possible world, [M].
+        ended: for each possible world, True if the episode has ended, [M].
         step: number of the present decision.
         plan: actions of each decision, [L, K]; executed from the present decision on.
         most: the simulation stops as soon as the harm exceeds this number, m2/s2.

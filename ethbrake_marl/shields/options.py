@@ -31,22 +31,23 @@ class ShieldOptions:
     """Keywords of ``eb.shield``, ``HybridShield`` and the other wrappers. The mode of an extension may add keywords.
 
     Args:
-        mode: ``step`` certifies or replaces each action; an action is certified if some plan after it keeps the harm
-            within the bound. ``episode`` is the paper's Algorithm 1: the policy or E-V2X-BM drives the whole episode.
-            None means ``step``; but if ``step`` lacks one of the other settings, None means the first mode that has
-            them all.
+        mode: ``step`` certifies or replaces each action. An action is certified if some plan that begins with this
+            action keeps the harm within the bound. ``episode`` is the paper's Algorithm 1: the policy or E-V2X-BM
+            drives the whole episode. None means ``step``; but if ``step`` lacks one of the other settings, None means
+            the first mode that has them all.
         bound: method to compute ``H*``, the harm of E-V2X-BM, in mode ``episode``: ``coupled`` (the engine's physics)
             or ``pairwise`` (the paper's closed form).
         harm_count: which harm is bounded: ``first`` (first impact of each pair) or ``total`` (every impact).
         allowance: amount by which the bound is loosened, for fewer replaced actions, m2/s2; not allowed in mode
             ``episode``.
-        cap: with ``baseline``, no vehicle bears more harm than under the constant actions of least harm; only allowed
-            in mode ``step``. None: only the harm summed over all vehicles is bounded.
-        intervention_penalty: amount subtracted from the reward of a step in which the proposed action was replaced.
+        cap: ``baseline``: no vehicle bears more harm than it would bear under the constant actions that do the least
+            harm; only allowed in mode ``step``. If ``cap`` is None, only the harm summed over all vehicles is bounded.
+        intervention_penalty: amount subtracted from a learner's reward of a step in which the learner's action was
+            replaced.
         logging: whether ``shield.log`` collects the replaced actions; not allowed in mode ``episode``.
-        shares: whether ``infos`` contains the harm that each vehicle bears under the current plan and under the
-            constant actions of least harm; with a ``cap`` the infos always contain this harm. ``shares=True`` slows a
-            step by a few percent, and is not allowed in mode ``episode``.
+        shares: whether the infos contain the harm that each vehicle bears under the present plan, and under the
+            constant actions that do the least harm; if there is a ``cap``, the infos always contain this harm.
+            ``shares=True`` slows a step by a few percent, and is not allowed in mode ``episode``.
         where: name with which error messages begin: the function or class that the user called.
 
     Raises ``InvalidInput`` for an invalid setting, and ``UnknownName`` for an unknown mode.
@@ -142,7 +143,7 @@ class ShieldOptions:
             policies: vehicle index -> policy that proposes the vehicle's actions; may be empty except in mode
                 ``episode``.
             several: whether to treat a single learner as a team of one vehicle.
-            how: further keywords, passed to ``StepGuard``.
+            how: further keywords of ``StepGuard``.
 
         """
         if self.mode == "episode":

@@ -43,8 +43,8 @@ class HybridAgent(AgentAround):
     Args:
         policy: the agent that is compared with E-V2X-BM in each world, and chosen or rejected.
         scenario: the scenario in which ``policy`` and E-V2X-BM are compared.
-        bound: method to compute ``H*`` and the deceleration: ``coupled`` (the engine's physics) or ``pairwise`` (the
-            paper's closed form).
+        bound: method to compute E-V2X-BM's deceleration and ``H*``: ``coupled`` (the engine's physics) or ``pairwise``
+            (the paper's closed form).
         harm_count: which harm is compared: ``first`` (first impact of each pair) or ``total`` (every impact).
 
     The memory contains ``chosen_policy`` [n], true where the policy drives; the compared harms ``policy_harm`` [n] and

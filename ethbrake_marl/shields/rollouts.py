@@ -67,10 +67,10 @@ def certify_by_policy(
     """Return ``decision``, changed to accept each rejected proposal that a rollout of the policy can certify.
 
     Args:
-        decision: the decision of ``certify``, which tries no rollouts.
+        decision: the decision that ``certify`` made without rollouts.
         running: the n episodes at this decision.
         proposed: proposed actions, [n] or [n, K].
-        budget: largest harm that is accepted in each episode, [n] m2/s2.
+        budget: largest harm of the whole episode that the shield accepts in each world, [n] m2/s2.
         held: the shield's plans before this decision, [n, L] or [n, L, K].
         proposer: the proposing policies, with their memories and the worlds at this decision.
 
@@ -101,7 +101,7 @@ def certify_rollouts(
         running: the n episodes of the whole batch.
         proposed: proposed actions of the whole batch, [n] or [n, K].
         rows: indices of the worlds in which to decide again, [m].
-        budget: largest harm that is accepted in each episode, [n] m2/s2.
+        budget: largest harm of the whole episode that the shield accepts in each world, [n] m2/s2.
         held: the shield's present plans of the whole batch, [n, L] or [n, L, K].
         proposer: the proposing policies, with their memories and the worlds at this decision.
 
@@ -134,10 +134,11 @@ def _later_plan(
 
     Args:
         running: the n episodes of the whole batch, with one possible world each.
-        first: actions of the present decision, [m] or [m, K].
+        first: actions to apply at the present decision, [m] or [m, K].
         rows: indices of the worlds for which to make a plan, [m].
-        budget: largest harm that is accepted in each episode, [n] m2/s2.
-        held: the shield's present plans; their entries before this decision are the past actions, [n, L] or [n, L, K].
+        budget: largest harm of the whole episode that the shield accepts in each world, [n] m2/s2.
+        held: the shield's present plans, [n, L] or [n, L, K]; the entries before the present decision are the actions
+            applied so far.
         proposer: the proposing policies, with their memories and the worlds at this decision.
 
     """

@@ -102,8 +102,8 @@ class StepShield:
         allowance: amount by which the bound is loosened until the episode ends, m2/s2.
         others: scripts of the unshielded vehicles (vehicle index -> script); each script must fix its commands at the
             alert. If ``others`` is None, the scenario's scripts drive.
-        cap: with ``baseline``, no vehicle bears more harm than under the constant actions of least harm; None: only the
-            harm summed over all vehicles is bounded.
+        cap: ``baseline``: no vehicle bears more harm than it would bear under the constant actions that do the least
+            harm; None: only the harm summed over all vehicles is bounded.
         logging: whether ``log`` lists the interventions (replaced actions).
 
     Raises ``InvalidInput`` for an unknown harm count, an unknown vehicle, a negative allowance, or a script in
@@ -320,10 +320,10 @@ class StepShield:
 
         Args:
             possible: the M possible worlds of each world at the alert.
-            problem: the possible worlds, as input for the functions of ``engine.profiles``.
+            problem: the possible worlds in the form that the functions of ``engine.profiles`` need.
             rows: indices of the batch rows in which the new episodes start.
-            plan: plan made for each world at the alert, [n, L] or [n, L, K].
-            harm: harm of the plan made at the alert, the largest over the possible worlds, [n] m2/s2.
+            plan: plan made for each world at the alert: the actions of each decision, [n, L] or [n, L, K].
+            harm: harm of the plan made for each world at the alert, the largest over the possible worlds, [n] m2/s2.
 
         """
         return harm, None
@@ -343,11 +343,11 @@ class StepShield:
                 NaN, the planned action is applied.
             seen: the observed worlds, with the first columns of ``Running.states``, [n, columns]; they are compared
                 with the prediction. If ``seen`` is None, nothing is compared.
-            only: true for the worlds in which to decide, [n]; the other worlds stay unchanged. If ``only`` is None, the
+            only: True for each world in which to decide, [n]; all other worlds stay unchanged. If ``only`` is None, the
                 shield decides in all worlds whose episode has not ended.
-            proposer: the policies that propose. If no other plan certifies a proposal, the shield simulates the
-                policies after this proposal, and tries their actions as a plan. If ``proposer`` is None, no policy is
-                simulated.
+            proposer: the policies that propose actions, with their memories and the worlds at this decision. If no
+                other plan certifies a proposal, the shield simulates the policies after this proposal, and tries their
+                actions as a plan. If ``proposer`` is None, no policy is simulated.
 
         Returns the decision with the actions to apply. After the call ``memory`` contains the predicted next state.
 
@@ -407,10 +407,11 @@ class StepShield:
 
         Args:
             now: the running episodes before the decision.
-            memory: the shield's memory before the decision, with the old plan.
-            budget: largest harm that is accepted in each episode, [n] m2/s2.
-            decision: the decision of ``certify``, changed where a rollout of the policy certified a proposal.
-            asked: true for the trusted worlds in which to decide, [n].
+            memory: the shield's memory before the decision, which contains the old plan.
+            budget: largest harm of the whole episode that the shield accepts in each world, [n] m2/s2.
+            decision: the decision of ``certify``; where only a rollout of the policy certified a proposal, this
+                proposal is accepted.
+            asked: True for each world in which to decide (only trusted worlds), [n].
 
         """
         return decision

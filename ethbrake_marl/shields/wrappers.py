@@ -49,10 +49,10 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
 
     Args:
         env: ``eb.parallel_env(...)`` with one learner (in mode ``step`` one or more), or a wrapper around it.
-        policy: an agent or a policy, a ``Team``, or a mapping from learner name to policy. The policy proposes the
+        policy: an agent, a policy, a ``Team``, or a mapping from learner name to policy. The policy proposes the
             actions that the caller leaves out. In worlds where the policy does less harm than E-V2X-BM, the policy's
             harm is the bound (the harm that the episode will not exceed). Mode ``episode`` needs a policy.
-        agents: names of the shielded learners, which must be all learners; None: all learners.
+        agents: names of the learners to shield; must contain every learner. None: all learners.
         options: keywords of ``ShieldOptions``, including ``mode``.
 
     Raises ``InvalidInput`` for invalid arguments.
