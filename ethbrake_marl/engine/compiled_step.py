@@ -102,12 +102,12 @@ class Step(NamedTuple):
 
     @property
     def shared(self) -> dict[str, Floats]:
-        """Reward terms with the same value for all vehicles of a world, before weighting: {name: values, [n]}."""
+        """Unweighted reward terms that have the same value for all vehicles of a world: {name: values, [n]}."""
         return self.params.shared(self.counted_harm, self.outcome[SAFE_END])
 
     @property
     def terms(self) -> dict[str, Floats]:
-        """All reward terms before weighting: {name: values}; [n] if all vehicles have the same value, else [n, N]."""
+        """All unweighted reward terms: {name: values}; [n] if all vehicles have the same value, else [n, N]."""
         return self.shared | self.further
 
     @property

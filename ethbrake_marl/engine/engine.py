@@ -48,7 +48,7 @@ Actions = Mapping[int, NDArray[np.floating]] | NDArray[np.floating]
 
 
 class Watcher(Protocol):
-    """Observer that follows an engine's episodes without changing them, for example to record them for a picture.
+    """Observer that follows an engine's episodes without changing the episodes, for example to record a picture.
 
     The engine stores the watcher's memory together with the state of its episodes, and replaces both in a single
     assignment. If a step fails or is interrupted, memory and state stay as they were before the step. For this reason a
@@ -58,11 +58,12 @@ class Watcher(Protocol):
     def begun(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
         """Return the watcher's new memory after episodes have started in the rows (worlds) with the indices ``rows``.
 
-        ``alert``: the worlds in which episodes have started, at t = 0. ``memory``: the watcher's previous memory.
+        ``alert`` contains the worlds in which episodes have started, at t = 0. ``memory`` is the watcher's memory
+        before the episodes started.
         """
 
     def stepped(self, memory: Any, before: Engine, after: Engine) -> Any:
-        """Return the watcher's memory after a step; ``memory`` is its memory before the step.
+        """Return the watcher's memory after a step; ``memory`` is the watcher's memory before the step.
 
         ``before`` is the engine before the step, and ``after`` the engine after the step.
         """
@@ -80,7 +81,7 @@ class Ruling(NamedTuple):
 
 
 class Guard(Protocol):
-    """A shield inside an engine: it may replace the actions that the learners propose.
+    """A shield inside an engine, which may replace the actions that the learners propose.
 
     The engine calls the guard in every ``Engine.step``, so no action can bypass the guard. The engine stores the
     guard's memory and answer together with the state of its episodes, and replaces all three in a single assignment. If
@@ -91,8 +92,8 @@ class Guard(Protocol):
     def begin(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
         """Return the guard's new memory after episodes have started in the rows (worlds) with the indices ``rows``.
 
-        ``alert``: the worlds in which episodes have started, at t = 0. ``memory``: the guard's previous memory; None
-        before the first episode.
+        ``alert`` contains the worlds in which episodes have started, at t = 0. ``memory`` is the guard's memory before
+        the episodes started; None before the first episode.
         """
 
     def decide(self, running: Engine, memory: Any, proposed: Floats) -> Ruling:
@@ -106,13 +107,13 @@ class Guard(Protocol):
         """
 
     def check(self, ruling: Ruling, after: Engine) -> Any:
-        """Return the guard's memory after the step, or raise ``UncertifiedStep`` to undo the step.
+        """Return the guard's memory after the step. To undo the step, raise ``UncertifiedStep`` instead.
 
-        ``ruling``: the answer that ``decide`` returned before the step. ``after``: the engine after the step.
+        ``ruling`` is the answer that ``decide`` returned before the step. ``after`` is the engine after the step.
         """
 
     def report(self, running: Engine) -> dict[str, NDArray[Any]]:
-        """Return what the guard reports in ``info`` about the last step: dictionary name -> values, [n, N].
+        """Return the infos of the guard about the last step: dictionary from name to values, [n, N].
 
         Before the first step of an episode, the report describes what the guard decided at the alert. ``running`` is
         the engine that the guard protects.
@@ -342,11 +343,11 @@ class Engine:
 
     @property
     def _nobody_refuses_steps(self) -> bool:
-        """True if a step cannot raise an error; the engine then changes its arrays in place, which is faster."""
+        """True if a step cannot raise an error; if True, the engine changes its arrays in place, which is faster."""
         return not (self.guard or self._now.watched or self._terms.are_foreign or self._own_grid.scripts)
 
     def _columns(self, actions: Actions) -> Floats:
-        """Return the learners' actions, which are an array or a mapping as in ``step``, as an array [n, L].
+        """Return the learners' actions as an array [n, L]; ``actions`` is an array or a mapping, as in ``step``.
 
         If ``actions`` is an array [n, L] of floats or integers, ``_columns`` does not check whether they are in [-1,
         1].
@@ -381,7 +382,7 @@ class Engine:
         return np.stack(each, axis=1) if each else columns
 
     def _ruled(self, before: Engine, columns: Floats, *, checked: bool) -> Ruling:
-        """Return the guard's answer to the learners' actions ``columns`` [n, L].
+        """Return the guard's answer (``Ruling``) to the learners' actions ``columns`` [n, L].
 
         ``before`` is the engine before the step. If ``checked`` is True, the actions are known to be in [-1, 1].
         """
@@ -408,7 +409,7 @@ class Engine:
         return step
 
     def _ask_scripts(self) -> dict[int, Memory]:
-        """Write commands into ``state.wanted``: those of the scripts that have a memory and decide once per step.
+        """Let the scripts that have a memory and decide once per step write their commands into ``state.wanted``.
 
         Returns the scripts' new memories: dictionary from vehicle index to memory.
         """
@@ -425,7 +426,7 @@ class Engine:
     def _move(self, columns: Floats) -> tuple[Step, bool]:
         """Move the worlds by one step under the learners' actions ``columns`` [n, L], and deliver messages.
 
-        Returns the results of the step, and True if some world could not be advanced.
+        Returns the results of the step, and whether some world could not be advanced.
         """
         if self._now.stops:
             self._now = self._now._replace(stops=())
@@ -448,7 +449,8 @@ class Engine:
     def _drive_own_grid(self, columns: Floats) -> Way:
         """Advance the worlds to the last of the decisions that scripts make within the step.
 
-        Returns the results of the step up to this last decision. ``columns`` [n, L] contains the learners' actions.
+        Returns the results of the step up to this last decision. ``columns`` [n, L] contains the actions of the L
+        learners.
         """
         way = self._own_grid.drive_step(self.state, self._now.rules, self._in_range(columns))
         self._change(memories=way.memories)
@@ -531,7 +533,7 @@ class Engine:
 
     @property
     def _nobody_refuses_episodes(self) -> bool:
-        """True if the start of an episode cannot raise an error; the engine then changes its arrays in place."""
+        """True if the start of an episode cannot raise an error; if True, the engine changes its arrays in place."""
         return not (self._now.watched or self._remembering or self.guard or self._terms.count_impacts)
 
     def cut(self, step: Step, most_steps: int) -> None:
@@ -543,7 +545,7 @@ class Engine:
         step.outcome[TRUNCATED, cut] = self._now.state.clock[cut, ENDED] = 1.0
 
     def segments(self, before: Worlds, last_mps2: Floats) -> Iterator[tuple[Worlds, Floats, Floats]]:
-        """Yield the segments of the last step: intervals between decisions that scripts made within the step.
+        """Yield the segments into which the decisions that scripts made within the last step divide this step.
 
         After a reset and before the first step, the segments lead from the alert to the first decision. Each segment is
         a tuple: the worlds at the start of the segment, the vehicles' commands in the segment ([n, N] m/s2), and the
@@ -561,7 +563,7 @@ class Engine:
         yield before, last_mps2, self.state.time_s.copy()
 
     def protect(self, guard: Guard | None) -> None:
-        """Use ``guard`` from the next reset on; None removes the present guard."""
+        """Use ``guard`` as the guard of this engine from the next reset on; None removes the present guard."""
         self.guard = guard
         self._now = self._now._replace(state=self._now.state._replace(guarded=None), ruling=None)
 
@@ -709,17 +711,17 @@ class Engine:
 
     @property
     def worlds(self) -> Worlds:
-        """Copy of the running worlds."""
+        """The worlds of the running episodes, as a copy."""
         return self._now.rules.unpack(self.packed)
 
     @property
     def packed(self) -> Packed:
-        """Running worlds packed into two arrays (layout: ``physics.columns``); not a copy, so do not change them."""
+        """The running worlds, packed into two arrays (layout: ``physics.columns``); not a copy, so only read them."""
         return self._now.state.packed
 
     @property
     def wanted_mps2(self) -> Floats:
-        """Acceleration that each vehicle commanded in the last step, [n, N] m/s2; not a copy."""
+        """Acceleration that each vehicle commanded in the last step, [n, N] m/s2; not a copy, so only read it."""
         return self._now.state.wanted
 
     @property
@@ -757,7 +759,7 @@ class Engine:
 
     @property
     def memories(self) -> dict[int, Memory]:
-        """Memories of the scripts that have one: dictionary from vehicle index to memory."""
+        """Memories of all scripts that have a memory: dictionary from vehicle index to memory."""
         return self._now.state.memories
 
     @property

@@ -239,10 +239,10 @@ def _who(script: Script, vehicle: int) -> str:
 
 
 def _named(error: Exception, script: Script, what: str, worlds: Worlds, vehicle: int) -> Exception:
-    """Return the exception to raise in place of ``error``, which a script raised.
+    """Return the exception to raise instead of ``error``, which a script raised.
 
-    The result is an ``InvalidInput`` that names the script. If the script belongs to this package, or if ``error`` is
-    an ``EthBrakeError``, the result is ``error`` itself.
+    The result is an ``InvalidInput`` whose message names the script. If the script belongs to this package, or if
+    ``error`` is an ``EthBrakeError``, the result is ``error`` itself.
 
     Args:
         error: the exception that the script raised.

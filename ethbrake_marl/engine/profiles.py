@@ -74,7 +74,7 @@ class ProfileProblem(NamedTuple):
         return len(self.start)
 
     def take(self, rows: Ints) -> ProfileProblem:
-        """Return the same problem for only the worlds with the indices ``rows``."""
+        """Return this problem restricted to the worlds with the indices ``rows``."""
         arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in self._fields[1:]}
         return self._replace(**arrays)
 
@@ -108,16 +108,17 @@ class ProfileProblem(NamedTuple):
         )
 
     def even_grid(self, number: int) -> Floats:
-        """Return ``number`` evenly spaced commands of each controlled vehicle, [n, number, C] m/s2.
+        """Return ``number`` evenly spaced commands for each controlled vehicle, [n, number, C] m/s2.
 
-        The commands range from full braking to full driving. No command exceeds a capacity by a rounding error.
+        The commands range from full braking to full driving. No command exceeds a capacity, not even by a rounding
+        error.
         """
         low, high = self.bounds[:, np.newaxis, :, 0], self.bounds[:, np.newaxis, :, 1]
         share = np.linspace(0.0, 1.0, number)[:, np.newaxis]
         return np.asarray(np.minimum(low + share * (high - low), high), np.float64)
 
     def minimising(self, weights: Floats, *, largest: bool = False) -> ProfileProblem:
-        """Return a copy of this problem in which a search minimises the weighted harm of the vehicles.
+        """Return a copy of this problem in which searches minimise a weighted harm of the vehicles.
 
         The harm count (first-impact or total harm) and the field ``identity`` stay the same.
 
@@ -137,7 +138,7 @@ class ProfileProblem(NamedTuple):
         return self._replace(weights=pairs, clock=clock)
 
     def follow(self, profiles: Profiles) -> tuple[Floats, Floats]:
-        """Return the first-impact harm and the total harm of each world under its profile, [n] m2/s2 each.
+        """Return first-impact harm and total harm of each world if each world follows its profile, [n] m2/s2 each.
 
         An engine whose vehicles follow the same commands computes exactly the same harm, to the last bit. Raises
         ``InvalidInput`` for profiles that do not fit the problem or exceed a capacity, and ``PhysicsError``, which
@@ -147,7 +148,7 @@ class ProfileProblem(NamedTuple):
         return line_sum(first, np.zeros(self.n)), line_sum(total, np.zeros(self.n))
 
     def values(self, profiles: Profiles) -> dict[HarmCount, Floats]:
-        """Return the value that a search minimises, of each world under its profile: {harm count: value, [n] m2/s2}.
+        """Return the value that a search minimises, if each world follows its profile: {harm count: value, [n] m2/s2}.
 
         The value is the harm summed over the line. In a problem that ``minimising`` has returned, the value is instead
         the sum of the vehicles' weighted harms, or the largest of these harms. Raises the same errors as ``follow``.
@@ -177,8 +178,7 @@ class ProfileProblem(NamedTuple):
         return harms
 
     def follow_pairs(self, profiles: Profiles) -> tuple[Floats, Floats]:
-        """Return the first-impact harm and the total harm of each pair if each world follows its profile, [n, P] m2/s2
-        each.
+        """Return first-impact harm and total harm of each pair if each world follows its profile, [n, P] m2/s2 each.
 
         If there is an obstacle ahead, the first pair consists of the obstacle and Vehicle 1. Raises the same errors as
         ``follow``.
@@ -232,7 +232,7 @@ def profile_problem(
     deciders: Sequence[int] | None = None,
     written_out: bool = False,
 ) -> ProfileProblem:
-    """Return the problem of choosing commands of some vehicles over a whole episode that cause the least harm.
+    """Return the problem of choosing commands of some vehicles over a whole episode, such that the harm is least.
 
     Args:
         worlds: n worlds.

@@ -59,10 +59,10 @@ class Terms:
         return 0.0 if self._objectives else self.params.harm
 
     def vector(self, step: Step, before: Ledger, state: State) -> Floats:
-        """Return the vector reward of a step, [n, N, K]; 0 for episodes that had ended before the step.
+        """Return the vector reward of a step, [n, N, K]; 0 where the episode had ended before the step.
 
-        ``step``: results of the step. ``before``: harm of each pair from the alert to the beginning of the step.
-        ``state``: state after the step.
+        ``step`` contains the results of the step. ``before`` contains the harm of each pair from the alert to the
+        beginning of the step. ``state`` is the state after the step.
         """
         vector = vector_of(self.components, state.ledger.since(before), self.params.harm_count, step.terms)
         vector[state.ended & ~step.ended] = 0.0

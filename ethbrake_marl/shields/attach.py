@@ -20,7 +20,7 @@ from ethbrake_marl.shields.options import ShieldOptions
 def proposing_agent(policy: object, where: str) -> Agent:
     """Return ``policy`` as an agent: an agent is returned unchanged, a learned policy becomes a ``LearnedAgent``.
 
-    Raises ``InvalidInput`` for any other object; the message begins with ``where``.
+    Raises ``InvalidInput`` if ``policy`` is neither an agent nor a learned policy; the message begins with ``where``.
     """
     if not isinstance(policy, type):
         if isinstance(policy, Agent):
@@ -36,7 +36,7 @@ def proposing_agent(policy: object, where: str) -> Agent:
 def proposing_agents(
     policy: Agent | LearnedPolicy | Team | Mapping[str, Agent | LearnedPolicy], vehicles: Sequence[int], where: str
 ) -> dict[int, Agent]:
-    """Return the proposing agent of each shielded vehicle: vehicle index -> agent.
+    """Return the agents that propose the actions of the shielded vehicles: vehicle index -> agent.
 
     Args:
         policy: a team, a mapping from vehicle name to policy, or one policy that proposes the actions of all vehicles.
@@ -70,8 +70,8 @@ def guard_of(engine: Engine, policy: Proposing | None, options: ShieldOptions) -
 
     Args:
         engine: the engine whose learners are shielded; this function does not change the engine.
-        policy: policy that proposes the actions that the caller leaves out. ``policy`` may be None, except in mode
-            ``episode``.
+        policy: policy that proposes the actions that the caller leaves out. In all modes except ``episode``, ``policy``
+            may be None.
         options: settings of the shield.
 
     Raises ``InvalidInput`` if no vehicle learns, if several vehicles learn and the mode is not ``step``, and if
@@ -111,7 +111,7 @@ class Attached:
         options: keywords of ``ShieldOptions``.
 
     An ``Attached`` object has the attributes ``engine``, ``guard`` and ``options``. Raises ``InvalidInput`` if ``env``
-    is not an environment of this package, or already has a shield.
+    is not an environment of this package, or if ``env`` already has a shield.
 
     """
 

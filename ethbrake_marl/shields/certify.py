@@ -85,7 +85,7 @@ def better_plan(
     world: Members, states: Floats, ended: Bools, step: int, constants: Floats, value: float, most: float,
     plan: Floats, trial: Floats,
 ) -> tuple[float, float]:  # fmt: skip
-    """Replace the rest of a plan by the best constant action, if the harm is then below ``value`` and at most ``most``.
+    """Replace the rest of a plan by the best constant action if the harm is then below ``value`` and at most ``most``.
 
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).
@@ -98,7 +98,8 @@ def better_plan(
         plan: the present plan, with the actions of each decision, [L, K]; changed in place.
         trial: workspace for the plan that is tried, [L, K].
 
-    Returns the harm of the resulting plan, and the least harm of any plan tried, accepted or not (both m2/s2).
+    Returns the harm of the resulting plan, and the least harm of all plans that were tried, whether accepted or not
+    (both m2/s2).
 
     """
     so_far = worst_so_far(world, states)
@@ -158,8 +159,8 @@ def try_action(
         after: receives the state of each possible world after the step, [M, S].
         over: for each possible world, receives True if the episode has ended after the step, [M].
 
-    Returns the harm of the resulting plan, the least harm of any plan tried (both m2/s2), and the reason (a code of
-    ``ShieldReason``). The search succeeded if the harm of the resulting plan is at most ``budget``.
+    Returns the harm of the resulting plan, the least harm of all plans that were tried (both m2/s2), and the reason (a
+    code of ``ShieldReason``). The search succeeded if the harm of the resulting plan is at most ``budget``.
 
     """
     going = take_steps(world, states, ended, step, action, after, over)
@@ -229,7 +230,7 @@ def decide_world(
         over: for each possible world, receives True if the episode has ended after the step, [M].
         out: receives, for each shielded vehicle, the applied action, reason, bound and margin, [K, 4].
 
-    Returns False if the physics fails with the applied actions, otherwise True.
+    Returns False if the physics fails with the actions to apply, otherwise True.
 
     """
     deviating = 0
@@ -314,9 +315,9 @@ def certify_worlds(
 
 @compiled
 def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Floats) -> None:
-    """Compute the harm of each whole episode if its plan is executed from now on; write it to ``value`` [n] m2/s2.
+    """Write into ``value`` [n] m2/s2 the harm of each whole episode if its plan is executed from now on.
 
-    The harm of a plan is its largest harm over the possible worlds; it is infinite if the physics fails. If one of the
+    The harm of a plan is the largest harm over the possible worlds, and infinite if the physics fails. If one of the
     ``constants`` [C, K], held to the horizon, causes less harm than the rest of a plan, this constant action replaces
     the rest of the plan in ``plans`` [n, L, K], and ``value`` contains the harm of the changed plan.
     """
@@ -337,9 +338,9 @@ def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Flo
 def ends_of_plans(running: Running, plans: Floats, rests: Bools, borne: Floats) -> None:
     """Simulate the ``plans`` [n, L, K] from now on and report how the episodes end.
 
-    ``running`` contains n worlds, each with M possible worlds. The results are written into two arrays. ``rests`` [n]:
-    whether all vehicles come to rest before the horizon and stay at rest, in every possible world. ``borne`` [n * M,
-    N]: the harm that each vehicle bears in the whole episode, m2/s2 (0 for an obstacle ahead).
+    ``running`` contains n worlds, each with M possible worlds. The results are written into the arrays ``rests`` and
+    ``borne``. ``rests`` [n]: whether all vehicles come to rest before the horizon and stay at rest, in every possible
+    world. ``borne`` [n * M, N]: the harm that each vehicle bears in the whole episode, m2/s2 (0 for an obstacle ahead).
     """
     n, every = running.steps.shape[0], all_members(running)
     M = running.states.shape[0] // max(n, 1)
@@ -354,7 +355,7 @@ def ends_of_plans(running: Running, plans: Floats, rests: Bools, borne: Floats) 
 
 @compiled
 def descend_constants(running: Running, grid: Floats, rounds: int, action: Floats) -> None:
-    """Improve constant actions by coordinate descent over the vehicles.
+    """Improve the vehicles' constant actions by coordinate descent: change the action of one vehicle at a time.
 
     For one vehicle after the other, the vehicle's action is replaced by the action in ``grid`` that does the least harm
     while the other vehicles keep their actions. Each tried action is held to the horizon, and the time until the
@@ -385,7 +386,7 @@ CONSTANTS = tuple(-k / 10 for k in range(11))  # constant actions that are tried
 
 
 class Backup(NamedTuple):
-    """The shield's present plans in n worlds; a plan is executed where no proposal is accepted."""
+    """The shield's present plans in n worlds. Where a proposal is not accepted, the plan's action is applied."""
 
     plan: Floats  # [n, L], or [n, L, K] for K shielded vehicles: actions of each decision; entry j is for decision j
     harm: Floats  # [n] harm of the episode in the worst possible world if the plan is executed from now on (m2/s2)
@@ -435,7 +436,7 @@ def plan_harm(running: Running, plan: Floats) -> Floats:
 
 
 def bettered_plan(running: Running, plan: Floats, constants: Floats) -> tuple[Floats, Floats]:
-    """Replace the rest of each plan by the best constant action where this causes less harm; return plans and harms.
+    """Replace the rest of a plan by the best constant action where that lowers the harm; return plans and harms.
 
     Args:
         running: the n episodes at a decision.
@@ -473,7 +474,8 @@ def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) 
 
     Args:
         running: the running episodes at this decision.
-        proposed: proposed actions, [n] or [n, K]; clipped to [-1, 1]. NaN is replaced by the planned action.
+        proposed: proposed actions, [n] or [n, K]; clipped to [-1, 1]. A proposed action NaN is replaced by the planned
+            action.
         backup: the present plan of each world, and the plan's harm; where a proposal cannot be certified, the plan is
             executed.
         budget: largest harm of the whole episode that the shield accepts in each world, [n] m2/s2; at least the harm of

@@ -74,10 +74,11 @@ class Guarded(NamedTuple):
 
     @property
     def told(self) -> dict[str, Any]:
-        """The shield's ``predicted_harm`` [n] and ``chosen_policy`` [n] by name; None if the shield has no such value.
+        """Dictionary of the shield's ``predicted_harm`` [n] and ``chosen_policy`` [n]; None if the shield lacks the
+        value.
 
-        ``predicted_harm`` is the harm predicted at the alert (m2/s2). ``chosen_policy`` says in which worlds the policy
-        drives.
+        ``predicted_harm`` is the harm predicted at the alert (m2/s2). ``chosen_policy`` is True in the worlds where the
+        policy drives.
         """
         return {what: getattr(self.shield, what, None) for what in ("predicted_harm", "chosen_policy")}
 
@@ -125,7 +126,7 @@ class ShieldGuard(ABC):
         """Start episodes in the rows with the indices ``rows``; return the shield's new state.
 
         ``alert`` contains the new worlds at the alert (t = 0), one for each of ``rows``. ``shield`` is a copy of the
-        shield's old state; this method may change the copy.
+        shield's old state, which this method may change.
         """
 
     @abstractmethod
@@ -169,8 +170,8 @@ class ShieldGuard(ABC):
     def report(self, running: Engine) -> dict[str, NDArray[Any]]:
         """Return the infos of every vehicle: name (without ``shield_``) -> values [n, N].
 
-        The infos describe the last step of the engine ``running``. In a row where a new episode has just started, the
-        infos describe the alert of this episode instead.
+        The infos describe the last step of the engine, which is ``running``. In a row where a new episode has just
+        started, the infos describe the alert of the new episode instead.
         """
         memory: Any = running.guarded
         ruling, first = running.ruling, running.steps == 0
@@ -183,10 +184,10 @@ class ShieldGuard(ABC):
         return last
 
     def _of_vehicles(self, infos: Mapping[str, Any], running: Engine) -> dict[str, NDArray[Any]]:
-        """Return the ``infos`` (name -> value) with every value expanded to all vehicles, [n, N].
+        """Return ``infos`` (name -> value) with every value expanded to an array with one number per vehicle, [n, N].
 
-        ``running`` is the engine. If a value has one column per learner, the vehicles that do not learn get 0 (for the
-        value ``reason``: ``NO_DECISION``).
+        ``running`` is the engine that the guard protects. If a value has one column per learner, the columns of all
+        other vehicles are 0 (in the info ``reason``: ``NO_DECISION``).
         """
         shape, spread = running.wanted_mps2.shape, dict[str, NDArray[Any]]()
         for name, value in infos.items():
@@ -199,8 +200,7 @@ class ShieldGuard(ABC):
         return spread
 
     def _of_step(self, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos that all modes report: mode, proposed and applied action, and whether the action was
-        replaced.
+        """Return the infos of all modes: mode, proposed action, applied action, and whether the action was replaced.
 
         ``ruling`` is the decision in the last step. Before the first step ``ruling`` is None, and the infos report 0 as
         the proposed and the applied action.
@@ -214,7 +214,7 @@ class ShieldGuard(ABC):
     def _asked(
         self, worlds: Worlds | None, memories: dict[int, Memory], proposed: Floats
     ) -> tuple[Floats, dict[int, Memory]]:
-        """Let policies propose for learners without an action; return proposals [n, L] and the policies' memories.
+        """Let policies propose for learners without an action; return all proposals [n, L] and the policies' memories.
 
         Args:
             worlds: the n worlds that the policies observe; may be None if no policy is called.
@@ -237,7 +237,7 @@ class ShieldGuard(ABC):
         return proposed, memories
 
     def _proposer(self, memories: dict[int, Memory], worlds: Worlds | None) -> Proposer | None:
-        """Return the policies with their ``memories`` and the current ``worlds``, as a rollout needs them.
+        """Return the policies with their ``memories`` and the present ``worlds``, from which a rollout can start.
 
         Returns None if the guard has no policies, or if ``worlds`` is None.
         """
@@ -248,8 +248,8 @@ def why(ruling: Ruling | None) -> dict[str, Any]:
     """Return the infos ``reason`` and ``margin`` of a decision of mode ``step``, each [n, L].
 
     ``reason`` is a code of ``ShieldReason``. ``margin`` is the budget (the largest harm that is accepted) minus the
-    least harm of any plan tried after the proposal, m2/s2. Before the first decision ``ruling`` is None; then the
-    reason is ``NO_DECISION`` and the margin is 0.
+    least harm of any plan tried after the proposal, m2/s2. Before the first decision ``ruling`` is None, and the infos
+    report the reason ``NO_DECISION`` and the margin 0.
     """
     if ruling is None:
         return {"reason": ShieldReason.NO_DECISION, "margin": 0.0}

@@ -83,7 +83,7 @@ class ShieldedDriver(ByPolicy):
 
     @classmethod
     def around(cls, driver: Driver, task: Task, **settings: Any) -> Team:
-        """Return a team in which copies of ``driver``, behind one shield, drive the vehicles of ``task``.
+        """Return a team in which copies of ``driver``, behind one shield, drive the controlled vehicles of ``task``.
 
         The scenario and the harm count come from ``task``; ``settings`` are further keywords of ``ShieldedDriver``.
         """

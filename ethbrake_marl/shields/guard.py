@@ -24,7 +24,7 @@ class MovingAtHorizon(UserWarning):
 
 
 class StepGuard(ShieldGuard):
-    """Guard of mode ``step``: certify every proposed action, or replace it.
+    """Guard of mode ``step``, which certifies or replaces every proposed action.
 
     Args:
         engine: the engine that gets this guard.
@@ -140,8 +140,7 @@ class StepGuard(ShieldGuard):
         return memory._replace(shield=shield)
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos of a step by name: actions, reason, margin, bound, trusted, settles, and shares if asked
-        for.
+        """Return the infos of a step by name: actions, reason, margin, bound, trusted, settles; shares if asked for.
 
         ``memory`` is the guard's memory. ``ruling`` is the decision in the step, None before the first decision. Each
         value is a number, or an array with one number per world [n], learner [n, L] or vehicle [n, N].

@@ -1,4 +1,4 @@
-"""Log of a step shield: every proposed action that the shield replaced."""
+"""The log of a step shield, which lists every proposed action that the shield replaced."""
 
 from __future__ import annotations
 

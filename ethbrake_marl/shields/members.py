@@ -1,4 +1,4 @@
-"""Simulate the possible worlds of a world, decision by decision, with exactly the operations of the engine's step.
+"""Simulate the possible worlds of a world, decision by decision, with the same floating-point operations as the engine.
 
 The shield's bound must hold in each of the M possible worlds (*members*) of a world. Usually M is 1: the world itself
 is its only member. K of the N vehicles are shielded. An action of the shield is an array [K] with one number per
@@ -164,7 +164,7 @@ def borne_by(table: Floats, total: float, i: int) -> float:
 
 @compiled
 def within_caps(world: Members, m: int) -> bool:
-    """Return whether every vehicle bears at most its cap in possible world ``m``; True without caps.
+    """Return whether every vehicle bears at most its cap in possible world ``m``; True if there are no caps.
 
     A cap is the largest harm that a vehicle may bear. ``world.table`` must contain the state of possible world ``m``.
     """
@@ -256,7 +256,8 @@ def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan:
 def hold_constant(world: Members, m: int, state: Floats, ended: bool, step: int, constants: Floats, c: int) -> float:
     """Return the harm in one possible world if a constant action is held to the horizon, m2/s2.
 
-    The time until the horizon is simulated in one go, not decision by decision. Returns infinity if the physics fails.
+    The time until the horizon is simulated in one go, not decision by decision. Returns infinity as the harm if the
+    physics fails.
 
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).

@@ -72,7 +72,7 @@ class ShieldOptions:
     def __new__(cls, mode: str | None = None, **settings: Any) -> ShieldOptions:
         """Create an instance of the first class that has all ``settings``; the class of ``mode`` is tried first.
 
-        ``ShieldOptions(mode, setting=...)`` thus accepts the settings of every installed mode.
+        For this reason ``ShieldOptions(mode, setting=...)`` accepts the settings of every installed mode.
         """
         if cls is ShieldOptions:
             cls = _class_with("step" if mode is None else check_mode(mode), settings)
@@ -95,7 +95,7 @@ class ShieldOptions:
         object.__setattr__(self, "mode", mode)
 
     def check_switches(self, *names: str) -> None:
-        """Raise ``InvalidInput`` unless each setting named in ``names`` is True or False."""
+        """Raise ``InvalidInput`` if a setting whose name is in ``names`` is neither True nor False."""
         for name in names:
             if not isinstance(getattr(self, name), bool):
                 raise InvalidInput(f"{self.where}: {name} = {getattr(self, name)!r}: must be True or False")
@@ -113,7 +113,7 @@ class ShieldOptions:
     def shield(
         self, scenario: Scenario, vehicle: int | tuple[int, ...], others: Mapping[int, Script] | None = None
     ) -> Any:
-        """Return a new shield with these settings, for every mode except ``episode``.
+        """Return a new shield with these settings (not for mode ``episode``, whose guard is made without this method).
 
         Args:
             scenario: the scenario of all episodes.
@@ -162,7 +162,7 @@ def check_mode(mode: object) -> str:
 
 
 def misplaced(name: str, value: object, mode: str, takers: list[str], where: str) -> InvalidInput:
-    """Return the error to raise for a setting that a mode does not accept.
+    """Return the error to raise for a setting that the mode ``mode`` does not accept.
 
     Args:
         name: name of the setting.
@@ -187,7 +187,7 @@ def one_learner(scenario: Scenario) -> int | None:
 
 
 def _class_with(mode: str, settings: Mapping[str, Any]) -> type[ShieldOptions]:
-    """Return the settings class of ``mode`` if it has all ``settings``, otherwise the first class that has them.
+    """Return the settings class of ``mode`` if it has all ``settings``, otherwise the first class that has them all.
 
     Raises ``UnknownName`` for a setting that no mode has.
     """

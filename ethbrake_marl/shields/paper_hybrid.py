@@ -35,10 +35,9 @@ Bound = Literal["coupled", "pairwise"]  # method to compute H* and a*: the engin
 
 
 class HybridAgent(AgentAround):
-    """Agent that drives by ``policy`` in worlds where the policy's rollout does at most the harm ``H*``, else by
-    E-V2X-BM.
+    """Agent that drives by ``policy`` where the policy's rollout does at most the harm ``H*``, otherwise by E-V2X-BM.
 
-    The rollout simulates the policy from the alert on. ``H*`` is the harm of E-V2X-BM's constant deceleration.
+    The policy's rollout simulates the policy from the alert on. ``H*`` is the harm of E-V2X-BM's constant deceleration.
 
     Args:
         policy: the agent that is compared with E-V2X-BM in each world, and chosen or rejected.
@@ -113,7 +112,7 @@ class FixedCommand:
         self.command_mps2 = command_mps2
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        """Return the command of each world, [n] m/s2."""
+        """Return the fixed command of each world, [n] m/s2."""
         return self.command_mps2
 
 

@@ -1,8 +1,8 @@
 """Rollouts of the proposing policies: simulations in which the policies drive. The actions of a rollout become a plan.
 
 A plan has one action for each decision. A rollout starts at the alert or at a later decision, and its plan is certified
-like any other plan (``plan_harm``). If a policy later deviates from its rollout, the shield may have to intervene; the
-bound still holds.
+like any other plan (``plan_harm``). If a policy later deviates from its rollout, the shield may replace actions of the
+policy; the bound still holds.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Proposer(NamedTuple):
 def rolled_out(
     worlds: Worlds, policies: Mapping[int, Agent], scenario: Scenario, vehicle: int | tuple[int, ...], width: int
 ) -> Floats:
-    """Return the actions of policies that drive without a shield from the alert to the end of the episodes.
+    """Return the actions of ``policies``, which drive without a shield from the alert to the end of the episodes.
 
     Args:
         worlds: n worlds at the alert.
@@ -50,8 +50,8 @@ def rolled_out(
         vehicle: index of the only shielded vehicle, or a tuple of K indices.
         width: number of decisions for which to return actions.
 
-    Returns actions, [n, width] if ``vehicle`` is an index, [n, width, K] if it is a tuple. After the end of an episode
-    the actions are full braking.
+    Returns actions, [n, width] if ``vehicle`` is an index, [n, width, K] if it is a tuple. For decisions after the end
+    of an episode, the result contains full braking.
 
     """
     team = Team({i: _Rounded(policy) for i, policy in policies.items()}, next(iter(policies.values())).name)
@@ -64,7 +64,7 @@ def rolled_out(
 def certify_by_policy(
     decision: Decision, running: Running, proposed: Floats, budget: Floats, held: Floats, proposer: Proposer
 ) -> Decision:
-    """Return ``decision``, changed to accept each rejected proposal that a rollout of the policy can certify.
+    """Return ``decision``, changed so that each rejected proposal that a rollout of the policy certifies is accepted.
 
     Args:
         decision: the decision that ``certify`` made without rollouts.
@@ -90,7 +90,7 @@ def certify_by_policy(
 def certify_rollouts(
     running: Running, proposed: Floats, rows: Ints, budget: Floats, held: Floats, proposer: Proposer
 ) -> Decision:
-    """Decide again in worlds whose proposals were rejected, with rollouts of the policy as plans.
+    """Decide again in the worlds whose proposals were rejected; this time the plans are rollouts of the policy.
 
     In each world one plan is tried: the proposal, clipped to [-1, 1], followed by the policy's actions in a simulation
     from the next state on. If this plan stays within the budget and the caps, the plan becomes the backup, and the
@@ -128,7 +128,7 @@ def certify_rollouts(
 def _later_plan(
     running: Running, first: Floats, rows: Ints, budget: Floats, held: Floats, proposer: Proposer
 ) -> Floats:
-    """Return plans of m worlds: past actions, then ``first``, then the actions of a rollout of the policies.
+    """Return plans for m worlds: the actions so far, then ``first``, then the actions of a rollout of the policies.
 
     A rollout stops as soon as its harm exceeds the budget.
 
@@ -189,8 +189,8 @@ def proposed_actions(
 ) -> tuple[Floats, dict[int, Memory]]:
     """Return the actions that the policies propose, [n, K] in [-1, 1], and the new memory of each vehicle's policy.
 
-    ``policies`` maps the index of each of K vehicles to its policy. ``memories`` maps the same index to the policy's
-    memory. ``worlds`` are n worlds at a decision.
+    ``policies`` maps the index of each of K vehicles to its policy. ``memories`` maps the index of each vehicle to the
+    memory of its policy. ``worlds`` are n worlds at a decision.
     """
     asked = {i: proposed_action(policy, worlds, memories[i], i) for i, policy in policies.items()}
     after = {i: memory for i, (_, memory) in asked.items()}
@@ -209,7 +209,7 @@ def proposed_action(policy: Agent, worlds: Worlds, memory: Memory, vehicle: int)
 class _Rounded(AgentAround):
     """Policy whose commands are converted to actions and back, so that they are rounded as in a plan.
 
-    ``memory["action"]`` contains the last actions of the policy.
+    ``memory["action"]`` contains the last actions that the policy chose.
     """
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:

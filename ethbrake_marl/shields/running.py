@@ -17,7 +17,7 @@ class Running(NamedTuple):
 
     The possible worlds of world k are in rows k * M to k * M + M - 1. Row k * M contains world k itself, the *nominal*
     world. For K shielded vehicles, actions have the shape [n, K] and plans (one action for each of L decisions) the
-    shape [n, L, K]. For a single shielded vehicle, the axis K may be left out.
+    shape [n, L, K]. For a single shielded vehicle, actions and plans may lack the axis K.
     """
 
     problem: ProfileProblem  # parameters, commands of unshielded vehicles and times of the decisions, in n * M rows
@@ -28,7 +28,7 @@ class Running(NamedTuple):
 
     @property
     def uncapped(self) -> Running:
-        """The same episodes without ``caps`` (the limits of each vehicle's harm)."""
+        """These episodes without ``caps`` (the limits of each vehicle's harm)."""
         return self._replace(caps=np.zeros((0, 0)))
 
     @property
@@ -61,7 +61,7 @@ class Running(NamedTuple):
         return self._select(self.rows_of(worlds), worlds)
 
     def nominal(self) -> Running:
-        """Return the same episodes with a single possible world each: the world itself."""
+        """Return these episodes with a single possible world for each world: the world itself."""
         if self.members == 1:
             return self
         return self._select(np.arange(self.n) * self.members, np.arange(self.n))

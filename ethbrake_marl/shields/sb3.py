@@ -19,10 +19,10 @@ from ethbrake_marl.shields.attach import Attached, Proposing
 class ShieldedVecEnv(SeededInside, VecEnvWrapper):
     """The environment of ``make_sb3_vec_env`` behind a shield, by default in mode ``step``.
 
-    Each row belongs to one learner. The shield decides on all learners of one world together. At every step the infos
-    of each row contain ``shield_bound_harm`` and the other ``shield_...`` keys. ``reset_infos`` contains the
-    ``shield_...`` keys for the alert. The episode's return in ``infos[row]["episode"]`` does not include the
-    intervention penalty.
+    Each row of the environment belongs to one learner of one world. The shield decides on all learners of one world
+    together. At every step the infos of each row contain ``shield_bound_harm`` and the other ``shield_...`` keys.
+    ``reset_infos`` contains the ``shield_...`` keys for the alert. The episode's return in ``infos[row]["episode"]``
+    does not include the intervention penalty.
 
     Args:
         venv: an environment made by ``make_sb3_vec_env``.

@@ -1,16 +1,16 @@
 """Mode ``step`` of the shield: keep the harm of the episode within a bound, whatever actions are proposed.
 
-**Claim.** The *bound* is the harm that the episode will not exceed. Let ``B`` be the bound at the first decision: the
-harm of the plan made at the alert. If every step applies the action that ``certify`` returns, then the harm at the end
-of the episode is at most ``B``, whatever actions are proposed. The bound never rises during the episode. An episode
-ends at rest or at the scenario's horizon. The claim does not cover anything that happens after the horizon.
+**Claim.** The *bound* is the harm that the episode will not exceed. Let ``B`` be the bound at the first decision, which
+is the harm of the plan made at the alert. If every step applies the action that ``certify`` returns, then the harm at
+the end of the episode is at most ``B``, whatever actions are proposed. The bound never rises during the episode. An
+episode ends at rest or at the scenario's horizon. The claim does not cover anything that happens after the horizon.
 
-**Induction.** Between two decisions the shield has a *plan* with an action for every decision up to the horizon. Let
-``c`` be the harm of the plan: the harm of the whole episode if the plan is executed from the present state. ``c``
-includes the harm so far. In the first-impact count, ``c`` leaves out further impacts of pairs that already had an
-impact. The function ``members.follow_plan`` computes ``c``. ``follow_plan`` simulates the plan decision by decision,
-with the same floating-point operations as the engine's step, in the same order. ``follow_plan`` also adds up the harm
-in the same order as the engine. Hence:
+**Induction.** Between two decisions the shield has a *plan*, which contains an action for every decision up to the
+horizon. Let ``c`` be the harm of the plan: the harm of the whole episode if the plan is executed from the present
+state. ``c`` includes the harm so far. In the first-impact count, ``c`` leaves out further impacts of pairs that already
+had an impact. The function ``members.follow_plan`` computes ``c``. ``follow_plan`` simulates the plan decision by
+decision, with the same floating-point operations as the engine's step, in the same order. ``follow_plan`` also adds up
+the harm in the same order as the engine. Hence:
 
 1. *Start.* At the first decision ``c = B``.
 
@@ -34,12 +34,12 @@ the last bound are the same floating-point number.
 **Several vehicles.** With several shielded vehicles, each action in the proof is an array with one action per shielded
 vehicle. The shield first tries all proposals together. If no plan after all proposals stays within the budget, the
 shield tries the proposals one by one, front to rear: one vehicle's proposal replaces that vehicle's action in the plan.
-This single proposal is accepted if some plan after it stays within the budget; if not, the vehicle's planned action
-remains. Before and after each proposal is tried, the shield has a plan whose harm is at most the budget.
+A single proposal is accepted if some plan after this proposal stays within the budget; if not, the vehicle's planned
+action remains. Before and after each proposal is tried, the shield has a plan whose harm is at most the budget.
 
 **Several members.** The shield may consider several possible worlds, the *members* of a world. With several members,
-each harm in the proof is the largest harm over the members, and the same actions are executed in all members. So the
-harm of the episode is at most ``B`` in *every* member.
+each harm in the proof is the largest harm over the members, and the same actions are executed in all members. So in
+*every* member the harm of the episode is at most ``B``.
 """
 
 from __future__ import annotations
@@ -89,11 +89,13 @@ class StepShield:
     prediction (a vehicle brakes beyond its capacity, a number is NaN, a message is missing), this world is marked in
     ``memory.distrusted`` [n], and its bound no longer holds. In a distrusted world the shield ignores proposals for the
     rest of the episode, and applies the rest of the plan or the best constant action, whichever does less harm. The
-    shield repeats this choice whenever a distrusted world again differs from the prediction. If an episode goes on
-    after its predicted end, the shielded vehicles brake fully.
+    shield chooses again between the plan and the best constant action whenever a distrusted world differs from the
+    prediction. If the engine continues an episode after the end that the shield predicted, the shielded vehicles brake
+    fully.
 
     If ``begin`` gets several ``possible`` worlds for each world, each harm is the largest harm over these possible
-    worlds. Each observed number must then lie within the range of its predictions in these possible worlds.
+    worlds. With several possible worlds, each observed number must lie within the range of its predictions in these
+    worlds.
 
     Args:
         scenario: the scenario of all worlds.
@@ -164,7 +166,7 @@ class StepShield:
 
     @property
     def chosen_policy(self) -> Bools:
-        """For each world: true if no proposed action has been replaced so far in the running episode, [n]."""
+        """For each world: True if no proposed action has been replaced so far in the running episode, [n]."""
         return np.asarray(self.interventions == 0, np.bool_)
 
     @property
@@ -173,7 +175,7 @@ class StepShield:
         return self._entries[: self.memory.logged] if self.logging else None
 
     def clear_log(self) -> None:
-        """Delete all log entries. If this method is never called, the log grows without limit."""
+        """Delete all log entries. If ``clear_log`` is never called, the log grows without limit."""
         self._entries, self.memory = [], self.memory._replace(logged=0)
 
     @property
@@ -349,7 +351,8 @@ class StepShield:
                 other plan certifies a proposal, the shield simulates the policies after this proposal, and tries their
                 actions as a plan. If ``proposer`` is None, no policy is simulated.
 
-        Returns the decision with the actions to apply. After the call ``memory`` contains the predicted next state.
+        Returns the decision with the actions to apply. After the call, the attribute ``memory`` contains the state that
+        is predicted for the next decision.
 
         """
         memory = self.memory
@@ -420,8 +423,8 @@ class StepShield:
         """Return the observed worlds ``seen`` [n, columns] in a form that can be compared with the prediction.
 
         Predictions may have a column for the gap to an obstacle ahead. In worlds without an obstacle, the observed gap
-        to the obstacle is infinite, and is replaced by the predicted number. All other numbers in ``seen`` stay the
-        same.
+        to the obstacle is infinite; the result contains the predicted number instead. The result contains all other
+        numbers of ``seen`` unchanged.
         """
         running = self.memory.running
         assert running is not None

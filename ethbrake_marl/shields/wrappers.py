@@ -123,7 +123,7 @@ def shielded_aec(env: ParallelEnv[str, Observations, NDArray[Any]], *args: Any, 
     """Return a shielded environment in which the agents act one after the other (AEC), front to rear.
 
     ``env`` is a parallel environment, because the shield needs the actions of all agents at once. ``args`` and
-    ``settings`` are further arguments of ``HybridShield``.
+    ``settings`` are the other arguments of ``HybridShield``.
     """
     return InTurns.around(HybridShield(env, *args, **settings))
 
@@ -138,8 +138,8 @@ class ShieldedEnv(
     Args:
         env: an ``EthBrake-v1`` environment, or a wrapper around it.
         policy: policy that is simulated from each alert. In worlds where the policy does less harm than E-V2X-BM, the
-            policy's harm is the bound (the harm that the episode will not exceed). ``policy`` may be None, except in
-            mode ``episode``.
+            policy's harm is the bound (the harm that the episode will not exceed). In all modes except ``episode``,
+            ``policy`` may be None.
         options: keywords of ``ShieldOptions``, including ``mode``.
 
     Raises ``InvalidInput`` for another kind of environment, and for invalid arguments.
@@ -179,8 +179,8 @@ class ShieldedEnv(
     def step(self, action: NDArray[Any]) -> Any:
         """Advance by one time step; the shield certifies or replaces the action [1].
 
-        Returns the values that the wrapped environment returns, with the intervention penalty subtracted from the
-        reward. If the environment contains a ``CostEnv``, these values include the cost.
+        Returns what ``step`` of the wrapped environment returns, but with the intervention penalty subtracted from the
+        reward. If the environment contains a ``CostEnv``, the cost is among the returned values.
         """
         self.attached.check_open()
         observation, reward, *others = self.env.step(action)
@@ -192,14 +192,14 @@ class ShieldedEnv(
 class ShieldedVectorEnv(_Closing, VectorWrapper):
     """``EthBrakeVectorEnv`` behind a shield, by default in mode ``step``, which certifies or replaces each action.
 
-    In a row where a new episode has just started, ``infos["shield_bound_harm"]`` and the other infos describe the new
-    alert. ``infos["final_info"]`` describes the last step of the old episode in this row.
+    In a row where a new episode has just started, ``infos["shield_bound_harm"]`` and the other infos describe the alert
+    of this episode. ``infos["final_info"]`` describes the last step of the old episode in this row.
 
     Args:
         env: an ``EthBrakeVectorEnv``, or a wrapper around it.
         policy: policy that is simulated from each alert. In worlds where the policy does less harm than E-V2X-BM, the
-            policy's harm is the bound (the harm that the episode will not exceed). ``policy`` may be None, except in
-            mode ``episode``.
+            policy's harm is the bound (the harm that the episode will not exceed). In all modes except ``episode``,
+            ``policy`` may be None.
         options: keywords of ``ShieldOptions``, including ``mode``.
 
     Raises ``InvalidInput`` for another kind of environment, and for invalid arguments.
@@ -256,15 +256,15 @@ def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, *
             shield certifies the changed action. ``env`` may also be an agent or a team; ``options`` must then contain
             ``scenario``, the scenario in which actions are certified.
         policy: policy that proposes the actions that the caller leaves out. In worlds where the policy does less harm
-            than E-V2X-BM, the policy's harm is the bound (the harm that the episode will not exceed). ``policy`` may be
-            None, except in mode ``episode``.
+            than E-V2X-BM, the policy's harm is the bound (the harm that the episode will not exceed). In all modes
+            except ``episode``, ``policy`` may be None.
         mode: ``step``, ``episode``, or the mode of an extension. None means ``step``; but if ``step`` lacks one of the
             ``options``, None means the first mode that has them all.
         options: further keywords of ``ShieldOptions``.
 
     Returns a ``HybridShield`` (for AEC, an AEC environment around a ``HybridShield``), a ``ShieldedEnv``, a
     ``ShieldedVectorEnv`` or a ``ShieldedVecEnv``. If ``env`` is an agent or a team, returns this agent or team behind a
-    shield. Raises ``InvalidInput`` for any other object, and for invalid arguments.
+    shield. Raises ``InvalidInput`` if ``env`` is of any other type, and for invalid arguments.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.shield(eb.parallel_env(scenario="paper-random"))
