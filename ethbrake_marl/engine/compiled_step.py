@@ -87,7 +87,7 @@ class Step(NamedTuple):
 
     @property
     def safe_end(self) -> Bools:
-        """Whether this step ended the episode and the episode had no impact from its beginning to its end, [n]."""
+        """Whether this step ended an episode that had no impact from beginning to end, [n]."""
         return self._is(SAFE_END)
 
     @property

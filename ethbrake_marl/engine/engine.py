@@ -227,7 +227,7 @@ class Engine:
         self._now = self._started(stream, None, worlds, {})
 
     def check_time_step(self, drivers: Mapping[int, Script]) -> None:
-        """Raise ``InvalidInput`` if an agent was made for another time between decisions than the scenario has.
+        """Raise ``InvalidInput`` if an agent was made for a time between decisions that is not the scenario's.
 
         ``drivers`` maps vehicle indices to agents or scripts. An agent without the attribute ``time_step_s`` can be
         used in every scenario.
@@ -585,7 +585,8 @@ class Engine:
     def snapshot(self) -> Arrays:
         """Return copies of all arrays that change while the engine runs, as a dictionary for ``restore``.
 
-        The snapshot contains the state, the position in the stream of worlds, and the memories of the scripts.
+        The snapshot contains the state of the episodes, the position in the stream of worlds, and the scripts'
+        memories.
         """
         arrays: Arrays = {name: array.copy() for name, array in zip(SNAPSHOT, self.state, strict=False)}
         arrays["stream"] = np.array([self.seed, self._now.stream.position], np.uint64)
@@ -666,7 +667,7 @@ class Engine:
         self._now = self._now._replace(state=state._replace(motion=motion, clock=clock), ruling=None)
 
     def moment(self) -> State:
-        """Return a copy of the present state; ``branch`` can continue from this copy."""
+        """Return a copy of the present state, from which ``branch`` can continue."""
         return self.state.copy()
 
     def first_moments(self, count: int) -> tuple[Worlds, State]:

@@ -99,7 +99,7 @@ Arrays = dict[str, NDArray[Any]]
 
 
 def flat(memory: Memory) -> Arrays:
-    """Return the arrays of a nested memory as a dictionary from path to array.
+    """Return the arrays of a nested memory as a dictionary from the path of an array to the array.
 
     For the memory ``{"a": x, "b": (y, z)}`` the result is ``{"a": x, "b.0": y, "b.1": z}``. None in the memory becomes
     an empty array.

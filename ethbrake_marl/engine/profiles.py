@@ -26,7 +26,7 @@ MOST_PHASES = 12
 
 
 class SearchWorld(NamedTuple):
-    """One world of a ``ProfileProblem``, prepared so that a search can simulate many profiles in it."""
+    """One world of a ``ProfileProblem``, prepared so that a search can simulate many profiles in this world."""
 
     episode: Episode  # working memory in which the world is simulated (``physics.episode``)
     bounds: Floats  # [C, 2] smallest and largest command of each controlled vehicle (m/s2)

@@ -66,7 +66,7 @@ Proposing = Agent | LearnedPolicy | Team | Mapping[str, Agent | LearnedPolicy]
 
 
 def guard_of(engine: Engine, policy: Proposing | None, options: ShieldOptions) -> ShieldGuard:
-    """Return the guard that shields all learners of an engine.
+    """Return a guard that shields all learners of an engine.
 
     Args:
         engine: the engine whose learners are shielded; this function does not change the engine.
@@ -99,7 +99,7 @@ def guard_of(engine: Engine, policy: Proposing | None, options: ShieldOptions) -
 
 
 class Attached:
-    """The link between an environment's shield wrapper and the guard in the environment's engine.
+    """The link between the shield wrapper of an environment and the guard in the environment's engine.
 
     Args:
         env: the environment to shield.

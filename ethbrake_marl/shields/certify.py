@@ -55,7 +55,7 @@ def best_constant(world: Members, states: Floats, ended: Bools, step: int, const
     """Return the index (in ``constants``) of the action that does the least harm, and its harm, m2/s2.
 
     The harm of a constant action is the largest harm over the possible worlds if the action is held from now to the
-    horizon. The time until the horizon is simulated in one go, not decision by decision.
+    horizon. The time until the horizon is simulated as one segment, not decision by decision.
 
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).
@@ -190,7 +190,7 @@ def tell_action(out: Floats, action: Floats, bound: float, margin: float) -> Non
 
     Args:
         out: columns ``APPLIED``, ``REASON``, ``BOUND`` and ``MARGIN`` for each vehicle, [K, 4]; changed in place. The
-            caller must have filled in the column ``REASON``.
+            caller must already have written the column ``REASON``.
         action: applied actions, [K].
         bound: harm that the episode will not exceed, m2/s2.
         margin: budget minus the harm of the plan after this decision, m2/s2.
@@ -339,8 +339,9 @@ def ends_of_plans(running: Running, plans: Floats, rests: Bools, borne: Floats) 
     """Simulate the ``plans`` [n, L, K] from now on and report how the episodes end.
 
     ``running`` contains n worlds, each with M possible worlds. The results are written into the arrays ``rests`` and
-    ``borne``. ``rests`` [n]: whether all vehicles come to rest before the horizon and stay at rest, in every possible
-    world. ``borne`` [n * M, N]: the harm that each vehicle bears in the whole episode, m2/s2 (0 for an obstacle ahead).
+    ``borne``. ``rests`` [n] is True for the worlds in which all vehicles come to rest before the horizon and stay at
+    rest, in every possible world. ``borne`` [n * M, N] is the harm that each vehicle bears in the whole episode, m2/s2
+    (0 for an obstacle ahead).
     """
     n, every = running.steps.shape[0], all_members(running)
     M = running.states.shape[0] // max(n, 1)
@@ -359,7 +360,7 @@ def descend_constants(running: Running, grid: Floats, rounds: int, action: Float
 
     For one vehicle after the other, the vehicle's action is replaced by the action in ``grid`` that does the least harm
     while the other vehicles keep their actions. Each tried action is held to the horizon, and the time until the
-    horizon is simulated in one go, not decision by decision.
+    horizon is simulated as one segment, not decision by decision.
 
     Args:
         running: the running episodes, in n worlds with exactly one possible world each.
@@ -469,8 +470,8 @@ def from_now(past: Floats, later: Floats | float, steps: Ints) -> Floats:
 def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) -> Decision:
     """Decide in every world: apply the proposed action if it can be certified, else the action of the backup plan.
 
-    A proposal is certified if a plan that begins with it keeps the harm of the episode within the budget. This function
-    does not change its arguments.
+    A proposal is certified if a plan that begins with the proposed action keeps the harm of the episode within the
+    budget. This function does not change its arguments.
 
     Args:
         running: the running episodes at this decision.

@@ -75,10 +75,10 @@ def ends_under(running: Running, plan: Floats) -> tuple[Bools, Floats]:
     ``plan`` contains the actions of each decision, [n, L], or [n, L, K] for K shielded vehicles. ``running`` contains n
     worlds, each with M possible worlds.
 
-    The first result is whether all vehicles are at rest at the horizon in every possible world, [n]. The second result
-    is the harm of the whole episode that each vehicle bears, [n * M, N] m2/s2. The harm of each vehicle equals, to the
-    bit, the harm that the engine's ledger contains for this vehicle at the end of the episode. With an obstacle ahead,
-    the first of the N columns belongs to the obstacle and is 0.
+    The first result is True for the worlds in which all vehicles are at rest at the horizon in every possible world,
+    [n]. The second result is the harm of the whole episode that each vehicle bears, [n * M, N] m2/s2. The harm of each
+    vehicle equals, to the bit, the harm that the engine's ledger contains for this vehicle at the end of the episode.
+    With an obstacle ahead, the first of the N columns belongs to the obstacle and is 0.
     """
     rests, borne = np.empty(running.n, np.bool_), np.empty(running.problem.mass.shape)
     plans = np.ascontiguousarray(plan).reshape(*plan.shape[:2], len(running.problem.vehicles))

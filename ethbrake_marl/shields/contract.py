@@ -74,8 +74,7 @@ class Guarded(NamedTuple):
 
     @property
     def told(self) -> dict[str, Any]:
-        """Dictionary of the shield's ``predicted_harm`` [n] and ``chosen_policy`` [n]; None if the shield lacks the
-        value.
+        """The shield's values ``predicted_harm`` [n] and ``chosen_policy`` [n], by name; None for a missing value.
 
         ``predicted_harm`` is the harm predicted at the alert (m2/s2). ``chosen_policy`` is True in the worlds where the
         policy drives.
@@ -131,7 +130,7 @@ class ShieldGuard(ABC):
 
     @abstractmethod
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos after a decision: name (without ``shield_``) -> value.
+        """Return the infos after a decision: dictionary from name (without ``shield_``) to value.
 
         A value is a single number, or an array with one number per world [n], learner [n, L] or vehicle [n, N].
 
@@ -163,12 +162,12 @@ class ShieldGuard(ABC):
         return memory
 
     def intervened(self, ruling: Ruling) -> Bools:
-        """Return whether the decision ``ruling`` replaced the proposed action, [n, L]."""
+        """Return whether the decision ``ruling`` replaced the learner's proposed action, [n, L]."""
         decided: Bools = ruling.decision.intervened
         return decided.reshape(ruling.applied.shape)
 
     def report(self, running: Engine) -> dict[str, NDArray[Any]]:
-        """Return the infos of every vehicle: name (without ``shield_``) -> values [n, N].
+        """Return the infos of every vehicle: dictionary from name (without ``shield_``) to values [n, N].
 
         The infos describe the last step of the engine, which is ``running``. In a row where a new episode has just
         started, the infos describe the alert of the new episode instead.

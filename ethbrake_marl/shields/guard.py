@@ -143,7 +143,7 @@ class StepGuard(ShieldGuard):
         """Return the infos of a step by name: actions, reason, margin, bound, trusted, settles; shares if asked for.
 
         ``memory`` is the guard's memory. ``ruling`` is the decision in the step, None before the first decision. Each
-        value is a number, or an array with one number per world [n], learner [n, L] or vehicle [n, N].
+        value is a single number, or an array with one number per world [n], learner [n, L] or vehicle [n, N].
         """
         shield: StepShield = memory.shield
         infos = self._of_step(ruling) | why(ruling)

@@ -124,7 +124,7 @@ def take_steps(
         after: receives the state of each possible world after the step, [M, S].
         over: for each possible world, receives True if the episode has ended after the step, [M].
 
-    Returns the number of possible worlds whose episode continues, or -1 if the physics failed.
+    Returns the number of possible worlds whose episode continues, or -1 if the physics failed in one of them.
 
     """
     going = 0
@@ -256,8 +256,8 @@ def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan:
 def hold_constant(world: Members, m: int, state: Floats, ended: bool, step: int, constants: Floats, c: int) -> float:
     """Return the harm in one possible world if a constant action is held to the horizon, m2/s2.
 
-    The time until the horizon is simulated in one go, not decision by decision. Returns infinity as the harm if the
-    physics fails.
+    The time until the horizon is simulated as one segment, not decision by decision. Returns infinity as the harm if
+    the physics fails.
 
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).

@@ -46,9 +46,9 @@ class HybridAgent(AgentAround):
             (the paper's closed form).
         harm_count: which harm is compared: ``first`` (first impact of each pair) or ``total`` (every impact).
 
-    The memory contains ``chosen_policy`` [n], true where the policy drives; the compared harms ``policy_harm`` [n] and
-    ``bound_harm`` [n]; and ``predicted_harm`` [n], the lower of these two harms. Raises ``InvalidInput`` for an unknown
-    ``bound`` or ``harm_count``, and if ``policy`` is not an agent.
+    The memory contains ``chosen_policy`` [n], True where the policy drives; ``policy_harm`` [n], the harm of the
+    policy's rollout; ``bound_harm`` [n], which is ``H*``; and ``predicted_harm`` [n], the lower of these two harms.
+    Raises ``InvalidInput`` for an unknown ``bound`` or ``harm_count``, and if ``policy`` is not an agent.
 
     """
 

@@ -200,7 +200,7 @@ def proposed_actions(
 def proposed_action(policy: Agent, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
     """Return the actions [n] in [-1, 1] that ``policy`` proposes for ``vehicle`` (index), and the policy's new memory.
 
-    If the policy returns NaN as a command, the action is NaN.
+    Where the policy commands NaN, the action is NaN.
     """
     command, memory = ask_script(policy, worlds, memory, vehicle)
     return np.where(np.isnan(command), np.nan, command_to_action(command, worlds.vehicles, vehicle)), memory

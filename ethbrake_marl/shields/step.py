@@ -82,13 +82,13 @@ class StepShield:
 
     At the alert the bound is the harm of E-V2X-BM's constant deceleration, executed decision by decision. In worlds
     where ``policy``, simulated from the alert, does less harm than E-V2X-BM, the bound is the policy's harm. The bound
-    never rises, and covers the time up to the scenario's horizon. ``memory.settles`` [n] says for each world whether
-    all vehicles are at rest at the horizon if the plan made at the alert is executed.
+    never rises, and covers the time up to the scenario's horizon. ``memory.settles`` [n] is True for the worlds in
+    which all vehicles are at rest at the horizon if the plan made at the alert is executed.
 
-    At each decision the observed worlds are compared with the prediction, bit by bit. If a world differs from its
-    prediction (a vehicle brakes beyond its capacity, a number is NaN, a message is missing), this world is marked in
-    ``memory.distrusted`` [n], and its bound no longer holds. In a distrusted world the shield ignores proposals for the
-    rest of the episode, and applies the rest of the plan or the best constant action, whichever does less harm. The
+    At each decision the observed worlds are compared with the shield's prediction, bit by bit. If a world differs from
+    its prediction (a vehicle brakes beyond its capacity, a number is NaN, a message is missing), this world is marked
+    in ``memory.distrusted`` [n], and its bound no longer holds. In a distrusted world the shield ignores proposals for
+    the rest of the episode, and applies the rest of the plan or the best constant action, whichever does less harm. The
     shield chooses again between the plan and the best constant action whenever a distrusted world differs from the
     prediction. If the engine continues an episode after the end that the shield predicted, the shielded vehicles brake
     fully.
@@ -161,7 +161,7 @@ class StepShield:
 
     @property
     def predicted_harm(self) -> Floats:
-        """Bound of each episode at the alert, including the allowance, [n] m2/s2."""
+        """The bound that each episode had at the alert, including the allowance, [n] m2/s2."""
         return self.memory.first_bound + self.allowance
 
     @property
@@ -191,7 +191,7 @@ class StepShield:
         return ends_under(running.nominal(), backup.plan)[1][:, -self.scenario.vehicles :]
 
     def take(self, rows: Ints) -> Self:
-        """Return an independent copy of the shield with only the episodes in the rows ``rows`` (indices)."""
+        """Return an independent copy of the shield that contains only the episodes in the rows ``rows`` (indices)."""
         part = copy.copy(self)
         part.memory = self.memory.take(rows)
         return part
@@ -346,7 +346,7 @@ class StepShield:
             seen: the observed worlds, with the first columns of ``Running.states``, [n, columns]; they are compared
                 with the prediction. If ``seen`` is None, nothing is compared.
             only: True for each world in which to decide, [n]; all other worlds stay unchanged. If ``only`` is None, the
-                shield decides in all worlds whose episode has not ended.
+                shield decides in every world whose episode has not ended.
             proposer: the policies that propose actions, with their memories and the worlds at this decision. If no
                 other plan certifies a proposal, the shield simulates the policies after this proposal, and tries their
                 actions as a plan. If ``proposer`` is None, no policy is simulated.
@@ -371,8 +371,8 @@ class StepShield:
     ) -> tuple[Decision, StepMemory]:
         """Return the decision on ``proposed`` [n] or [n, K], and the memory after the decision.
 
-        ``memory`` is the memory before the decision. ``asked`` [n] says in which worlds to decide. ``proposer``
-        contains the policies to simulate; None: no policy.
+        ``memory`` is the memory before the decision. ``asked`` [n] is True for the worlds in which to decide.
+        ``proposer`` contains the policies to simulate; None: no policy.
         """
         before, held, budget = memory.running, memory.backup, self._bound_of(memory)
         assert before is not None
@@ -457,7 +457,7 @@ class StepShield:
         """For each world: return whether an impact has happened in at least one of its possible worlds, [n].
 
         After an impact in a possible world, the true world may lie outside the range of the possible worlds.
-        ``running`` contains the predicted episodes.
+        ``running`` contains the episodes as the shield predicted them.
         """
         N = running.problem.mass.shape[1]
         predicted = running.states.reshape(running.n, running.members, -1)
@@ -467,8 +467,8 @@ class StepShield:
         """Compare the observed worlds with the prediction in ``memory``; return the new memory.
 
         ``seen`` [n, columns] contains the observed worlds, with the first columns of ``Running.states``. ``asked`` [n]
-        says which worlds are compared. A world that differs from the prediction becomes distrusted, and gets a new plan
-        from the observed state on.
+        is True for the worlds that are compared. A world that differs from the prediction becomes distrusted, and gets
+        a new plan from the observed state on.
         """
         running, backup, seen = memory.running, memory.backup, self.as_seen(seen)
         assert running is not None
