@@ -100,7 +100,7 @@ class Guard(Protocol):
         """Return the guard's answer (``Ruling``), which contains the actions to apply in the next step.
 
         Args:
-            running: the engine before the step.
+            running: the engine with its running episodes, before the step.
             memory: the guard's memory before the step.
             proposed: actions of the learners, [n, L]; a column of NaN means that this learner proposed no action.
 
@@ -150,9 +150,9 @@ class Engine:
     """A batch of ``n`` running episodes of one scenario.
 
     A step leads from one decision of the ``deciders`` to their next decision. The first step begins when the shortest
-    latency of a decider has elapsed. A ``guard`` (a shield) may replace the actions that the learners propose. If the
-    physics cannot advance a world, the world's episode is truncated and ``roster`` lists the world; the other worlds
-    continue.
+    latency among the deciders has elapsed. A ``guard`` (a shield) may replace the actions that the learners propose. If
+    the physics cannot advance a world, the world's episode is truncated and ``roster`` lists the world; the other
+    worlds continue.
 
     Args:
         scenario: the scenario of all episodes, or another ``Game``.
@@ -579,7 +579,7 @@ class Engine:
         return self._now.watched[watcher]
 
     def watch(self, watcher: Watcher, memory: Any) -> None:
-        """Add a watcher of the episodes; ``memory`` is the watcher's first memory."""
+        """Add a watcher of the episodes, with ``memory`` as the watcher's first memory."""
         self._now = self._now._replace(watched={**self._now.watched, watcher: memory})
 
     def snapshot(self) -> Arrays:
@@ -640,7 +640,7 @@ class Engine:
         Args:
             worlds: n worlds at any time of their episodes.
             ledger: harm and number of impacts of each pair since the episodes began; None: no harm and no impacts.
-            ended: whether each episode has ended, [n]; steps do not move the world of an ended episode. If ``ended`` is
+            ended: for each world, True if the episode has ended, [n]; steps do not move such a world. If ``ended`` is
                 None, an episode has ended if its time is at or after the horizon.
 
         Raises ``InvalidInput`` if ``worlds`` has another number of worlds or vehicles than the engine, or if a term of

@@ -85,8 +85,8 @@ class OwnGrid:
     def drive_step(self, state: State, rules: Rules, actions: Floats) -> Way:
         """Let the scripts make their decisions within the next step; return the results up to the last decision.
 
-        Each world of ``state`` is moved, in place, to the last decision that changed a command. ``rules`` contains the
-        settings of the engine's steps, and ``actions`` the learners' actions, [n, L].
+        Each world of ``state`` is moved, in place, to the last decision at which a script changed its command.
+        ``rules`` contains the settings of the engine's steps, and ``actions`` the learners' actions, [n, L].
         """
         column = state.packed.column
         in_force = state.motion[:, column.command : column.previous].copy()
@@ -127,8 +127,8 @@ class OwnGrid:
         """Let the scripts make all decisions before ``until_s`` [n] s; return the results up to the last decision.
 
         Only worlds of ``state`` for which the mask ``running`` [n] is True are advanced, in place. ``_decide`` moves a
-        world to a decision only if this decision changes a command: stopping at other decisions, too, would change the
-        rounding of the motion. ``rules`` contains the settings of the engine's steps, and ``actions`` the learners'
+        world to a decision only if this decision changes a command. Stopping at other decisions, too, would change how
+        the motion is rounded. ``rules`` contains the settings of the engine's steps, and ``actions`` the learners'
         actions, [n, L].
         """
         motion, params, _, wanted_so_far, *_ = state

@@ -349,7 +349,7 @@ def _checked_vehicles(vehicles: Sequence[int], N: int) -> Ints:
 
 
 class Profiles(NamedTuple):
-    """One profile per world: phase j of world k lasts from decision ``ends[k, j - 1]`` to decision ``ends[k, j]``.
+    """One profile per world: phase j of world k lasts from decision ``ends[k, j - 1]`` (0 if j = 0) to ``ends[k, j]``.
 
     During phase j of world k the commands ``commands_mps2[k, j]`` apply. Phases that a profile does not need are empty:
     they begin and end at the last step.

@@ -12,13 +12,14 @@ class Script(Protocol):
 
     A script is called when the latency of its vehicle has elapsed, and at every time step from then on.
 
-    A script without memory has ``act(worlds, vehicle)``, which returns the commanded acceleration of ``vehicle`` (index
-    from 0) in every world, [n] m/s2; negative values brake. A script with memory has two methods, and stores nothing in
-    its attributes:
+    A script without memory has the method ``act(worlds, vehicle)``. ``act`` returns the commanded acceleration of
+    ``vehicle`` (index from 0) in every world, [n] m/s2; negative values brake. A script with memory has two methods,
+    and stores nothing in its attributes:
 
     - ``begin(alert, vehicle, scripts) -> memory`` is called when episodes start in the worlds ``alert``, at t = 0.
-      ``scripts`` maps the index of each scripted vehicle to its script; learners, and the vehicles
-      that the evaluated agent drives, are left out.
+      ``scripts`` maps the index of each scripted vehicle to the vehicle's script; it lacks learners and, in an
+      evaluation, the vehicles that the evaluated agent drives.
+
     - ``act(worlds, memory, vehicle) -> (command, memory)`` returns the command [n] m/s2, and the new memory. ``worlds``
       can include worlds in which no decision is due at this moment; the results for these worlds are ignored.
 
@@ -28,7 +29,7 @@ class Script(Protocol):
     the agent predicted when the episode began.
 
     For a script with the attribute ``state_free = True``, ``act`` is called only once per episode, right after
-    ``begin``, because its command never changes.
+    ``begin``, because the script's command never changes.
     """
 
     def act(self, *args: Any, **kwargs: Any) -> Any:

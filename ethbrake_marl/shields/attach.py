@@ -72,7 +72,7 @@ def guard_of(engine: Engine, policy: Proposing | None, options: ShieldOptions) -
         engine: the engine whose learners are shielded; this function does not change the engine.
         policy: policy that proposes the actions that the caller leaves out. In all modes except ``episode``, ``policy``
             may be None.
-        options: settings of the shield.
+        options: settings of the shield, such as its mode.
 
     Raises ``InvalidInput`` if no vehicle learns, if several vehicles learn and the mode is not ``step``, and if
     ``policy`` is of the wrong type.

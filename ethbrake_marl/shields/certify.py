@@ -2,11 +2,12 @@
 
 A *plan* is a sequence of actions, one for each decision up to the horizon. The *backup* is the present plan of the
 shield. The *budget* is the largest harm that the shield accepts for the whole episode. The shield may consider several
-*possible worlds* (members) for each world. Each plan is simulated in all possible worlds, with the compiled functions
-of the module ``members``.
+*possible worlds* (members) for each world. Each plan is simulated in all possible worlds of a world, with the compiled
+functions of the module ``members``.
 
-Two plans that begin with the proposed action are simulated: one continues with the rest of the backup, the other with
-the best constant action. The module ``step`` proves that the harm of the episode never exceeds the bound at the alert.
+Two plans that begin with the proposed action are simulated. One plan continues with the rest of the backup, the other
+with the best constant action. The module ``step`` proves that the harm of the episode never exceeds the bound at the
+alert.
 """
 
 from __future__ import annotations
@@ -160,7 +161,7 @@ def try_action(
         over: for each possible world, receives True if the episode has ended after the step, [M].
 
     Returns the harm of the resulting plan, the least harm of all plans that were tried (both m2/s2), and the reason (a
-    code of ``ShieldReason``). The search succeeded if the harm of the resulting plan is at most ``budget``.
+    code of ``ShieldReason``). The search has succeeded if the harm of the resulting plan is at most ``budget``.
 
     """
     going = take_steps(world, states, ended, step, action, after, over)
@@ -209,7 +210,7 @@ def decide_world(
 ) -> bool:  # fmt: skip
     """Decide in one world: accept the proposed actions, or replace them by the actions of the plan.
 
-    The proposals of all vehicles are first tried together. If no plan after all proposals together stays within the
+    First the proposals of all vehicles are tried together. If no plan after all proposals together stays within the
     budget, the proposals are tried one by one, front to rear, while the other vehicles act as planned. An accepted
     proposal becomes part of the plan before the next vehicle's proposal is tried.
 
@@ -318,8 +319,8 @@ def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Flo
     """Write into ``value`` [n] m2/s2 the harm of each whole episode if its plan is executed from now on.
 
     The harm of a plan is the largest harm over the possible worlds, and infinite if the physics fails. If one of the
-    ``constants`` [C, K], held to the horizon, causes less harm than the rest of a plan, this constant action replaces
-    the rest of the plan in ``plans`` [n, L, K], and ``value`` contains the harm of the changed plan.
+    ``constants`` [C, K], held to the horizon, does less harm than the rest of a plan in ``plans`` [n, L, K], this
+    constant action replaces the rest of the plan, and ``value`` contains the harm of the changed plan.
     """
     n, every = running.steps.shape[0], all_members(running)
     trial = np.zeros((plans.shape[1], plans.shape[2]))
@@ -364,7 +365,7 @@ def descend_constants(running: Running, grid: Floats, rounds: int, action: Float
 
     Args:
         running: the running episodes, in n worlds with exactly one possible world each.
-        grid: actions to try for each vehicle, [G].
+        grid: actions that are tried for each vehicle, [G].
         rounds: how often the descent tries all actions of all vehicles.
         action: constant action of each vehicle, [n, K]; changed in place.
 
@@ -482,8 +483,8 @@ def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) 
         budget: largest harm of the whole episode that the shield accepts in each world, [n] m2/s2; at least the harm of
             ``backup``.
 
-    Raises ``InvalidInput`` if the shapes of the arrays do not fit, or if a budget is below the harm of ``backup``.
-    Raises ``PhysicsError``, which names the worlds, if the physics fails with the applied action.
+    Raises ``InvalidInput`` if the shapes of the arrays do not fit together, or if a budget is below the harm of
+    ``backup``. Raises ``PhysicsError``, which names the worlds, if the physics fails with the applied action.
 
     """
     n, problem, vehicles = running.n, running.problem, len(running.problem.vehicles)

@@ -18,8 +18,8 @@ A *guard* is the object in an engine that decides which actions are applied. The
 - ``info``: details of the decision, which environments report in their infos as ``shield_...``.
 
 ``decide`` returns ``applied``, ``memory`` and ``info`` in one ``Ruling`` (``engine.engine``). After the step, ``check``
-compares the new state with the prediction. If ``check`` raises ``UncertifiedStep``, the engine undoes the step and
-keeps its old memory.
+compares the new state with the state that the guard predicted. If ``check`` raises ``UncertifiedStep``, the engine
+undoes the step and keeps its old memory.
 
 ``begin`` starts episodes in some rows of the batch, and ``report`` returns the infos. ``ShieldGuard`` implements what
 all modes share: it asks the policies for proposals, stores their memories, and arranges the infos by vehicle. The
@@ -113,7 +113,7 @@ class ShieldGuard(ABC):
         """Return the actions to apply in the next step, with the details of the decision.
 
         Args:
-            running: the engine before the step.
+            running: the engine with its running episodes, before the step.
             memory: memory of the guard.
             proposed: proposed actions, [n, L]. A column of NaN means that the caller gave no action for the learner of
                 this column; the learner's policy then proposes. A single NaN is an invalid action and is never applied.
@@ -124,8 +124,8 @@ class ShieldGuard(ABC):
     def _started(self, shield: Any, alert: Worlds, rows: Ints) -> Any:
         """Start episodes in the rows with the indices ``rows``; return the shield's new state.
 
-        ``alert`` contains the new worlds at the alert (t = 0), one for each of ``rows``. ``shield`` is a copy of the
-        shield's old state, which this method may change.
+        ``alert`` contains the new worlds at the alert (t = 0), one for each index in ``rows``. ``shield`` is a copy of
+        the shield's old state, which this method may change.
         """
 
     @abstractmethod
@@ -144,8 +144,8 @@ class ShieldGuard(ABC):
     def begin(self, memory: Guarded | None, alert: Worlds, rows: Ints) -> Guarded:
         """Start episodes in the rows with the indices ``rows``; return the guard's new memory.
 
-        ``alert`` contains the new worlds at the alert (t = 0), one for each of ``rows``. ``memory`` is the guard's old
-        memory, None before the first episode.
+        ``alert`` contains the new worlds at the alert (t = 0), one for each index in ``rows``. ``memory`` is the
+        guard's old memory, None before the first episode.
         """
         shield, policies = memory or Guarded(self._fresh, {})
         memories = {i: begin_script(policy, alert, i, self.scripts) for i, policy in self._policies.items()}

@@ -43,9 +43,9 @@ class Review(NamedTuple):
 def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
     """For each intervention, compare the episode with an episode in which ``policy`` drives unshielded from then on.
 
-    An intervention is *needed* if the episode without it does more harm, *costly* if the episode without it does less
-    harm, and *harmless* if both episodes do equal harm. The episode with the interventions is also simulated again in
-    ``worlds``, because the shield may have assumed other worlds.
+    An intervention is *needed* if the episode without the intervention does more harm than the actual episode, *costly*
+    if it does less harm, and *harmless* if both episodes do equal harm. The episode with the interventions is also
+    simulated again in ``worlds``, because the shield may have assumed other worlds.
 
     Args:
         shield: a shield made with ``logging=True``, after it has run the episodes in ``worlds``. Log entries of earlier

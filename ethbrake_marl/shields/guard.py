@@ -35,7 +35,7 @@ class StepGuard(ShieldGuard):
         where: name with which error messages begin: the function or class that the user called.
         shares: whether the infos contain the harm that each vehicle bears; if the shield has a cap, the infos always
             contain this harm.
-        later_rollouts: whether a rollout of the policy from a later decision on may certify an action.
+        later_rollouts: whether a rollout of the policy that starts after the alert may certify an action.
         told: the worlds at the alert, as the shield assumes them. If ``told`` is None, the shield knows the true
             worlds. Policies always observe the true worlds.
         warns: whether to warn once with ``MovingAtHorizon`` if a vehicle would still move at the horizon under the plan
@@ -84,7 +84,7 @@ class StepGuard(ShieldGuard):
         """Let the shield certify or replace the proposals in all worlds whose episodes still run.
 
         Args:
-            running: the engine before the step.
+            running: the engine with its running episodes, before the step.
             memory: memory of the guard.
             proposed: proposed actions, [n, L]. A column of NaN means that the caller gave no action for the learner of
                 this column; the learner's policy then proposes. A single NaN is an invalid action and is never applied.

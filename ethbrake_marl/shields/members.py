@@ -235,7 +235,7 @@ def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan:
         states: present state of each possible world, [M, S], in the layout of ``Running.states``.
         ended: for each possible world, True if the episode has ended, [M].
         step: number of the present decision.
-        plan: actions of each decision, [L, K]; executed from the present decision on.
+        plan: actions of each decision, [L, K]; the simulation executes them from the present decision on.
         most: the simulation stops as soon as the harm exceeds this number, m2/s2.
 
     Returns infinity if the harm exceeds ``most`` in a possible world, if a vehicle bears more than its cap, or if the

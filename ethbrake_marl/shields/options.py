@@ -33,8 +33,8 @@ class ShieldOptions:
     Args:
         mode: ``step`` certifies or replaces each action. An action is certified if some plan that begins with this
             action keeps the harm within the bound. ``episode`` is the paper's Algorithm 1: the policy or E-V2X-BM
-            drives the whole episode. None means ``step``; but if ``step`` lacks one of the other settings, None means
-            the first mode that has them all.
+            drives the whole episode. None means ``step``; but if the mode ``step`` lacks one of the other settings,
+            None means the first mode that has all of them.
         bound: method to compute ``H*``, the harm of E-V2X-BM, in mode ``episode``: ``coupled`` (the engine's physics)
             or ``pairwise`` (the paper's closed form).
         harm_count: which harm is bounded: ``first`` (first impact of each pair) or ``total`` (every impact).

@@ -1,7 +1,8 @@
 """The paper's hybrid (Algorithm 1): at the alert, choose the policy or the baseline for the whole episode.
 
-The policy is rolled out (simulated) in the engine from the alert on. The harm of this rollout is compared with ``H*``,
-the harm of the baseline E-V2X-BM. The policy or the baseline, whichever does less harm, drives the whole episode.
+The policy is rolled out (simulated) in the engine from the alert on. The harm of this rollout is then compared with
+``H*``, the harm of the baseline E-V2X-BM. The policy or the baseline, whichever does less harm, drives the whole
+episode.
 
 The coupled ``H*`` is computed in the same engine as the policy's harm. With the coupled ``H*``, the hybrid does at most
 the harm of the baseline in every world, provided that the policy drives exactly as in its rollout. A policy with random
@@ -141,10 +142,10 @@ class EpisodeGuard(ShieldGuard):
         return memory if shield is None else renew_memory(shield, rows, memory)
 
     def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
-        """Return the actions of the driver that was chosen at the alert.
+        """Return the actions of the driver (policy or E-V2X-BM) that was chosen at the alert.
 
         Args:
-            running: the engine before the step.
+            running: the engine with its running episodes, before the step.
             memory: memory of the guard.
             proposed: proposed actions, [n, 1]; they have no effect.
 

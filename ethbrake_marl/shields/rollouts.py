@@ -1,4 +1,5 @@
-"""Rollouts of the proposing policies: simulations in which the policies drive. The actions of a rollout become a plan.
+"""Rollouts of the policies that propose actions: simulations in which these policies drive. The actions of such a
+simulation are used as a plan.
 
 A plan has one action for each decision. A rollout starts at the alert or at a later decision, and its plan is certified
 like any other plan (``plan_harm``). If a policy later deviates from its rollout, the shield may replace actions of the
@@ -31,7 +32,7 @@ from ethbrake_marl.shields.running import Running
 
 
 class Proposer(NamedTuple):
-    """The proposing policies, with the memories and the worlds from which a rollout starts."""
+    """The policies that propose actions, with the memories and the worlds from which a rollout starts."""
 
     policies: Mapping[int, Agent]  # index of each shielded vehicle -> its policy, front to rear
     memories: Mapping[int, Memory]  # index of each shielded vehicle -> memory of its policy after this decision
@@ -50,8 +51,8 @@ def rolled_out(
         vehicle: index of the only shielded vehicle, or a tuple of K indices.
         width: number of decisions for which to return actions.
 
-    Returns actions, [n, width] if ``vehicle`` is an index, [n, width, K] if it is a tuple. For decisions after the end
-    of an episode, the result contains full braking.
+    Returns the actions: [n, width] if ``vehicle`` is an index, [n, width, K] if ``vehicle`` is a tuple. For decisions
+    after the end of an episode, the result contains full braking.
 
     """
     team = Team({i: _Rounded(policy) for i, policy in policies.items()}, next(iter(policies.values())).name)
@@ -72,7 +73,7 @@ def certify_by_policy(
         proposed: proposed actions, [n] or [n, K].
         budget: largest harm of the whole episode that the shield accepts in each world, [n] m2/s2.
         held: the shield's plans before this decision, [n, L] or [n, L, K].
-        proposer: the proposing policies, with their memories and the worlds at this decision.
+        proposer: the policies that propose actions, with their memories and the worlds at this decision.
 
     """
     rejected = (decision.reason == NO_CERTIFICATE).reshape(running.n, -1).any(axis=1)
@@ -94,8 +95,8 @@ def certify_rollouts(
 
     In each world one plan is tried: the proposal, clipped to [-1, 1], followed by the policy's actions in a simulation
     from the next state on. If this plan stays within the budget and the caps, the plan becomes the backup, and the
-    proposal is accepted. If the plan exceeds the budget or a cap, the reason stays ``NO_CERTIFICATE``. A vehicle whose
-    proposal is NaN executes its planned action.
+    proposal is accepted. If the plan exceeds the budget or a cap, the reason stays ``NO_CERTIFICATE``. If a vehicle's
+    proposal is NaN, the vehicle's planned action is used.
 
     Args:
         running: the n episodes of the whole batch.
@@ -103,7 +104,7 @@ def certify_rollouts(
         rows: indices of the worlds in which to decide again, [m].
         budget: largest harm of the whole episode that the shield accepts in each world, [n] m2/s2.
         held: the shield's present plans of the whole batch, [n, L] or [n, L, K].
-        proposer: the proposing policies, with their memories and the worlds at this decision.
+        proposer: the policies that propose actions, with their memories and the worlds at this decision.
 
     Returns a decision for the m worlds in ``rows`` only.
 
@@ -139,7 +140,7 @@ def _later_plan(
         budget: largest harm of the whole episode that the shield accepts in each world, [n] m2/s2.
         held: the shield's present plans, [n, L] or [n, L, K]; the entries before the present decision are the actions
             applied so far.
-        proposer: the proposing policies, with their memories and the worlds at this decision.
+        proposer: the policies that propose actions, with their memories and the worlds at this decision.
 
     """
     policies, memories, worlds = proposer
@@ -189,8 +190,8 @@ def proposed_actions(
 ) -> tuple[Floats, dict[int, Memory]]:
     """Return the actions that the policies propose, [n, K] in [-1, 1], and the new memory of each vehicle's policy.
 
-    ``policies`` maps the index of each of K vehicles to its policy. ``memories`` maps the index of each vehicle to the
-    memory of its policy. ``worlds`` are n worlds at a decision.
+    ``policies`` maps the index of each of K vehicles to its policy. ``memories`` maps the index of each of these
+    vehicles to the memory of the vehicle's policy. ``worlds`` are n worlds at a decision.
     """
     asked = {i: proposed_action(policy, worlds, memories[i], i) for i, policy in policies.items()}
     after = {i: memory for i, (_, memory) in asked.items()}
@@ -200,7 +201,7 @@ def proposed_actions(
 def proposed_action(policy: Agent, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
     """Return the actions [n] in [-1, 1] that ``policy`` proposes for ``vehicle`` (index), and the policy's new memory.
 
-    Where the policy commands NaN, the action is NaN.
+    In worlds where the policy commands NaN, the result is NaN.
     """
     command, memory = ask_script(policy, worlds, memory, vehicle)
     return np.where(np.isnan(command), np.nan, command_to_action(command, worlds.vehicles, vehicle)), memory

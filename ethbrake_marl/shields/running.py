@@ -43,7 +43,7 @@ class Running(NamedTuple):
 
     @property
     def finished(self) -> Bools:
-        """For each world: whether the episode is over in all its members (possible worlds), [n]."""
+        """For each world: whether the episode has ended in all members (possible worlds) of the world, [n]."""
         return np.asarray(self.ended.reshape(self.n, -1).all(axis=1), np.bool_)
 
     @property

@@ -19,7 +19,7 @@ the harm in the same order as the engine. Hence:
    becomes ``c``. If the proposal equals the planned action, the plan and ``c`` stay the same, because a new simulation
    would repeat the same operations.
 
-3. *Otherwise the planned action is applied.* When ``follow_plan`` computed ``c``, its simulation passed through the
+3. *Otherwise the planned action is applied.* When ``follow_plan`` computed ``c``, the simulation passed through the
    state after the planned action. So from this state on, the rest of the plan again has the harm ``c``, to the last
    bit. A plan with less harm may replace the rest of the plan.
 
@@ -247,7 +247,7 @@ class StepShield:
         Args:
             worlds: n worlds at the alert.
             rows: indices of the batch rows in which the new episodes start, [n].
-            policy: the proposing policy, or vehicle index -> policy for several vehicles; None: no policy.
+            policy: the policy that proposes actions, or vehicle index -> policy for several vehicles; None: no policy.
             possible: the M possible worlds of each world, [n * M].
 
         """
@@ -343,8 +343,8 @@ class StepShield:
         Args:
             proposed: proposed actions, [n], or [n, K] for several vehicles; clipped to [-1, 1]. Where the proposal is
                 NaN, the planned action is applied.
-            seen: the observed worlds, with the first columns of ``Running.states``, [n, columns]; they are compared
-                with the prediction. If ``seen`` is None, nothing is compared.
+            seen: the observed worlds, [n, columns], which are compared with the prediction; the columns are the first
+                columns of ``Running.states``. If ``seen`` is None, nothing is compared.
             only: True for each world in which to decide, [n]; all other worlds stay unchanged. If ``only`` is None, the
                 shield decides in every world whose episode has not ended.
             proposer: the policies that propose actions, with their memories and the worlds at this decision. If no
@@ -403,7 +403,7 @@ class StepShield:
     def _also_certified(
         self, now: Running, memory: StepMemory, budget: Floats, decision: Decision, asked: Bools
     ) -> Decision:
-        """Return the decision to apply: ``decision``, in which a subclass may replace further actions.
+        """Return the decision that is applied: ``decision``, in which a subclass may replace further actions.
 
         The plans of ``decision`` already stay within the budget in every possible world. This class returns
         ``decision`` unchanged.
@@ -466,9 +466,9 @@ class StepShield:
     def _compared(self, memory: StepMemory, seen: Floats, asked: Bools) -> StepMemory:
         """Compare the observed worlds with the prediction in ``memory``; return the new memory.
 
-        ``seen`` [n, columns] contains the observed worlds, with the first columns of ``Running.states``. ``asked`` [n]
-        is True for the worlds that are compared. A world that differs from the prediction becomes distrusted, and gets
-        a new plan from the observed state on.
+        ``seen`` [n, columns] contains the observed worlds; its columns are the first columns of ``Running.states``.
+        ``asked`` [n] is True for the worlds that are compared. A world that differs from the prediction becomes
+        distrusted, and gets a new plan from the observed state on.
         """
         running, backup, seen = memory.running, memory.backup, self.as_seen(seen)
         assert running is not None

@@ -29,7 +29,7 @@ Step = tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]  # observations, rew
 
 
 class _Closing:
-    """Mixin for wrappers whose ``close`` removes the guard from the engine, then closes the environment."""
+    """Mixin with a method ``close``, which removes the guard from the engine and then closes the environment."""
 
     attached: Attached  # the link to the engine and its guard
 
@@ -44,8 +44,8 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
 
     Mode ``step`` (the default) certifies or replaces the actions of all learners together. In mode ``episode`` (the
     paper's Algorithm 1) the policy or E-V2X-BM drives the whole episode, whatever actions are proposed. The bounds hold
-    as long as the other vehicles follow their scripts. ``infos[agent]`` reports each decision under ``shield_reason``
-    and other ``shield_...`` keys. See docs/shield.md.
+    as long as the other vehicles follow their scripts. The infos of each agent, ``infos[agent]``, describe the shield's
+    decision under the keys ``shield_...``. See docs/shield.md.
 
     Args:
         env: ``eb.parallel_env(...)`` with one learner (in mode ``step`` one or more), or a wrapper around it.
@@ -133,16 +133,16 @@ class ShieldedEnv(
 ):
     """``EthBrake-v1`` behind a shield, by default in mode ``step``, which certifies or replaces each action.
 
-    The info reports each decision under ``shield_reason`` and other ``shield_...`` keys.
+    The info describes the shield's decision under the keys ``shield_...``, such as ``shield_reason``.
 
     Args:
         env: an ``EthBrake-v1`` environment, or a wrapper around it.
-        policy: policy that is simulated from each alert. In worlds where the policy does less harm than E-V2X-BM, the
-            policy's harm is the bound (the harm that the episode will not exceed). In all modes except ``episode``,
-            ``policy`` may be None.
+        policy: policy that is simulated at the start of each episode, from the alert on. In worlds where the policy
+            does less harm than E-V2X-BM, the policy's harm is the bound (the harm that the episode will not exceed). In
+            all modes except ``episode``, ``policy`` may be None.
         options: keywords of ``ShieldOptions``, including ``mode``.
 
-    Raises ``InvalidInput`` for another kind of environment, and for invalid arguments.
+    Raises ``InvalidInput`` if ``env`` is another kind of environment, and for invalid arguments.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.ShieldedEnv(eb.EthBrakeEnv("paper-random"))
@@ -197,12 +197,12 @@ class ShieldedVectorEnv(_Closing, VectorWrapper):
 
     Args:
         env: an ``EthBrakeVectorEnv``, or a wrapper around it.
-        policy: policy that is simulated from each alert. In worlds where the policy does less harm than E-V2X-BM, the
-            policy's harm is the bound (the harm that the episode will not exceed). In all modes except ``episode``,
-            ``policy`` may be None.
+        policy: policy that is simulated at the start of each episode, from the alert on. In worlds where the policy
+            does less harm than E-V2X-BM, the policy's harm is the bound (the harm that the episode will not exceed). In
+            all modes except ``episode``, ``policy`` may be None.
         options: keywords of ``ShieldOptions``, including ``mode``.
 
-    Raises ``InvalidInput`` for another kind of environment, and for invalid arguments.
+    Raises ``InvalidInput`` if ``env`` is another kind of environment, and for invalid arguments.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -258,13 +258,13 @@ def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, *
         policy: policy that proposes the actions that the caller leaves out. In worlds where the policy does less harm
             than E-V2X-BM, the policy's harm is the bound (the harm that the episode will not exceed). In all modes
             except ``episode``, ``policy`` may be None.
-        mode: ``step``, ``episode``, or the mode of an extension. None means ``step``; but if ``step`` lacks one of the
-            ``options``, None means the first mode that has them all.
+        mode: ``step``, ``episode``, or the mode of an extension. None means ``step``; but if the mode ``step`` lacks
+            one of the ``options``, None means the first mode that has all of them.
         options: further keywords of ``ShieldOptions``.
 
     Returns a ``HybridShield`` (for AEC, an AEC environment around a ``HybridShield``), a ``ShieldedEnv``, a
-    ``ShieldedVectorEnv`` or a ``ShieldedVecEnv``. If ``env`` is an agent or a team, returns this agent or team behind a
-    shield. Raises ``InvalidInput`` if ``env`` is of any other type, and for invalid arguments.
+    ``ShieldedVectorEnv`` or a ``ShieldedVecEnv``. If ``env`` is an agent or a team, returns the same agent or team with
+    a shield. Raises ``InvalidInput`` if ``env`` is of any other type, and for invalid arguments.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.shield(eb.parallel_env(scenario="paper-random"))
