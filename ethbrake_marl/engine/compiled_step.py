@@ -2,7 +2,7 @@
 
 Each of n worlds is a row of the arrays ``state`` and ``params``, whose columns ``physics.columns`` defines. The array
 ``clock`` [n, 4] contains, for each world, the time of the first decision, the number of steps taken, the number of the
-last step, and whether the episode has ended.
+step that ends at the horizon, and whether the episode has ended.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class Step(NamedTuple):
 
     @property
     def safe_end(self) -> Bools:
-        """Whether this step ended the episode and the episode had no impact from its beginning to its end, [n]."""
+        """Whether this step ended an episode that had no impact from beginning to end, [n]."""
         return self._is(SAFE_END)
 
     @property
@@ -102,12 +102,12 @@ class Step(NamedTuple):
 
     @property
     def shared(self) -> dict[str, Floats]:
-        """Reward terms with the same value for all vehicles of a world, before weighting: {name: values, [n]}."""
+        """Unweighted reward terms that have the same value for all vehicles of a world: {name: values, [n]}."""
         return self.params.shared(self.counted_harm, self.outcome[SAFE_END])
 
     @property
     def terms(self) -> dict[str, Floats]:
-        """All reward terms before weighting: {name: values}; [n] if all vehicles have the same value, else [n, N]."""
+        """All unweighted reward terms: {name: values}; [n] if all vehicles have the same value, else [n, N]."""
         return self.shared | self.further
 
     @property
@@ -121,11 +121,11 @@ class Step(NamedTuple):
 
 @compiled(apart=True, bare=True)
 def place_row(table: Floats, state: Floats, params: Floats, k: int, pieces: Floats) -> None:
-    """Fill in those quantities in the ``table`` of world ``k`` that matter only if brakes take time to build up.
+    """Write into ``table`` the quantities of world ``k`` that are needed only if brakes take time to build up.
 
     The present accelerations come from row ``k`` of ``state``, and the rates of build-up from row ``k`` of ``params``.
-    ``pieces`` [N, 2 K] are braking profiles with K intervals of constant command. If this code were inside the loop of
-    ``step_worlds``, it would slow down worlds without build-up.
+    ``pieces`` [N, 2 K] are braking profiles with K intervals of constant command. Inside the loop of ``step_worlds``,
+    this code would slow down the simulation of worlds whose brakes act at once.
     """
     column, N = columns(state), pieces.shape[0]
     command, brake_rate, release_rate = column.command, column.brake_rate, column.release_rate
@@ -146,24 +146,24 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
     episode is truncated with the reward 0, and ``outcome`` contains the status code of the failure.
 
     Args:
-        state: motion and harm of the worlds, [n, S]; changed in place.
+        state: present motion and harm so far of the worlds, [n, S]; changed in place.
         params: parameters of the vehicles, one row per world, in the layout of ``physics.columns``.
-        clock: first decision, steps taken, last step and end of each episode (see the module docstring),
-            [n, CLOCK_WIDTH]; changed in place.
+        clock: times and numbers of the steps of each episode (see the module docstring), [n, CLOCK_WIDTH]; changed in
+            place.
         actions: actions of the learners, [n, L].
         learners: indices of the learners (0 = front), [L].
         settings: five numbers with the indices ``TIME_STEP``, ``HORIZON``, ``HARM_WEIGHT``, ``HARM_IS_TOTAL`` and
             ``TERMINAL_WEIGHT``.
-        no_rows: ``NO_ROWS``, an empty array: the physics then keeps no list of single impacts.
+        no_rows: ``NO_ROWS``, an empty array, so that the physics keeps no list of single impacts.
         builds_up: True if brakes take time to build up in some world, or if a script follows a braking profile.
         pieces: braking profiles with K intervals of constant command, [N, 2 K]; used only if ``builds_up`` is True.
         wanted: commands of all vehicles, [n, N] m/s2; this function overwrites the learners' commands.
         reward: array that receives the reward of each vehicle, [n, N].
-        outcome: array that receives the harm of the step in each world and whether the episode has ended,
+        outcome: array that receives, for each world, the harm of the step and whether the episode has ended,
             [OUTCOME_ROWS, n].
 
-    Returns ``(-1, FLAG.DONE)`` if all worlds were advanced. If not all were advanced, returns the row number of a
-    world that was not advanced, and ``BAD_ACTION`` or the status code of the physics.
+    Returns ``(-1, FLAG.DONE)`` if all worlds were advanced. If some world was not advanced, returns the row number of
+    such a world, and ``BAD_ACTION`` or the status code of the physics.
 
     """
     n, N = wanted.shape
@@ -281,16 +281,17 @@ class Rules(NamedTuple):
 
         Args:
             worlds: n packed worlds, one row per world; changed in place.
-            clock: first decision, steps taken, last step and end of each episode (see the module docstring),
-                [n, CLOCK_WIDTH]; changed in place.
+            clock: times and numbers of the steps of each episode (see the module docstring), [n, CLOCK_WIDTH]; changed
+                in place.
             actions: actions of the learners in [-1, 1], [n, L].
             wanted: commands of all vehicles, [n, N] m/s2; this function overwrites the learners' commands.
             reward: array that receives the reward of each vehicle, [n, N].
-            outcome: array that receives the harm of the step in each world and whether the episode has ended,
+            outcome: array that receives, for each world, the harm of the step and whether the episode has ended,
                 [OUTCOME_ROWS, n].
 
-        The status code is ``FLAG.DONE`` if all worlds were advanced. It is ``BAD_ACTION`` if an action is outside
-        [-1, 1]; no world was moved then. Any other code names a check of the physics that failed in some world.
+        The status code is ``FLAG.DONE`` if all worlds were advanced. The status code is ``BAD_ACTION`` if an action is
+        outside [-1, 1]; in this case no world was moved. Any other status code belongs to a check of the physics that
+        failed in some world.
 
         """
         _, status = step_worlds(

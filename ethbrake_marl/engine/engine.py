@@ -48,21 +48,22 @@ Actions = Mapping[int, NDArray[np.floating]] | NDArray[np.floating]
 
 
 class Watcher(Protocol):
-    """Observer that follows an engine's episodes without changing them, for example to record them for a picture.
+    """Observer that follows an engine's episodes without changing the episodes, for example to record a picture.
 
     The engine stores the watcher's memory together with the state of its episodes, and replaces both in a single
-    assignment. If a step fails or is interrupted, neither has changed. For this reason a watcher must never change its
-    memory in place.
+    assignment. If a step fails or is interrupted, memory and state stay as they were before the step. For this reason a
+    watcher must never change its memory in place.
     """
 
     def begun(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
         """Return the watcher's new memory after episodes have started in the rows (worlds) with the indices ``rows``.
 
-        ``alert``: the worlds in which episodes have started, at t = 0. ``memory``: the watcher's previous memory.
+        ``alert`` contains the worlds in which episodes have started, at t = 0. ``memory`` is the watcher's memory
+        before the episodes started.
         """
 
     def stepped(self, memory: Any, before: Engine, after: Engine) -> Any:
-        """Return the watcher's memory after a step; ``memory`` is its memory before the step.
+        """Return the watcher's memory after a step; ``memory`` is the watcher's memory before the step.
 
         ``before`` is the engine before the step, and ``after`` the engine after the step.
         """
@@ -80,39 +81,39 @@ class Ruling(NamedTuple):
 
 
 class Guard(Protocol):
-    """A shield inside an engine: it may replace the actions that the learners propose.
+    """A shield inside an engine, which may replace the actions that the learners propose.
 
     The engine calls the guard in every ``Engine.step``, so no action can bypass the guard. The engine stores the
     guard's memory and answer together with the state of its episodes, and replaces all three in a single assignment. If
-    a step fails or is interrupted, none of the three has changed. For this reason a guard must never change its memory
-    in place.
+    a step fails or is interrupted, memory, answer and state stay as they were before the step. For this reason a guard
+    must never change its memory in place.
     """
 
     def begin(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
         """Return the guard's new memory after episodes have started in the rows (worlds) with the indices ``rows``.
 
-        ``alert``: the worlds in which episodes have started, at t = 0. ``memory``: the guard's previous memory; None
-        before the first episode.
+        ``alert`` contains the worlds in which episodes have started, at t = 0. ``memory`` is the guard's memory before
+        the episodes started; None before the first episode.
         """
 
     def decide(self, running: Engine, memory: Any, proposed: Floats) -> Ruling:
         """Return the guard's answer (``Ruling``), which contains the actions to apply in the next step.
 
         Args:
-            running: the engine before the step.
+            running: the engine with its running episodes, before the step.
             memory: the guard's memory before the step.
             proposed: actions of the learners, [n, L]; a column of NaN means that this learner proposed no action.
 
         """
 
     def check(self, ruling: Ruling, after: Engine) -> Any:
-        """Return the guard's memory after the step, or raise ``UncertifiedStep`` to undo the step.
+        """Return the guard's memory after the step. To undo the step, raise ``UncertifiedStep`` instead.
 
-        ``ruling``: the answer that ``decide`` returned before the step. ``after``: the engine after the step.
+        ``ruling`` is the answer that ``decide`` returned before the step. ``after`` is the engine after the step.
         """
 
     def report(self, running: Engine) -> dict[str, NDArray[Any]]:
-        """Return what the guard reports in ``info`` about the last step: dictionary name -> values, [n, N].
+        """Return the infos of the guard about the last step: dictionary from name to values, [n, N].
 
         Before the first step of an episode, the report describes what the guard decided at the alert. ``running`` is
         the engine that the guard protects.
@@ -139,7 +140,8 @@ class Now(NamedTuple):
     def kept(self, packed: Packed) -> Packed:
         """Return the packed worlds ``packed``, with the same columns as the worlds of this engine.
 
-        Columns for an obstacle and columns for messages are added if the engine's worlds have them.
+        Columns for an obstacle and columns for messages are added to ``packed`` if the engine's worlds have such
+        columns.
         """
         return packed.widened(self.obstacle, self.by_link)
 
@@ -148,25 +150,25 @@ class Engine:
     """A batch of ``n`` running episodes of one scenario.
 
     A step leads from one decision of the ``deciders`` to their next decision. The first step begins when the shortest
-    latency of a decider has elapsed. A ``guard`` (a shield) may replace the actions that the learners propose. If the
-    physics cannot advance a world, the world's episode is truncated and ``roster`` lists the world; the other worlds
-    continue.
+    latency among the deciders has elapsed. A ``guard`` (a shield) may replace the actions that the learners propose. If
+    the physics cannot advance a world, the world's episode is truncated and ``roster`` lists the world; the other
+    worlds continue.
 
     Args:
         scenario: the scenario of all episodes, or another ``Game``.
         n: number of worlds that are advanced together, at least 1.
-        learners: indices of the vehicles (0 = front) that need an action in every step.
+        learners: indices of the learners (0 = front): the vehicles whose actions the caller passes to ``step``.
         scripts: dictionary from the index of every vehicle that does not learn to the vehicle's script.
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
-        observation: observation of all vehicles, or a dictionary vehicle name -> observation; None: the observation of
-            the scenario.
+        observation: the features that vehicles observe: one observation for all vehicles, or a dictionary vehicle name
+            -> observation; None: the observation of the scenario.
         seed: seed of the training stream, from which the worlds come if ``worlds`` is None.
         deciders: indices of the vehicles at whose decisions each step begins and ends; None: the learners. In an
             evaluation the engine has no learners; there ``deciders`` are the vehicles that the evaluated agent drives.
         worlds: worlds of the first episodes, at t = 0; None: the first worlds of the training stream.
         guard: function that receives this engine and returns its guard (shield); None: the engine applies the
             learners' actions unchanged.
-        reward_vector: components of the vector reward that each step returns besides the reward
+        reward_vector: components of a vector reward, which each step returns in addition to the reward
             (``game.reward_vector``); None: no vector reward.
 
     >>> import ethbrake_marl as eb
@@ -225,7 +227,7 @@ class Engine:
         self._now = self._started(stream, None, worlds, {})
 
     def check_time_step(self, drivers: Mapping[int, Script]) -> None:
-        """Raise ``InvalidInput`` if an agent was made for another time between decisions than the scenario has.
+        """Raise ``InvalidInput`` if an agent was made for a time between decisions that is not the scenario's.
 
         ``drivers`` maps vehicle indices to agents or scripts. An agent without the attribute ``time_step_s`` can be
         used in every scenario.
@@ -243,7 +245,8 @@ class Engine:
         """Start a new episode in each of the n worlds. If this call fails, the running episodes continue.
 
         Args:
-            seed: seed whose first world becomes the next world of the training stream; None: the stream continues.
+            seed: seed of a new training stream, from whose beginning the next worlds come; None: the present stream
+                continues.
             worlds: worlds of the new episodes, n worlds at t = 0; None: the next worlds of the training stream.
 
         """
@@ -319,8 +322,8 @@ class Engine:
 
         ``actions`` contains a number in [-1, 1] for each learner: an array [n, L] with columns in the order of
         ``learners``, or a mapping from vehicle index to [n]. If the engine has a guard, the mapping may leave out
-        learners that propose no action. An episode that has ended stands still until ``renew`` or ``reset`` starts a
-        new one. If the guard raises ``UncertifiedStep``, the engine stays as it was before the step.
+        learners that propose no action. The world of an ended episode does not move until ``renew`` or ``reset`` starts
+        a new episode. If the guard raises ``UncertifiedStep``, the engine stays as it was before the step.
         """
         columns = self._columns(actions)
         if self._nobody_refuses_steps:
@@ -340,13 +343,14 @@ class Engine:
 
     @property
     def _nobody_refuses_steps(self) -> bool:
-        """True if a step cannot raise an error; the engine then changes its arrays in place, which is faster."""
+        """True if a step cannot raise an error; if True, the engine changes its arrays in place, which is faster."""
         return not (self.guard or self._now.watched or self._terms.are_foreign or self._own_grid.scripts)
 
     def _columns(self, actions: Actions) -> Floats:
-        """Return the learners' actions, which are an array or a mapping as in ``step``, as an array [n, L].
+        """Return the learners' actions as an array [n, L]; ``actions`` is an array or a mapping, as in ``step``.
 
-        For a float or integer array of this shape, ``_columns`` does not check whether the actions are in [-1, 1].
+        If ``actions`` is an array [n, L] of floats or integers, ``_columns`` does not check whether they are in [-1,
+        1].
         """
         shape = (self.n, len(self.learners))
         if type(actions) is np.ndarray and actions.shape == shape and actions.dtype.kind in "fiu":
@@ -378,7 +382,7 @@ class Engine:
         return np.stack(each, axis=1) if each else columns
 
     def _ruled(self, before: Engine, columns: Floats, *, checked: bool) -> Ruling:
-        """Return the guard's answer to the learners' actions ``columns`` [n, L].
+        """Return the guard's answer (``Ruling``) to the learners' actions ``columns`` [n, L].
 
         ``before`` is the engine before the step. If ``checked`` is True, the actions are known to be in [-1, 1].
         """
@@ -405,9 +409,9 @@ class Engine:
         return step
 
     def _ask_scripts(self) -> dict[int, Memory]:
-        """Write the commands of the scripts that have a memory and decide once per step to ``state.wanted``.
+        """Let the scripts that have a memory and decide once per step write their commands into ``state.wanted``.
 
-        Returns the new memories of these scripts: dictionary from vehicle index to memory.
+        Returns the scripts' new memories: dictionary from vehicle index to memory.
         """
         asked: dict[int, Memory] = {}
         own_grid = self._own_grid.scripts
@@ -422,7 +426,7 @@ class Engine:
     def _move(self, columns: Floats) -> tuple[Step, bool]:
         """Move the worlds by one step under the learners' actions ``columns`` [n, L], and deliver messages.
 
-        Returns the results of the step, and True if some world could not be advanced.
+        Returns the results of the step, and whether some world could not be advanced.
         """
         if self._now.stops:
             self._now = self._now._replace(stops=())
@@ -443,9 +447,10 @@ class Engine:
         return Step(reward, outcome, self.reward, {}), some_failed
 
     def _drive_own_grid(self, columns: Floats) -> Way:
-        """Advance the worlds through the decisions that scripts make within the step, up to the last one.
+        """Advance the worlds to the last of the decisions that scripts make within the step.
 
-        Returns the results of this first part of the step. ``columns`` [n, L] contains the learners' actions.
+        Returns the results of the step up to this last decision. ``columns`` [n, L] contains the actions of the L
+        learners.
         """
         way = self._own_grid.drive_step(self.state, self._now.rules, self._in_range(columns))
         self._change(memories=way.memories)
@@ -457,9 +462,10 @@ class Engine:
 
         Args:
             step: results of the step; changed in place.
-            harm_before: harm of each pair before the step; None if every vehicle's reward counts the harm of the whole
-                line.
-            start: the worlds before the step; None if no term of the reward is computed from single impacts.
+            harm_before: harm of each pair from the alert to the beginning of the step; None if every vehicle's reward
+                counts the harm of the whole line.
+            start: the worlds before the step, needed for reward terms that are computed from single impacts; None if
+                there are no such terms.
 
         """
         impacts = self.state.impacts
@@ -471,7 +477,7 @@ class Engine:
         self._now = self._now._replace(state=state)
 
     def _change(self, **fields: Any) -> None:
-        """Replace the fields of ``self.state`` that ``fields`` names."""
+        """Replace fields of ``self.state`` by the values in ``fields`` (field name -> new value)."""
         self._now = self._now._replace(state=self._now.state._replace(**fields))
 
     def observe(self, vehicle: int) -> Observations:
@@ -527,27 +533,27 @@ class Engine:
 
     @property
     def _nobody_refuses_episodes(self) -> bool:
-        """True if the start of an episode cannot raise an error; the engine then changes its arrays in place."""
+        """True if the start of an episode cannot raise an error; if True, the engine changes its arrays in place."""
         return not (self._now.watched or self._remembering or self.guard or self._terms.count_impacts)
 
     def cut(self, step: Step, most_steps: int) -> None:
         """Truncate the episodes that have taken ``most_steps`` steps or more.
 
-        ``step`` is the result of the last step; it is changed in place to show that these episodes were truncated.
+        ``step`` is the result of the last step; ``cut`` marks the truncated episodes in ``step``, in place.
         """
         cut = (self.steps >= most_steps) & (step.ended | ~self.ended)
         step.outcome[TRUNCATED, cut] = self._now.state.clock[cut, ENDED] = 1.0
 
     def segments(self, before: Worlds, last_mps2: Floats) -> Iterator[tuple[Worlds, Floats, Floats]]:
-        """Yield the segments of the last step: intervals between decisions that scripts made within the step.
+        """Yield the segments into which the decisions that scripts made within the last step divide this step.
 
         After a reset and before the first step, the segments lead from the alert to the first decision. Each segment is
         a tuple: the worlds at the start of the segment, the vehicles' commands in the segment ([n, N] m/s2), and the
         time at the end of the segment ([n] s).
 
         Args:
-            before: the worlds at the start of the step.
-            last_mps2: commands of the last segment, [n, N] m/s2.
+            before: the worlds at the start of the last step (after a reset: at the alert).
+            last_mps2: the vehicles' commands in the last segment, [n, N] m/s2.
 
         """
         for motion, wanted in self._now.stops:
@@ -557,14 +563,14 @@ class Engine:
         yield before, last_mps2, self.state.time_s.copy()
 
     def protect(self, guard: Guard | None) -> None:
-        """Use ``guard`` from the next reset on; None removes the present guard."""
+        """Use ``guard`` as the guard of this engine from the next reset on; None removes the present guard."""
         self.guard = guard
         self._now = self._now._replace(state=self._now.state._replace(guarded=None), ruling=None)
 
     def remember(self, guarded: Any) -> None:
         """Set the guard's memory to ``guarded``, which ``Guard.begin`` or ``Guard.check`` has returned.
 
-        A caller that moves the worlds by ``place`` instead of ``step`` must set the memory itself.
+        A caller that moves the worlds by ``place`` instead of ``step`` must set the guard's memory by this method.
         """
         self._now = self._now._replace(state=self._now.state._replace(guarded=guarded))
 
@@ -573,13 +579,14 @@ class Engine:
         return self._now.watched[watcher]
 
     def watch(self, watcher: Watcher, memory: Any) -> None:
-        """Add a watcher of the episodes; ``memory`` is the watcher's first memory."""
+        """Add a watcher of the episodes, with ``memory`` as the watcher's first memory."""
         self._now = self._now._replace(watched={**self._now.watched, watcher: memory})
 
     def snapshot(self) -> Arrays:
         """Return copies of all arrays that change while the engine runs, as a dictionary for ``restore``.
 
-        The snapshot contains the state, the position in the stream of worlds, and the memories of the scripts.
+        The snapshot contains the state of the episodes, the position in the stream of worlds, and the scripts'
+        memories.
         """
         arrays: Arrays = {name: array.copy() for name, array in zip(SNAPSHOT, self.state, strict=False)}
         arrays["stream"] = np.array([self.seed, self._now.stream.position], np.uint64)
@@ -618,8 +625,8 @@ class Engine:
     def _rules_for(self, state: State) -> Rules:
         """Return the settings of the compiled step (``Rules``) for the worlds of ``state``.
 
-        The result differs from the settings for this engine's own worlds if brakes take time to build up only in the
-        worlds of ``state``.
+        The settings take into account whether brakes take time to build up in a world of ``state``, even if brakes act
+        at once in all worlds of this engine.
         """
         builds_up = self.scenario.builds_up or state.packed.builds_up or self.in_pieces
         return self._now.rules._replace(builds_up=builds_up)
@@ -632,9 +639,9 @@ class Engine:
 
         Args:
             worlds: n worlds at any time of their episodes.
-            ledger: harm and impacts since the episodes began; None: no harm and no impacts.
-            ended: whether each episode has ended, [n]; steps do not move the world of an ended episode. None: an
-                episode has ended if its time is at or after the horizon.
+            ledger: harm and number of impacts of each pair since the episodes began; None: no harm and no impacts.
+            ended: for each world, True if the episode has ended, [n]; steps do not move such a world. If ``ended`` is
+                None, an episode has ended if its time is at or after the horizon.
 
         Raises ``InvalidInput`` if ``worlds`` has another number of worlds or vehicles than the engine, or if a term of
         the reward is computed from single impacts.
@@ -660,14 +667,11 @@ class Engine:
         self._now = self._now._replace(state=state._replace(motion=motion, clock=clock), ruling=None)
 
     def moment(self) -> State:
-        """Return a copy of the present state; ``branch`` can continue from this copy."""
+        """Return a copy of the present state, from which ``branch`` can continue."""
         return self.state.copy()
 
     def first_moments(self, count: int) -> tuple[Worlds, State]:
-        """Return the first ``count`` worlds of the training stream twice: at the alert, and as a ``State``.
-
-        The ``State`` contains the worlds at their first decision.
-        """
+        """Return the first ``count`` worlds of the training stream, and these worlds at their first decision."""
         stream = copy.copy(self._now.stream)
         stream.restart(self.seed)
         alert, new = stream.take(count).alert, self._unwatched(count, self._now)
@@ -708,17 +712,17 @@ class Engine:
 
     @property
     def worlds(self) -> Worlds:
-        """Copy of the running worlds."""
+        """The worlds of the running episodes, as a copy."""
         return self._now.rules.unpack(self.packed)
 
     @property
     def packed(self) -> Packed:
-        """Running worlds packed into two arrays (layout: ``physics.columns``); not a copy, so do not change them."""
+        """The running worlds, packed into two arrays (layout: ``physics.columns``); not a copy, so only read them."""
         return self._now.state.packed
 
     @property
     def wanted_mps2(self) -> Floats:
-        """Acceleration that each vehicle commanded in the last step, [n, N] m/s2; not a copy."""
+        """Acceleration that each vehicle commanded in the last step, [n, N] m/s2; not a copy, so only read it."""
         return self._now.state.wanted
 
     @property
@@ -748,12 +752,15 @@ class Engine:
 
     @property
     def observation(self) -> ObservationSpec:
-        """Observation that all learners share. Raises ``InvalidInput`` if learners observe different features."""
+        """Observation (list of features) that all learners have in common.
+
+        Raises ``InvalidInput`` if learners observe different features.
+        """
         return common_observation(self.observations, self.scenario)
 
     @property
     def memories(self) -> dict[int, Memory]:
-        """Memories of the scripts that have one: dictionary from vehicle index to memory."""
+        """Memories of all scripts that have a memory: dictionary from vehicle index to memory."""
         return self._now.state.memories
 
     @property

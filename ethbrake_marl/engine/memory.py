@@ -100,10 +100,10 @@ Arrays = dict[str, NDArray[Any]]
 
 
 def flat(memory: Memory) -> Arrays:
-    """Return the arrays of a nested memory as a dictionary from path to array.
+    """Return the arrays of a nested memory as a dictionary from the path of an array to the array.
 
-    For the memory ``{"a": x, "b": (y, z)}`` the result is ``{"a": x, "b.0": y, "b.1": z}``. A None in the memory
-    becomes an empty array.
+    For the memory ``{"a": x, "b": (y, z)}`` the result is ``{"a": x, "b.0": y, "b.1": z}``. None in the memory becomes
+    an empty array.
     """
     if isinstance(memory, Mapping | tuple):
         parts = memory.items() if isinstance(memory, Mapping) else enumerate(memory)
@@ -130,9 +130,9 @@ def unflat(arrays: Mapping[str, NDArray[Any]], place: str) -> Memory:
 def _check_kept(before: Memory, after: Memory, who: str) -> None:
     """Raise ``InvalidInput`` if a call of ``act`` changed the keys, shapes or dtypes of a memory.
 
-    After such a change, the engine could not replace the memory of single worlds when new episodes start there.
-    ``before`` is the memory before the call, and ``after`` the memory after the call. The error message begins with
-    ``who``.
+    If the form of the memory changed, the engine could not replace the memory of single worlds when new episodes start.
+    ``before`` is the memory before the call of ``act``, and ``after`` the memory after the call. The error message
+    begins with ``who``.
     """
     began, kinds = (map_memory(lambda array: (array.dtype, *array.shape[1:]), each) for each in (before, after))
     if began != kinds:
@@ -241,16 +241,16 @@ def _who(script: Script, vehicle: int) -> str:
 
 
 def _named(error: Exception, script: Script, what: str, worlds: Worlds, vehicle: int) -> Exception:
-    """Return the exception to raise in place of ``error``, which a script raised.
+    """Return the exception to raise instead of ``error``, which a script raised.
 
-    The result is an ``InvalidInput`` that names the script. If the script belongs to this package, or if ``error`` is
-    an ``EthBrakeError``, the result is ``error`` itself.
+    The result is an ``InvalidInput`` whose message names the script. If the script belongs to this package, or if
+    ``error`` is an ``EthBrakeError``, the result is ``error`` itself.
 
     Args:
         error: the exception that the script raised.
         script: the script.
-        what: name of the script's method that raised the error.
-        worlds: the worlds that were passed to this method.
+        what: name of the method of the script that raised the error.
+        worlds: the worlds that were passed to the script's method.
         vehicle: index of the script's vehicle (0 = front).
 
     """

@@ -37,7 +37,7 @@ Stop = tuple[Floats, Floats]  # state [n, S] of all worlds at a script's decisio
 
 
 class Way(NamedTuple):
-    """Results of the first part of a step. This part ends at the last decision that a script makes within the step."""
+    """Results of the first part of a step: up to the last decision that a script makes within the step."""
 
     reward: Floats  # [n, N] reward of this part
     harm: Floats  # [2, n] harm of the line in this part: first-impact harm, total harm (m2/s2)
@@ -48,13 +48,13 @@ class Way(NamedTuple):
     stops: tuple[Stop, ...]  # the worlds at each of the decisions, in order
 
     def add_to(self, motion: Floats, column: Columns, reward: Floats, outcome: Floats) -> None:
-        """Add the results of this first part of a step to the results of the rest of the step, in place.
+        """Add the results up to the last decision of a script to the results of the rest of the step, in place.
 
         Args:
-            motion: state of the worlds after the step, [n, S].
-            column: numbers of the columns of ``motion`` (``physics.columns``).
-            reward: reward of each vehicle in the rest of the step, [n, N].
-            outcome: results of the compiled step for the rest of the step, [OUTCOME_ROWS, n].
+            motion: state of the worlds after the whole step, [n, S].
+            column: number of the column of ``motion`` that contains each quantity (``physics.columns``).
+            reward: reward of each vehicle in the rest of the step (after the last decision of a script), [n, N].
+            outcome: other results of the rest of the step, as the compiled step returns them, [OUTCOME_ROWS, n].
 
         """
         reward += self.reward
@@ -83,10 +83,10 @@ class OwnGrid:
         self._time_step_s, self._horizon_s = time_step_s, horizon_s
 
     def drive_step(self, state: State, rules: Rules, actions: Floats) -> Way:
-        """Let the scripts make their decisions within the next step; return the result of this first part of the step.
+        """Let the scripts make their decisions within the next step; return the results up to the last decision.
 
-        Each world of ``state`` is moved, in place, to the last decision that changed a command. ``rules`` contains the
-        settings of the step, and ``actions`` the learners' actions, [n, L].
+        Each world of ``state`` is moved, in place, to the last decision at which a script changed its command.
+        ``rules`` contains the settings of the engine's steps, and ``actions`` the learners' actions, [n, L].
         """
         column = state.packed.column
         in_force = state.motion[:, column.command : column.previous].copy()
@@ -98,15 +98,15 @@ class OwnGrid:
         return way._replace(in_force=in_force)
 
     def drive_to_start(self, state: State, rules: Rules, rows: Ints, start_s: Floats) -> Way:
-        """Let the scripts make their decisions between the alert and the first step; return the result (``Way``).
+        """Let the scripts make their decisions between the alert and the first step; return the results (``Way``).
 
-        Learners and deciders coast until the first step, and the scripts observe this.
+        Until the first step the learners and deciders coast, and the scripts observe that these vehicles coast.
 
         Args:
-            state: all running episodes; the new episodes are at the alert. ``drive_to_start`` moves the new episodes to
-                their first step, in place.
+            state: state of all running episodes; the new episodes are at the alert. ``drive_to_start`` moves the new
+                episodes to their first step, in place.
             rules: settings of the engine's steps.
-            rows: row numbers of the new episodes in ``state``.
+            rows: numbers of the rows of ``state`` in which the new episodes start.
             start_s: time at which the first step of each new episode begins, [len(rows)] s.
 
         Raises ``PhysicsError``, which lists the worlds that could not be advanced.
@@ -124,12 +124,12 @@ class OwnGrid:
         return way
 
     def _decide(self, state: State, rules: Rules, running: Bools, until_s: Floats, actions: Floats) -> Way:
-        """Let the scripts make all decisions before ``until_s`` [n] s; return the result of this part of the step.
+        """Let the scripts make all decisions before ``until_s`` [n] s; return the results up to the last decision.
 
         Only worlds of ``state`` for which the mask ``running`` [n] is True are advanced, in place. ``_decide`` moves a
-        world to a decision only if this decision changes a command: stopping at other decisions, too, would change the
-        rounding of the motion. ``rules`` contains the settings of the step, and ``actions`` the learners' actions,
-        [n, L].
+        world to a decision only if this decision changes a command. Stopping at other decisions, too, would change how
+        the motion is rounded. ``rules`` contains the settings of the engine's steps, and ``actions`` the learners'
+        actions, [n, L].
         """
         motion, params, _, wanted_so_far, *_ = state
         (n, N), column = wanted_so_far.shape, state.packed.column
@@ -173,14 +173,14 @@ class OwnGrid:
     def _look_ahead(
         self, state: State, rules: Rules, until_s: Floats, decision_s: Floats, actions: Floats
     ) -> tuple[Packed, Floats, Floats]:
-        """Return copies of the worlds, advanced to ``until_s``, with their reward [n, N] and outcome [OUTCOME_ROWS, n].
+        """Return copies of the worlds at ``until_s``, and the rewards [n, N] and results [OUTCOME_ROWS, n] until then.
 
         Args:
-            state: the worlds before the motion. In ``state.wanted`` the learners' commands are overwritten; nothing
-                else in ``state`` changes.
-            rules: settings of the step.
+            state: the worlds before they are advanced. In ``state.wanted`` the learners' commands are overwritten;
+                nothing else in ``state`` changes.
+            rules: settings of the engine's steps.
             until_s: time to which each world is advanced, [n] s; a world that has reached this time does not move.
-            decision_s: time of the deciders' next decision, [n] s; the delivery of periodic messages depends on it.
+            decision_s: time of the deciders' next decision, [n] s, on which the delivery of periodic messages depends.
             actions: actions of the learners, [n, L]; L may be 0.
 
         """

@@ -1,7 +1,7 @@
 """The problem that searches and shields solve: which commands over a whole episode cause the least harm?
 
-A *profile* contains the commands of the controlled vehicles from the first decision to the horizon. It consists of at
-most K *phases*: intervals with constant commands that end at a decision.
+A *profile* contains the commands of the controlled vehicles from the first decision to the horizon. A profile consists
+of at most K *phases*: intervals with constant commands. Each phase ends at a decision.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MOST_PHASES = 12
 
 
 class SearchWorld(NamedTuple):
-    """One world of a ``ProfileProblem``, prepared so that a search can simulate many profiles in it."""
+    """One world of a ``ProfileProblem``, prepared so that a search can simulate many profiles in this world."""
 
     episode: Episode  # working memory in which the world is simulated (``physics.episode``)
     bounds: Floats  # [C, 2] smallest and largest command of each controlled vehicle (m/s2)
@@ -74,7 +74,7 @@ class ProfileProblem(NamedTuple):
         return len(self.start)
 
     def take(self, rows: Ints) -> ProfileProblem:
-        """Return the same problem for only the worlds with the indices ``rows``."""
+        """Return this problem restricted to the worlds with the indices ``rows``."""
         arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in self._fields[1:]}
         return self._replace(**arrays)
 
@@ -108,21 +108,23 @@ class ProfileProblem(NamedTuple):
         )
 
     def even_grid(self, number: int) -> Floats:
-        """Return ``number`` evenly spaced commands of each controlled vehicle, [n, number, C] m/s2.
+        """Return ``number`` evenly spaced commands for each controlled vehicle, [n, number, C] m/s2.
 
-        The commands range from full braking to full driving. No command exceeds a capacity by a rounding error.
+        The commands range from full braking to full driving. No command exceeds a capacity, not even by a rounding
+        error.
         """
         low, high = self.bounds[:, np.newaxis, :, 0], self.bounds[:, np.newaxis, :, 1]
         share = np.linspace(0.0, 1.0, number)[:, np.newaxis]
         return np.asarray(np.minimum(low + share * (high - low), high), np.float64)
 
     def minimising(self, weights: Floats, *, largest: bool = False) -> ProfileProblem:
-        """Return a copy of this problem in which a search minimises the weighted harm of the vehicles.
+        """Return a copy of this problem in which searches minimise a weighted harm of the vehicles.
 
         The harm count (first-impact or total harm) and the field ``identity`` stay the same.
 
         Args:
-            weights: weight of the harm that each vehicle bears, at least 0, [n, N]; an obstacle has no weight.
+            weights: for each vehicle, the weight (at least 0) of the harm that the vehicle bears, [n, N]; an obstacle
+                has no weight.
             largest: True: minimise the largest weighted harm of a vehicle; False: minimise the sum of all weighted
                 harms.
 
@@ -136,7 +138,7 @@ class ProfileProblem(NamedTuple):
         return self._replace(weights=pairs, clock=clock)
 
     def follow(self, profiles: Profiles) -> tuple[Floats, Floats]:
-        """Return the first-impact harm and the total harm of one profile per world, [n] m2/s2 each.
+        """Return first-impact harm and total harm of each world if each world follows its profile, [n] m2/s2 each.
 
         An engine whose vehicles follow the same commands computes exactly the same harm, to the last bit. Raises
         ``InvalidInput`` for profiles that do not fit the problem or exceed a capacity, and ``PhysicsError``, which
@@ -146,10 +148,10 @@ class ProfileProblem(NamedTuple):
         return line_sum(first, np.zeros(self.n)), line_sum(total, np.zeros(self.n))
 
     def values(self, profiles: Profiles) -> dict[HarmCount, Floats]:
-        """Return the value that a search minimises, for one profile per world: {harm count: value, [n] m2/s2}.
+        """Return the value that a search minimises, if each world follows its profile: {harm count: value, [n] m2/s2}.
 
-        The value is the harm of the line. For a result of ``minimising``, the value is instead the sum of the vehicles'
-        weighted harms, or the largest of them. Raises the same errors as ``follow``.
+        The value is the harm summed over the line. In a problem that ``minimising`` has returned, the value is instead
+        the sum of the vehicles' weighted harms, or the largest of these harms. Raises the same errors as ``follow``.
         """
         if (self.clock[:, CLOCK.AIM] == WHOLE).all():
             return dict(zip(HARM_COUNTS, self.follow(profiles), strict=True))
@@ -163,10 +165,10 @@ class ProfileProblem(NamedTuple):
         return harms
 
     def borne(self, profiles: Profiles) -> dict[HarmCount, Floats]:
-        """Return the harm that each vehicle bears under one profile per world: {harm count: [n, N] m2/s2}.
+        """Return the harm that each vehicle bears if each world follows its profile: {harm count: [n, N] m2/s2}.
 
-        The arrays have no column for an obstacle. An engine computes the same harm, to the last bit. Raises the same
-        errors as ``follow``.
+        The returned arrays have no column for an obstacle. An engine whose vehicles follow the same commands counts the
+        same harm, to the last bit. Raises the same errors as ``follow``.
         """
         obstacle, harms = int(np.isinf(self.mass[:, 0]).any()), {}
         for harm_count, pairs in zip(HARM_COUNTS, self.follow_pairs(profiles), strict=True):
@@ -176,7 +178,7 @@ class ProfileProblem(NamedTuple):
         return harms
 
     def follow_pairs(self, profiles: Profiles) -> tuple[Floats, Floats]:
-        """Return the first-impact harm and the total harm of each pair under one profile per world, [n, P] m2/s2 each.
+        """Return first-impact harm and total harm of each pair if each world follows its profile, [n, P] m2/s2 each.
 
         If there is an obstacle ahead, the first pair consists of the obstacle and Vehicle 1. Raises the same errors as
         ``follow``.
@@ -230,7 +232,7 @@ def profile_problem(
     deciders: Sequence[int] | None = None,
     written_out: bool = False,
 ) -> ProfileProblem:
-    """Return the problem of choosing commands of some vehicles over a whole episode that cause the least harm.
+    """Return the problem of choosing commands of some vehicles over a whole episode, such that the harm is least.
 
     Args:
         worlds: n worlds.
@@ -240,11 +242,12 @@ def profile_problem(
         time_step_s: time between two decisions, s.
         others_mps2: constant commands of the other vehicles, [n, N] m/s2 (columns of ``vehicles`` are ignored); None:
             full braking.
-        deciders: indices of vehicles; the first decision is at the shortest latency of these vehicles. If this time has
-            passed in a world, the first decision is at the world's present time. None: ``vehicles``.
-        written_out: whether the arrays contain an obstacle, as an additional vehicle in front, even if no world has an
-            obstacle (``Worlds.with_obstacle``). If some world has an obstacle, the arrays always contain one. Worlds
-            without an obstacle then get one that no vehicle can reach.
+        deciders: indices of vehicles; the first decision is at the shortest latency of these vehicles. If this latency
+            has already elapsed in a world, the first decision is at the world's present time. None: ``vehicles``.
+        written_out: whether the arrays always contain an obstacle, as an additional vehicle in front
+            (``Worlds.with_obstacle``), even if no world has an obstacle. If some world has an obstacle, the arrays
+            always contain one. If the arrays contain an obstacle, worlds without an obstacle get one that no vehicle
+            can reach.
 
     Raises ``InvalidInput`` if ``vehicles`` is empty, repeats an index or contains an unknown index, if the harm count
     is unknown, if a command exceeds a capacity, or if the horizon is not after the first decision.
@@ -303,11 +306,11 @@ def profile_problem(
 
 
 def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -> UInt64s:
-    """Return a hash of each world's problem, [n]: 8 bytes of BLAKE2b over all data that a profile's harm depends on.
+    """Return a hash for each world, [n]: 8 bytes of BLAKE2b over all data that affect the harm of a profile.
 
-    These data are the world's state and parameters, the other vehicles' ``command`` [n, N], the times of decisions and
-    the horizon in ``clock`` [n, CLOCK.WIDTH], and the indices ``vehicles`` of the controlled vehicles. The hash is the
-    same for first-impact harm and total harm.
+    These data are the world's state and parameters, the ``command`` [n, N] of the vehicles that are not controlled, the
+    times of decisions and the horizon in ``clock`` [n, CLOCK.WIDTH], and the indices ``vehicles`` of the controlled
+    vehicles. The hash is the same for first-impact harm and total harm.
     """
     packed = Packed.of(worlds)
     (state, params), column = packed, packed.column
@@ -346,10 +349,10 @@ def _checked_vehicles(vehicles: Sequence[int], N: int) -> Ints:
 
 
 class Profiles(NamedTuple):
-    """One profile per world: phase j of world k lasts from decision ``ends[k, j - 1]`` to decision ``ends[k, j]``.
+    """One profile per world: phase j of world k lasts from decision ``ends[k, j - 1]`` (0 if j = 0) to ``ends[k, j]``.
 
-    During this phase the commands ``commands_mps2[k, j]`` apply. Phases that a profile does not need are empty: they
-    begin and end at the last step.
+    During phase j of world k the commands ``commands_mps2[k, j]`` apply. Phases that a profile does not need are empty:
+    they begin and end at the last step.
     """
 
     ends: Ints  # [n, K] number of the decision at which each phase ends
@@ -385,9 +388,10 @@ class Profiles(NamedTuple):
 
 @compiled
 def make_search_world(problem: ProfileProblem, k: int, random: UInt64s) -> SearchWorld:
-    """Return world number ``k`` of a problem, with working memory of its own for simulations.
+    """Return world number ``k`` of ``problem``, with working memory of its own for simulations.
 
-    ``random`` [n] contains the state of each world's random generator; the result shares number ``k`` of this array.
+    ``random`` [n] contains the state of each world's random generator. The result contains entry ``k`` of ``random`` as
+    a view (not a copy).
     """
     N = problem.mass.shape[1]
     table = np.zeros((rows_for(problem.pieces.shape[2]), N))

@@ -57,7 +57,7 @@ class State(NamedTuple):
         return Ledger(*packed.ledger(), *(each.copy() for each in of_worlds))
 
     def copy(self) -> State:
-        """Return a copy with arrays of its own; it shares the scripts' memories, which are never changed in place."""
+        """Return a copy with arrays of its own; the scripts' memories, which never change in place, are shared."""
         motion, params, clock, wanted, potential = (array.copy() for array in self[:5])
         return State(motion, params, clock, wanted, potential, self.memories, self.guarded, self.impacts)
 
@@ -70,7 +70,7 @@ class State(NamedTuple):
 
     @staticmethod
     def join(states: list[State]) -> State:
-        """Return one state with the worlds of all ``states``, one state after the other.
+        """Return one state that contains the worlds of all ``states``, in the order of ``states``.
 
         All ``states`` must come from the same engine. Raises ``InvalidInput`` if this engine has a guard (shield),
         because memories of guards cannot be joined.

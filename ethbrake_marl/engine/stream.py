@@ -34,11 +34,11 @@ class Start(NamedTuple):
 
     @property
     def alert(self) -> Worlds:
-        """The worlds of the new episodes at the alert, t = 0, n of them."""
+        """The n worlds of the new episodes at the alert, t = 0."""
         return self.origin.take(np.arange(self.first, self.first + len(self.clock)))
 
     def part(self, first: int, count: int) -> Start:
-        """Return ``count`` consecutive worlds, beginning with world number ``first`` of this object."""
+        """Return ``count`` consecutive worlds of this object, beginning with its world number ``first``."""
         rows = slice(first, first + count)
         packed = Packed(self.packed.state[rows], self.packed.params[rows])
         return Start(self.origin, self.first + first, packed, self.clock[rows], self.wanted[rows])
@@ -53,10 +53,10 @@ class Roster:
 
     Args:
         n: number of rows, one per world.
-        seed: seed of the stream of worlds.
-        first: number of the world in row 0, counted from the beginning of the stream; row k has world ``first + k``.
-            None: the worlds do not come from the stream.
-        given: the worlds at the alert, if they do not come from the stream; None: they come from the stream.
+        seed: seed of the stream from which the worlds come.
+        first: number of the world in row 0, counted from the beginning of the stream; row k has world ``first + k``. If
+            ``first`` is None, the worlds do not come from the stream.
+        given: the worlds at the alert, if the caller has passed worlds; None: the worlds come from the stream.
 
     """
 
@@ -74,7 +74,7 @@ class Roster:
         return new
 
     def renew(self, rows: Ints, first: int) -> None:
-        """Record that new worlds run in the rows with the indices ``rows``.
+        """Record that new worlds of the stream run in the rows with the indices ``rows``.
 
         The new worlds have the numbers ``first``, ``first + 1``, ... in the stream.
         """
@@ -87,8 +87,8 @@ class Roster:
 
         Args:
             status: status code of the physics for each world that could not be advanced, 0 for all other worlds, [n].
-            from_s: time at which the step began in each world, [n] s.
-            until_s: time at which the step should have ended in each world, [n] s.
+            from_s: time at which the last step began in each world, [n] s.
+            until_s: time at which the last step should have ended in each world, [n] s.
 
         """
         new = FLAG.failure(np.where(status == 0, FLAG.DONE, status), from_s, until_s).worlds
@@ -102,8 +102,8 @@ class Roster:
 class Stream:
     """The training worlds of a seed, one after the other, each advanced to its first decision.
 
-    In this stream, learners and scripts with a memory coast until the first decision. If a script decides before the
-    first decision of the ``deciders``, the engine advances the worlds once more from the alert.
+    Here learners, and scripts with a memory, coast until the first decision of the ``deciders``. If such a script
+    decides earlier, the engine advances the worlds once more from the alert.
 
     Args:
         scenario: the scenario from which worlds are drawn.
@@ -134,7 +134,7 @@ class Stream:
         return self._drawn - (0 if self._pool is None else len(self._pool.clock) - self._next)
 
     def take(self, count: int) -> Start:
-        """Return the next ``count`` worlds of the stream at their first decision, and move on in the stream."""
+        """Return the next ``count`` worlds of the stream at their first decision; the next call continues there."""
         if self._pool is None or self._next + count > len(self._pool.clock):
             self._fill(count)
         assert self._pool is not None
@@ -145,8 +145,9 @@ class Stream:
     def _fill(self, count: int) -> None:
         """Draw further worlds and advance them to their first decision, so that ``take`` can return ``count`` worlds.
 
-        If a world cannot be advanced to its first decision, the next world that can be advanced takes its place, so
-        all other worlds keep their numbers in the stream. ``_fill`` gives a ``FailedWorld`` warning for such a world.
+        If a world cannot be advanced to its first decision, the next world that can be advanced is used in its place.
+        So all other worlds keep their numbers in the stream. For each world that cannot be advanced, ``_fill`` gives a
+        ``FailedWorld`` warning.
         """
         first, size = self.position, max(4 * count, SAMPLED_AT_ONCE)
         alert = self._scenario.sample(size, self.seed, first=self._drawn, channel="training").worlds
@@ -166,7 +167,7 @@ class Stream:
         self._drawn += size
 
     def prepare(self, alert: Worlds) -> Start:
-        """Return the worlds ``alert`` (at t = 0) advanced to their first decision.
+        """Return the worlds ``alert``, which are at t = 0, advanced to their first decision.
 
         Raises ``InvalidInput`` if the first decision of a world is not before the horizon.
         """

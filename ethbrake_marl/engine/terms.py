@@ -23,8 +23,8 @@ class Terms:
     """The reward terms that the compiled step cannot compute; ``add`` adds them to the reward of a step.
 
     An *objective* says whose harm a vehicle's reward includes. If neither the reward nor the scenario has an objective,
-    each vehicle's reward includes the harm of the whole line. *Shaping* adds to the reward the change of a function of
-    the state, the *potential*.
+    each vehicle's reward includes the harm of the whole line. *Shaping* adds to the reward the change of the
+    *potential*, a function of the state.
 
     Args:
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
@@ -59,9 +59,10 @@ class Terms:
         return 0.0 if self._objectives else self.params.harm
 
     def vector(self, step: Step, before: Ledger, state: State) -> Floats:
-        """Return the vector reward of a step, [n, N, K]; 0 for episodes that had ended before the step.
+        """Return the vector reward of a step, [n, N, K]; 0 where the episode had ended before the step.
 
-        ``step``: results of the step. ``before``: harm before the step. ``state``: state after the step.
+        ``step`` contains the results of the step. ``before`` contains the harm of each pair from the alert to the
+        beginning of the step. ``state`` is the state after the step.
         """
         vector = vector_of(self.components, state.ledger.since(before), self.params.harm_count, step.terms)
         vector[state.ended & ~step.ended] = 0.0
@@ -84,10 +85,11 @@ class Terms:
             step: results of the compiled step; its fields ``further`` and ``reward`` are changed in place.
             state: state after the step.
             scenario: the scenario of the episodes.
-            before: harm of each pair before the step; None if there are no objectives.
-            impacts_before: impacts of the episodes before the step; None if no reward term is computed from single
-                impacts.
-            worlds: worlds after the step, from which new potentials are computed; None if the reward is not shaped.
+            before: harm of each pair from the alert to the beginning of the step; None if there are no objectives.
+            impacts_before: impacts from the alert to the beginning of the step; None if no reward term is computed from
+                single impacts.
+            worlds: worlds after the step, from which the new potentials (see the class) are computed; None if the
+                reward is not shaped.
 
         """
         if before is not None and self.params.harm > 0.0:
@@ -112,7 +114,7 @@ class Terms:
         return state
 
     def _outcome(self, step: Step, state: State, time_step_s: float) -> StepOutcome:
-        """Return the ``StepOutcome`` of a step, from which measures are computed; ``state`` is the state afterwards."""
+        """Return the ``StepOutcome`` of the step that led to ``state``, from which measures are computed."""
         motion, params, column = state.motion, state.params, state.packed.column
         return StepOutcome(
             step.first_impact_harm,

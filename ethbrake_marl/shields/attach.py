@@ -20,7 +20,7 @@ from ethbrake_marl.shields.options import ShieldOptions
 def proposing_agent(policy: object, where: str) -> Agent:
     """Return ``policy`` as an agent: an agent is returned unchanged, a learned policy becomes a ``LearnedAgent``.
 
-    Raises ``InvalidInput`` for any other object; the message begins with ``where``.
+    Raises ``InvalidInput`` if ``policy`` is neither an agent nor a learned policy; the message begins with ``where``.
     """
     if not isinstance(policy, type):
         if isinstance(policy, Agent):
@@ -36,10 +36,10 @@ def proposing_agent(policy: object, where: str) -> Agent:
 def proposing_agents(
     policy: Agent | LearnedPolicy | Team | Mapping[str, Agent | LearnedPolicy], vehicles: Sequence[int], where: str
 ) -> dict[int, Agent]:
-    """Return the proposing agent of each shielded vehicle: vehicle index -> agent.
+    """Return the agents that propose the actions of the shielded vehicles: vehicle index -> agent.
 
     Args:
-        policy: a team, a mapping from vehicle name to policy, or one policy that proposes for all vehicles.
+        policy: a team, a mapping from vehicle name to policy, or one policy that proposes the actions of all vehicles.
         vehicles: indices of the shielded vehicles.
         where: name with which error messages begin: the function or class that the user called.
 
@@ -66,13 +66,13 @@ Proposing = Agent | LearnedPolicy | Team | Mapping[str, Agent | LearnedPolicy]
 
 
 def guard_of(engine: Engine, policy: Proposing | None, options: ShieldOptions) -> ShieldGuard:
-    """Return the guard that shields all learners of an engine.
+    """Return a guard that shields all learners of an engine.
 
     Args:
         engine: the engine whose learners are shielded; this function does not change the engine.
-        policy: policy that proposes the actions that the caller leaves out. ``policy`` may be None, except in mode
-            ``episode``.
-        options: settings of the shield.
+        policy: policy that proposes the actions that the caller leaves out. In all modes except ``episode``, ``policy``
+            may be None.
+        options: settings of the shield, such as its mode.
 
     Raises ``InvalidInput`` if no vehicle learns, if several vehicles learn and the mode is not ``step``, and if
     ``policy`` is of the wrong type.
@@ -99,18 +99,19 @@ def guard_of(engine: Engine, policy: Proposing | None, options: ShieldOptions) -
 
 
 class Attached:
-    """The link between an environment's shield wrapper and the guard in the environment's engine.
+    """The link between the shield wrapper of an environment and the guard in the environment's engine.
 
     Args:
         env: the environment to shield.
         interface: class of which ``env`` must be an instance, such as ``gymnasium.Env``.
-        maker: code that makes such an environment, such as ``eb.parallel_env``; error messages name this code.
+        maker: code that makes an environment of the right kind, such as ``eb.parallel_env``; error messages contain
+            this code.
         policy: policy that proposes the actions that the caller leaves out; None: no policy.
-        where: name with which error messages begin: the shield wrapper.
+        where: name with which error messages begin: the name of the shield wrapper.
         options: keywords of ``ShieldOptions``.
 
     An ``Attached`` object has the attributes ``engine``, ``guard`` and ``options``. Raises ``InvalidInput`` if ``env``
-    is not an environment of this package, or already has a shield.
+    is not an environment of this package, or if ``env`` already has a shield.
 
     """
 
@@ -171,7 +172,10 @@ class Attached:
             raise InvalidInput(f"{self.options.where}: this shield was closed; put a new shield around the environment")
 
     def close(self) -> None:
-        """Remove this shield from the environment. After the call, ``memory`` and ``shield`` keep their last values."""
+        """Remove this shield from the environment.
+
+        After ``close``, the attributes ``memory`` and ``shield`` keep their last values.
+        """
         if self.engine.guard is self.guard:
             self._left = self.memory
             self.engine.protect(None)

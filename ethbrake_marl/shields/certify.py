@@ -2,11 +2,12 @@
 
 A *plan* is a sequence of actions, one for each decision up to the horizon. The *backup* is the present plan of the
 shield. The *budget* is the largest harm that the shield accepts for the whole episode. The shield may consider several
-*possible worlds* (members) for each world. Each plan is simulated in all possible worlds, with the compiled functions
-of the module ``members``.
+*possible worlds* (members) for each world. Each plan is simulated in all possible worlds of a world, with the compiled
+functions of the module ``members``.
 
-Two plans that begin with the proposed action are simulated: one continues with the rest of the backup, the other with
-the best constant action. The module ``step`` proves that the harm of the episode never exceeds the bound at the alert.
+Two plans that begin with the proposed action are simulated. One plan continues with the rest of the backup, the other
+with the best constant action. The module ``step`` proves that the harm of the episode never exceeds the bound at the
+alert.
 """
 
 from __future__ import annotations
@@ -55,12 +56,12 @@ def best_constant(world: Members, states: Floats, ended: Bools, step: int, const
     """Return the index (in ``constants``) of the action that does the least harm, and its harm, m2/s2.
 
     The harm of a constant action is the largest harm over the possible worlds if the action is held from now to the
-    horizon. The time until the horizon is simulated in one go, not decision by decision.
+    horizon. The time until the horizon is simulated as one segment, not decision by decision.
 
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).
         states: present state of each possible world, [M, S], in the layout of ``Running.states``.
-        ended: whether the episode has ended in each possible world, [M].
+        ended: for each possible world, True if the episode has ended, [M].
         step: number of the present decision.
         constants: C constant actions to try, each with one number per shielded vehicle, [C, K].
 
@@ -85,20 +86,21 @@ def better_plan(
     world: Members, states: Floats, ended: Bools, step: int, constants: Floats, value: float, most: float,
     plan: Floats, trial: Floats,
 ) -> tuple[float, float]:  # fmt: skip
-    """Replace the rest of a plan by the best constant action, if the harm is then below ``value`` and at most ``most``.
+    """Replace the rest of a plan by the best constant action if the harm is then below ``value`` and at most ``most``.
 
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).
         states: present state of each possible world, [M, S], in the layout of ``Running.states``.
-        ended: whether the episode has ended in each possible world, [M].
+        ended: for each possible world, True if the episode has ended, [M].
         step: number of the present decision; actions from this decision on are replaced.
         constants: C constant actions to try, each with one number per shielded vehicle, [C, K].
         value: harm of the present ``plan``, the largest over the possible worlds, m2/s2.
         most: largest harm that the new plan may have, m2/s2.
         plan: the present plan, with the actions of each decision, [L, K]; changed in place.
-        trial: workspace for a plan to try, [L, K].
+        trial: workspace for the plan that is tried, [L, K].
 
-    Returns the harm of the resulting plan, and the least harm of any plan tried, accepted or not (both m2/s2).
+    Returns the harm of the resulting plan, and the least harm of all plans that were tried, whether accepted or not
+    (both m2/s2).
 
     """
     so_far = worst_so_far(world, states)
@@ -126,7 +128,7 @@ def copy_action(action: Floats, to: Floats) -> None:
 
 @compiled
 def is_planned(action: Floats, planned: Floats) -> bool:
-    """Return whether ``action`` [K] equals the ``planned`` action [K] for each of K shielded vehicles."""
+    """Return whether the actions ``action`` [K] of all K shielded vehicles equal their ``planned`` actions [K]."""
     for c in range(planned.shape[0]):  # noqa: SIM110  # all() is not compiled
         if action[c] != planned[c]:
             return False
@@ -146,20 +148,20 @@ def try_action(
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).
         states: present state of each possible world, [M, S], in the layout of ``Running.states``.
-        ended: whether the episode has ended in each possible world, [M].
+        ended: for each possible world, True if the episode has ended, [M].
         step: number of the present decision.
-        action: the actions to try, one per shielded vehicle, [K].
-        budget: largest harm of the episode that is accepted, m2/s2.
+        action: actions whose consequences are tried, one per shielded vehicle, [K].
+        budget: largest harm of the whole episode that the shield accepts, m2/s2.
         certified: harm of the present ``plan``, m2/s2.
         constants: C constant actions to try, each with one number per shielded vehicle, [C, K].
-        plan: present plan, [L, K]; if the search succeeds, ``plan`` is changed to the tried action followed by the
-            actions found for the later decisions.
+        plan: the shield's present plan, [L, K]. If the search succeeds, ``plan`` is replaced in place by the plan
+            found, which begins with ``action``.
         room: workspace for two plans, [2, L, K].
         after: receives the state of each possible world after the step, [M, S].
-        over: receives whether the episode has ended after the step in each possible world, [M].
+        over: for each possible world, receives True if the episode has ended after the step, [M].
 
-    Returns the harm of the resulting plan, the least harm of any plan tried (both m2/s2), and the reason (a code of
-    ``ShieldReason``). The search succeeded if the harm of the resulting plan is at most ``budget``.
+    Returns the harm of the resulting plan, the least harm of all plans that were tried (both m2/s2), and the reason (a
+    code of ``ShieldReason``). The search has succeeded if the harm of the resulting plan is at most ``budget``.
 
     """
     going = take_steps(world, states, ended, step, action, after, over)
@@ -185,14 +187,14 @@ def try_action(
 def tell_action(out: Floats, action: Floats, bound: float, margin: float) -> None:
     """Write the applied action, bound and margin of each shielded vehicle into its row of ``out``.
 
-    The margin of a vehicle whose proposal was rejected is left unchanged.
+    If a vehicle's proposal was rejected, the vehicle's margin in ``out`` does not change.
 
     Args:
         out: columns ``APPLIED``, ``REASON``, ``BOUND`` and ``MARGIN`` for each vehicle, [K, 4]; changed in place. The
-            caller must have filled in the column ``REASON``.
+            caller must already have written the column ``REASON``.
         action: applied actions, [K].
         bound: harm that the episode will not exceed, m2/s2.
-        margin: budget minus the harm of the plan, m2/s2.
+        margin: budget minus the harm of the plan after this decision, m2/s2.
 
     """
     for c in range(action.shape[0]):
@@ -208,28 +210,28 @@ def decide_world(
 ) -> bool:  # fmt: skip
     """Decide in one world: accept the proposed actions, or replace them by the actions of the plan.
 
-    The proposals of all vehicles are first tried together. If no plan after these actions stays within the budget, the
-    proposals are tried one by one, front to rear, while the other vehicles act as planned. An accepted proposal becomes
-    part of the plan before the next vehicle's proposal is tried.
+    First the proposals of all vehicles are tried together. If no plan after all proposals together stays within the
+    budget, the proposals are tried one by one, front to rear, while the other vehicles act as planned. An accepted
+    proposal becomes part of the plan before the next vehicle's proposal is tried.
 
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).
         states: present state of each possible world, [M, S], in the layout of ``Running.states``.
-        ended: whether the episode has ended in each possible world, [M].
+        ended: for each possible world, True if the episode has ended, [M].
         step: number of the present decision.
         proposed: proposed actions, [K]; NaN for a vehicle without a proposal.
-        budget: largest harm of the episode that is accepted, m2/s2.
+        budget: largest harm of the whole episode that the shield accepts, m2/s2.
         certified: harm of the present ``plan``, m2/s2.
         constants: constant actions that may replace the rest of a plan, [C, K].
         plan: the present plan, with the actions of each decision, [L, K]; replaced in place by the new plan, whose harm
             is the bound in ``out``.
         room: workspace for two plans, [2, L, K].
-        tried: workspace for the actions to try, [2, K].
+        tried: workspace for the actions that are tried, [2, K].
         after: receives the state of each possible world after the step, [M, S].
-        over: receives whether the episode has ended after the step in each possible world, [M].
-        out: receives applied action, reason, bound and margin of each vehicle, [K, 4].
+        over: for each possible world, receives True if the episode has ended after the step, [M].
+        out: receives, for each shielded vehicle, the applied action, reason, bound and margin, [K, 4].
 
-    Returns False if the physics fails with the applied actions, otherwise True.
+    Returns False if the physics fails with the actions to apply, otherwise True.
 
     """
     deviating = 0
@@ -279,16 +281,16 @@ def certify_worlds(
     A world whose episode has ended keeps its state and its plan.
 
     Args:
-        running: the episodes at this decision, n worlds with M possible worlds each.
+        running: the running episodes at this decision, in n worlds with M possible worlds each.
         proposed: proposed actions, [n, K]; NaN for a vehicle without a proposal.
-        budget: largest harm that is accepted in each episode, [n] m2/s2.
-        certified: harm of each plan, [n] m2/s2.
+        budget: largest harm of the whole episode that the shield accepts in each world, [n] m2/s2.
+        certified: harm of each of the present ``plans``, [n] m2/s2.
         constants: constant actions that may replace the rest of a plan, [C, K].
         plans: plan of each world, with the actions of each decision, [n, L, K]; changed in place.
         after: receives the state of each possible world after the step, [n * M, S].
-        out: receives applied action, reason, bound and margin of each vehicle, [n, K, 4].
-        over: receives whether the episode has ended after the step in each possible world, [n * M].
-        failed: receives whether the physics failed in each world, [n].
+        out: receives, for each shielded vehicle, the applied action, reason, bound and margin, [n, K, 4].
+        over: for each possible world, receives True if the episode has ended after the step, [n * M].
+        failed: for each world, receives True if the physics failed, [n].
 
     """
     n, every = running.steps.shape[0], all_members(running)
@@ -314,11 +316,11 @@ def certify_worlds(
 
 @compiled
 def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Floats) -> None:
-    """Compute the harm of each whole episode if its plan is executed from now on; write it to ``value`` [n] m2/s2.
+    """Write into ``value`` [n] m2/s2 the harm of each whole episode if its plan is executed from now on.
 
-    The harm of a plan is its largest harm over the possible worlds; it is infinite if the physics fails. If one of the
-    ``constants`` [C, K], held to the horizon, causes less harm than the rest of a plan, this constant action replaces
-    the rest of the plan in ``plans`` [n, L, K], and ``value`` contains the harm of the changed plan.
+    The harm of a plan is the largest harm over the possible worlds, and infinite if the physics fails. If one of the
+    ``constants`` [C, K], held to the horizon, does less harm than the rest of a plan in ``plans`` [n, L, K], this
+    constant action replaces the rest of the plan, and ``value`` contains the harm of the changed plan.
     """
     n, every = running.steps.shape[0], all_members(running)
     trial = np.zeros((plans.shape[1], plans.shape[2]))
@@ -337,9 +339,10 @@ def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Flo
 def ends_of_plans(running: Running, plans: Floats, rests: Bools, borne: Floats) -> None:
     """Simulate the ``plans`` [n, L, K] from now on and report how the episodes end.
 
-    ``running`` contains n worlds, each with M possible worlds. The results are written into two arrays. ``rests`` [n]:
-    whether all vehicles come to rest before the horizon and stay at rest, in every possible world. ``borne`` [n * M,
-    N]: the harm that each vehicle bears in the whole episode, m2/s2 (0 for an obstacle ahead).
+    ``running`` contains n worlds, each with M possible worlds. The results are written into the arrays ``rests`` and
+    ``borne``. ``rests`` [n] is True for the worlds in which all vehicles come to rest before the horizon and stay at
+    rest, in every possible world. ``borne`` [n * M, N] is the harm that each vehicle bears in the whole episode, m2/s2
+    (0 for an obstacle ahead).
     """
     n, every = running.steps.shape[0], all_members(running)
     M = running.states.shape[0] // max(n, 1)
@@ -354,16 +357,16 @@ def ends_of_plans(running: Running, plans: Floats, rests: Bools, borne: Floats) 
 
 @compiled
 def descend_constants(running: Running, grid: Floats, rounds: int, action: Floats) -> None:
-    """Improve constant actions by coordinate descent over the vehicles.
+    """Improve the vehicles' constant actions by coordinate descent: change the action of one vehicle at a time.
 
     For one vehicle after the other, the vehicle's action is replaced by the action in ``grid`` that does the least harm
     while the other vehicles keep their actions. Each tried action is held to the horizon, and the time until the
-    horizon is simulated in one go, not decision by decision.
+    horizon is simulated as one segment, not decision by decision.
 
     Args:
-        running: the episodes, n worlds with exactly one possible world each.
-        grid: actions to try for each vehicle, [G].
-        rounds: number of passes over all vehicles.
+        running: the running episodes, in n worlds with exactly one possible world each.
+        grid: actions that are tried for each vehicle, [G].
+        rounds: how often the descent tries all actions of all vehicles.
         action: constant action of each vehicle, [n, K]; changed in place.
 
     """
@@ -385,7 +388,7 @@ CONSTANTS = tuple(-k / 10 for k in range(11))  # constant actions that are tried
 
 
 class Backup(NamedTuple):
-    """The shield's present plans in n worlds; a plan is executed where no proposal is accepted."""
+    """The shield's present plans in n worlds. Where a proposal is not accepted, the plan's action is applied."""
 
     plan: Floats  # [n, L], or [n, L, K] for K shielded vehicles: actions of each decision; entry j is for decision j
     harm: Floats  # [n] harm of the episode in the worst possible world if the plan is executed from now on (m2/s2)
@@ -435,7 +438,7 @@ def plan_harm(running: Running, plan: Floats) -> Floats:
 
 
 def bettered_plan(running: Running, plan: Floats, constants: Floats) -> tuple[Floats, Floats]:
-    """Replace the rest of each plan by the best constant action where this causes less harm; return plans and harms.
+    """Replace the rest of a plan by the best constant action where that lowers the harm; return plans and harms.
 
     Args:
         running: the n episodes at a decision.
@@ -468,17 +471,20 @@ def from_now(past: Floats, later: Floats | float, steps: Ints) -> Floats:
 def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) -> Decision:
     """Decide in every world: apply the proposed action if it can be certified, else the action of the backup plan.
 
-    A proposal is certified if a plan that begins with it keeps the harm of the episode within the budget. This function
-    does not change its arguments.
+    A proposal is certified if a plan that begins with the proposed action keeps the harm of the episode within the
+    budget. This function does not change its arguments.
 
     Args:
-        running: the episodes at this decision.
-        proposed: proposed actions, [n] or [n, K]; clipped to [-1, 1]. NaN is replaced by the planned action.
-        backup: the present plan, which is followed where a proposal cannot be certified, and its harm.
-        budget: largest harm that is accepted in each episode, [n] m2/s2; at least the harm of ``backup``.
+        running: the running episodes at this decision.
+        proposed: proposed actions, [n] or [n, K]; clipped to [-1, 1]. A proposed action NaN is replaced by the planned
+            action.
+        backup: the present plan of each world, and the plan's harm; where a proposal cannot be certified, the plan is
+            executed.
+        budget: largest harm of the whole episode that the shield accepts in each world, [n] m2/s2; at least the harm of
+            ``backup``.
 
-    Raises ``InvalidInput`` if the shapes of the arrays do not fit, or if a budget is below the harm of ``backup``.
-    Raises ``PhysicsError``, which names the worlds, if the physics fails with the applied action.
+    Raises ``InvalidInput`` if the shapes of the arrays do not fit together, or if a budget is below the harm of
+    ``backup``. Raises ``PhysicsError``, which names the worlds, if the physics fails with the applied action.
 
     """
     n, problem, vehicles = running.n, running.problem, len(running.problem.vehicles)

@@ -1,4 +1,4 @@
-"""Comparison of the observed worlds with the shield's prediction: bit by bit, including the harm so far."""
+"""Compare the observed worlds with the shield's prediction: bit by bit, including the harm so far."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ GROUPS = (("gap", " m"), ("hit flag", ""), ("first-impact harm", " m2/s2"), ("to
 
 
 def seen_columns(packed: Packed) -> Floats:
-    """Return the running worlds of an engine as rows [n, S] in the layout of ``Running.states``.
+    """Return the states of an engine's running worlds, [n, S], in the layout of ``Running.states``.
 
     Each row consists of five groups of columns: speeds, gaps, hit flags (1 after an impact of the pair), first-impact
     harms and total harms. If any world has an obstacle ahead, each group of columns begins with a column for the
@@ -34,7 +34,7 @@ def seen_columns(packed: Packed) -> Floats:
 
 
 def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
-    """Return a copy of ``worlds`` with the speeds, gaps and hit flags in ``states``.
+    """Return a copy of ``worlds`` with the speeds, gaps and hit flags (1: the pair had an impact) of ``states``.
 
     ``states`` [n, S] has the layout of ``Running.states``. The gap to an obstacle ahead and its hit flag also come from
     ``states``.
@@ -53,7 +53,8 @@ def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
 
 
 def difference(predicted: Floats, seen: Floats) -> str:
-    """Describe the first number in which an observed world differs from its prediction; "nothing" if they are equal.
+    """Describe the first number in which an observed world differs from its prediction; "nothing" if all numbers are
+    equal.
 
     ``predicted`` and ``seen`` are rows [S] in the layout of ``Running.states``; ``seen`` may lack the last columns.
     """
@@ -69,15 +70,15 @@ def difference(predicted: Floats, seen: Floats) -> str:
 
 
 def ends_under(running: Running, plan: Floats) -> tuple[Bools, Floats]:
-    """Return how the episodes end if the plans are executed from now on.
+    """Return how the episodes end if the plans are executed from now on: whether at rest, and with how much harm.
 
     ``plan`` contains the actions of each decision, [n, L], or [n, L, K] for K shielded vehicles. ``running`` contains n
     worlds, each with M possible worlds.
 
-    The first result is whether all vehicles are at rest at the horizon in every possible world, [n]. The second result
-    is the harm of the whole episode that each vehicle bears, [n * M, N] m2/s2. The harm of each vehicle equals, to the
-    bit, its harm in the engine's ledger. With an obstacle ahead, the first of the N columns belongs to the obstacle and
-    is 0.
+    The first result is True for the worlds in which all vehicles are at rest at the horizon in every possible world,
+    [n]. The second result is the harm of the whole episode that each vehicle bears, [n * M, N] m2/s2. The harm of each
+    vehicle equals, to the bit, the harm that the engine's ledger contains for this vehicle at the end of the episode.
+    With an obstacle ahead, the first of the N columns belongs to the obstacle and is 0.
     """
     rests, borne = np.empty(running.n, np.bool_), np.empty(running.problem.mass.shape)
     plans = np.ascontiguousarray(plan).reshape(*plan.shape[:2], len(running.problem.vehicles))

@@ -18,8 +18,8 @@ A *guard* is the object in an engine that decides which actions are applied. The
 - ``info``: details of the decision, which environments report in their infos as ``shield_...``.
 
 ``decide`` returns ``applied``, ``memory`` and ``info`` in one ``Ruling`` (``engine.engine``). After the step, ``check``
-compares the new state with the prediction. If ``check`` raises ``UncertifiedStep``, the engine undoes the step and
-keeps its old memory.
+compares the new state with the state that the guard predicted. If ``check`` raises ``UncertifiedStep``, the engine
+undoes the step and keeps its old memory.
 
 ``begin`` starts episodes in some rows of the batch, and ``report`` returns the infos. ``ShieldGuard`` implements what
 all modes share: it asks the policies for proposals, stores their memories, and arranges the infos by vehicle. The
@@ -74,10 +74,10 @@ class Guarded(NamedTuple):
 
     @property
     def told(self) -> dict[str, Any]:
-        """The shield's ``predicted_harm`` [n] and ``chosen_policy`` [n] by name; None if the shield has no such value.
+        """The shield's values ``predicted_harm`` [n] and ``chosen_policy`` [n], by name; None for a missing value.
 
-        ``predicted_harm`` is the harm predicted at the alert (m2/s2). ``chosen_policy`` says in which worlds the policy
-        drives.
+        ``predicted_harm`` is the harm predicted at the alert (m2/s2). ``chosen_policy`` is True in the worlds where the
+        policy drives.
         """
         return {what: getattr(self.shield, what, None) for what in ("predicted_harm", "chosen_policy")}
 
@@ -91,8 +91,8 @@ class ShieldGuard(ABC):
 
     Args:
         engine: the engine that gets this guard. All learners of the engine are shielded.
-        policies: vehicle index -> policy that proposes if the caller gives no action. A policy with a memory is called
-            at every decision, even if its proposal is not needed, to update its memory.
+        policies: vehicle index -> policy that proposes an action if the caller gives no action for the vehicle. A
+            policy with a memory is called at every decision, even if its proposal is not needed, to update its memory.
         shield: initial state of the shield, before any episode; its type depends on the mode.
         mode: mode of the shield; the infos report the number of the mode.
         where: name with which error messages begin: the function or class that the user called.
@@ -113,7 +113,7 @@ class ShieldGuard(ABC):
         """Return the actions to apply in the next step, with the details of the decision.
 
         Args:
-            running: the engine before the step.
+            running: the engine with its running episodes, before the step.
             memory: memory of the guard.
             proposed: proposed actions, [n, L]. A column of NaN means that the caller gave no action for the learner of
                 this column; the learner's policy then proposes. A single NaN is an invalid action and is never applied.
@@ -124,13 +124,13 @@ class ShieldGuard(ABC):
     def _started(self, shield: Any, alert: Worlds, rows: Ints) -> Any:
         """Start episodes in the rows with the indices ``rows``; return the shield's new state.
 
-        ``alert`` contains the new worlds at the alert (t = 0), one for each of ``rows``. ``shield`` is a copy of the
-        shield's old state; this method may change the copy.
+        ``alert`` contains the new worlds at the alert (t = 0), one for each index in ``rows``. ``shield`` is a copy of
+        the shield's old state, which this method may change.
         """
 
     @abstractmethod
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos after a decision: name (without ``shield_``) -> value.
+        """Return the infos after a decision: dictionary from name (without ``shield_``) to value.
 
         A value is a single number, or an array with one number per world [n], learner [n, L] or vehicle [n, N].
 
@@ -144,8 +144,8 @@ class ShieldGuard(ABC):
     def begin(self, memory: Guarded | None, alert: Worlds, rows: Ints) -> Guarded:
         """Start episodes in the rows with the indices ``rows``; return the guard's new memory.
 
-        ``alert`` contains the new worlds at the alert (t = 0), one for each of ``rows``. ``memory`` is the guard's old
-        memory, None before the first episode.
+        ``alert`` contains the new worlds at the alert (t = 0), one for each index in ``rows``. ``memory`` is the
+        guard's old memory, None before the first episode.
         """
         shield, policies = memory or Guarded(self._fresh, {})
         memories = {i: begin_script(policy, alert, i, self.scripts) for i, policy in self._policies.items()}
@@ -162,15 +162,15 @@ class ShieldGuard(ABC):
         return memory
 
     def intervened(self, ruling: Ruling) -> Bools:
-        """Return whether the decision ``ruling`` replaced the proposed action, [n, L]."""
+        """Return whether the decision ``ruling`` replaced the learner's proposed action, [n, L]."""
         decided: Bools = ruling.decision.intervened
         return decided.reshape(ruling.applied.shape)
 
     def report(self, running: Engine) -> dict[str, NDArray[Any]]:
-        """Return the infos of every vehicle: name (without ``shield_``) -> values [n, N].
+        """Return the infos of every vehicle: dictionary from name (without ``shield_``) to values [n, N].
 
-        The infos describe the last step of the engine ``running``. In a row where a new episode has just started, the
-        infos describe the alert of this episode instead.
+        The infos describe the last step of the engine, which is ``running``. In a row where a new episode has just
+        started, the infos describe the alert of the new episode instead.
         """
         memory: Any = running.guarded
         ruling, first = running.ruling, running.steps == 0
@@ -183,10 +183,10 @@ class ShieldGuard(ABC):
         return last
 
     def _of_vehicles(self, infos: Mapping[str, Any], running: Engine) -> dict[str, NDArray[Any]]:
-        """Return the ``infos`` (name -> value) with every value expanded to all vehicles, [n, N].
+        """Return ``infos`` (name -> value) with every value expanded to an array with one number per vehicle, [n, N].
 
-        ``running`` is the engine. If a value has one column per learner, the vehicles that do not learn get 0 (for the
-        value ``reason``: ``NO_DECISION``).
+        ``running`` is the engine that the guard protects. If a value has one column per learner, the columns of all
+        other vehicles are 0 (in the info ``reason``: ``NO_DECISION``).
         """
         shape, spread = running.wanted_mps2.shape, dict[str, NDArray[Any]]()
         for name, value in infos.items():
@@ -199,10 +199,10 @@ class ShieldGuard(ABC):
         return spread
 
     def _of_step(self, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos that all modes report: mode, proposed action, applied action, and if the shield intervened.
+        """Return the infos of all modes: mode, proposed action, applied action, and whether the action was replaced.
 
-        ``ruling`` is the decision in the last step. Before the first step ``ruling`` is None; the proposed and the
-        applied action are then 0.
+        ``ruling`` is the decision in the last step. Before the first step ``ruling`` is None, and the infos report 0 as
+        the proposed and the applied action.
         """
         infos: dict[str, Any] = {"mode": self.mode}
         if ruling is None:
@@ -213,13 +213,13 @@ class ShieldGuard(ABC):
     def _asked(
         self, worlds: Worlds | None, memories: dict[int, Memory], proposed: Floats
     ) -> tuple[Floats, dict[int, Memory]]:
-        """Let policies propose for learners without an action; return proposals [n, L] and the policies' memories.
+        """Let policies propose for learners without an action; return all proposals [n, L] and the policies' memories.
 
         Args:
             worlds: the n worlds that the policies observe; may be None if no policy is called.
             memories: vehicle index -> memory of this vehicle's policy.
-            proposed: actions that the caller proposes, [n, L]. A column of NaN is replaced by the actions that this
-                learner's policy proposes.
+            proposed: actions that the caller proposes, [n, L]. A column of NaN is replaced by the actions that the
+                policy of the column's learner proposes.
 
         """
         left_out = np.isnan(proposed).all(axis=0)
@@ -236,7 +236,7 @@ class ShieldGuard(ABC):
         return proposed, memories
 
     def _proposer(self, memories: dict[int, Memory], worlds: Worlds | None) -> Proposer | None:
-        """Return the policies with their ``memories`` and the current ``worlds``, as a rollout needs them.
+        """Return the policies with their ``memories`` and the present ``worlds``, from which a rollout can start.
 
         Returns None if the guard has no policies, or if ``worlds`` is None.
         """
@@ -247,8 +247,8 @@ def why(ruling: Ruling | None) -> dict[str, Any]:
     """Return the infos ``reason`` and ``margin`` of a decision of mode ``step``, each [n, L].
 
     ``reason`` is a code of ``ShieldReason``. ``margin`` is the budget (the largest harm that is accepted) minus the
-    least harm of any plan tried after the proposal, m2/s2. Before the first decision ``ruling`` is None; then the
-    reason is ``NO_DECISION`` and the margin is 0.
+    least harm of any plan tried after the proposal, m2/s2. Before the first decision ``ruling`` is None, and the infos
+    report the reason ``NO_DECISION`` and the margin 0.
     """
     if ruling is None:
         return {"reason": ShieldReason.NO_DECISION, "margin": 0.0}

@@ -19,15 +19,16 @@ from ethbrake_marl.shields.paper_hybrid import HybridAgent
 class ShieldedDriver(ByPolicy):
     """An agent or a team behind a shield that certifies every action: mode ``step``, or a mode of an extension.
 
-    At the alert the policy is simulated to the end of the episode. In worlds where the policy does at most the harm of
-    E-V2X-BM, the policy drives without interventions, and the policy's harm is the bound. In all other worlds each
-    proposed action must be certified: by the rest of the plan, by a constant action, or by a rollout, which simulates
-    the policy from the state after the action. The shield decides on all proposals of a team together.
+    At the alert the policy is simulated to the end of the episode. In worlds where the simulated policy does at most
+    the harm of E-V2X-BM, the policy drives without interventions, and the policy's harm is the bound. In all other
+    worlds each proposed action must be certified by a plan that begins with the action: it continues with the rest of
+    the present plan, with a constant action, or with a rollout (a simulation of the policy). In each world, the shield
+    decides on the proposals of all vehicles of a team together.
 
     Args:
-        policy: the agent or team that proposes.
+        policy: the agent or team that proposes actions.
         scenario: the scenario in which actions are certified.
-        later_rollouts: whether a rollout of the policy from a later decision on may certify an action.
+        later_rollouts: whether a rollout of the policy that starts after the alert may certify an action.
         told: the worlds at the alert, as the shield assumes them. If ``told`` is None, the shield knows the true
             worlds. The policy always observes the true worlds.
         options: keywords of ``ShieldOptions``.
@@ -73,17 +74,17 @@ class ShieldedDriver(ByPolicy):
 
     @property
     def adds(self) -> Source:
-        """Knowledge (``Source``) that the shield uses to certify actions, in addition to the policy's own knowledge."""
+        """Knowledge (``Source``) that the shield uses to certify actions, beyond what the policy knows."""
         return self.options.adds
 
     @property
     def knows(self) -> Knowledge:
-        """Everything that the policy or the shield knows."""
+        """Knowledge of the policy and the shield together."""
         return Knowledge.of(self.policy, also=self.adds)
 
     @classmethod
     def around(cls, driver: Driver, task: Task, **settings: Any) -> Team:
-        """Return a team in which copies of ``driver``, behind one shield, drive the vehicles of ``task``.
+        """Return a team in which copies of ``driver``, behind one shield, drive the controlled vehicles of ``task``.
 
         The scenario and the harm count come from ``task``; ``settings`` are further keywords of ``ShieldedDriver``.
         """
@@ -103,10 +104,11 @@ class ShieldedDriver(ByPolicy):
 
 
 def shielded(driver: Driver, scenario: Scenario, mode: str, **options: Any) -> Driver:
-    """Return an agent or a team behind a shield.
+    """Return the agent or team ``driver`` with a shield.
 
     Args:
-        driver: the agent or team. If the scenario has several learners, a copy of the agent drives each of them.
+        driver: the agent or team to shield. If the scenario has several learners, a copy of the agent drives each of
+            them.
         scenario: the scenario in which actions are certified.
         mode: ``step``, ``episode`` or a mode of an extension.
         options: further keywords of ``ShieldOptions``.

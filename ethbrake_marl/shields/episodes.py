@@ -1,4 +1,4 @@
-"""Results of whole episodes behind a step shield: harm, bound and number of replaced actions in every world."""
+"""Results of whole episodes with a step shield: harm, bound and number of replaced actions in every world."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ CHUNK = 500  # number of worlds simulated together; limits memory, and does not 
 
 
 class Shielded(NamedTuple):
-    """Results of whole episodes behind a step shield: n worlds, N vehicles, K of them shielded.
+    """Results of whole episodes with a step shield in n worlds: N vehicles, of which K are shielded.
 
-    The comments beside the fields state the shapes of the arrays for one driver. ``stack`` adds a first axis for
-    several drivers: for instance, ``harm`` has the shape [drivers, n] after ``stack``.
+    The comments beside the fields state the shapes that the arrays have for a single driver. ``stack`` adds a first
+    axis for several drivers: for instance, the shape of ``harm`` becomes [drivers, n].
     """
 
     harm: Floats  # [n] harm of the episode, first-impact or total harm, whichever the shield bounds (m2/s2)
@@ -35,7 +35,7 @@ class Shielded(NamedTuple):
 
     @staticmethod
     def of(episodes: Episodes, task: Task) -> Shielded:
-        """Return the results of finished ``episodes`` behind a step shield; ``task`` states the harm count."""
+        """Return the results of finished ``episodes`` with a step shield; ``task`` contains the harm count."""
         shield: StepShield = episodes.guarded.shield
         assert shield.memory.running is not None
         return Shielded(
@@ -63,7 +63,7 @@ def drive_shielded(driver: Driver, worlds: Worlds, task: Task, **settings: Any) 
     """Drive in every world with a copy of ``driver`` behind a step shield, and return the results.
 
     Args:
-        driver: an agent or a team.
+        driver: the agent or team to shield.
         worlds: n worlds at the alert, simulated in groups of at most ``CHUNK`` worlds.
         task: scenario, shielded vehicles and harm count.
         settings: further keywords of ``ShieldedDriver``.

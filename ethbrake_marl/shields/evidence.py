@@ -41,17 +41,17 @@ class Review(NamedTuple):
 
 
 def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
-    """Compare each intervention with the same episode in which ``policy`` drives unshielded from that decision on.
+    """For each intervention, compare the episode with an episode in which ``policy`` drives unshielded from then on.
 
-    An intervention is *needed* if the episode without it does more harm, *costly* if the episode without it does less
-    harm, and *harmless* if both episodes do equal harm. The episode with the interventions is also simulated again, so
-    that both harms are computed in ``worlds``, even if the shield assumed other worlds.
+    An intervention is *needed* if the episode without the intervention does more harm than the actual episode, *costly*
+    if it does less harm, and *harmless* if both episodes do equal harm. The episode with the interventions is also
+    simulated again in ``worlds``, because the shield may have assumed other worlds.
 
     Args:
         shield: a shield made with ``logging=True``, after it has run the episodes in ``worlds``. Log entries of earlier
             episodes are ignored.
-        policy: the agent, or the team of all shielded vehicles, that proposed the actions in these episodes.
-        worlds: the worlds of these episodes at the alert.
+        policy: the agent, or the team of all shielded vehicles, that proposed the actions in the reviewed episodes.
+        worlds: the worlds of the reviewed episodes, as they were at the alert.
 
     Raises ``InvalidInput`` if the shield has no log, or if ``worlds`` and the shield's batch differ in the number of
     worlds.
@@ -83,14 +83,14 @@ def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
 def _released_harm(shield: StepShield, policy: Driver, worlds: Worlds, world: Ints, step: Ints) -> Floats:
     """Return the harm of m episodes in which ``policy`` drives unshielded from a given decision on, [m] m2/s2.
 
-    Before the given decision, the vehicles repeat the actions that the shield applied.
+    Before the given decision, the shielded vehicles repeat the actions that the shield applied.
 
     Args:
-        shield: the shield after the episodes; its plans contain the applied actions.
+        shield: the shield after it has run the episodes; its plans then contain the actions that were applied.
         policy: the agent or team that drives from the given decision on.
         worlds: the n worlds of the batch at the alert.
-        world: index (in ``worlds``) of the world of each of the m episodes, [m].
-        step: number of the first decision at which the policy drives, [m].
+        world: for each of the m episodes, the index of its world in ``worlds``, [m].
+        step: number of the first decision at which the policy drives, in each of the m episodes, [m].
 
     """
     scenario, plan = shield.scenario, shield.memory.backup.plan[world]
@@ -107,7 +107,7 @@ class _Released(AgentAround):
     """Agent that repeats recorded actions until a given decision, and follows a policy from that decision on.
 
     Args:
-        policy: the policy that drives from decision ``release`` on.
+        policy: the policy that drives from the decision with the number ``release`` on.
         actions: recorded actions of m episodes, one for each of L decisions, [m, L].
         release: number of the first decision at which the policy drives, in each of the m episodes, [m].
         deciding: indices of all shielded vehicles, which decide at the same times.

@@ -14,7 +14,8 @@ def shield_episodes(policy: Agent, argument: str | None, settings: AgentSettings
     """Return ``policy`` behind the paper's Algorithm 1 (``+episode``).
 
     At the alert Algorithm 1 chooses the policy or E-V2X-BM, whichever does less harm, for the whole episode.
-    ``argument`` is None, or ``pairwise`` for the paper's closed form of E-V2X-BM. ``settings`` must contain a scenario.
+    ``argument`` is None, or ``pairwise`` for the paper's closed form of E-V2X-BM. ``settings`` must contain the key
+    ``scenario``.
     """
     bound: Bound = "coupled" if argument is None else "pairwise"
     return HybridAgent(policy, settings.needed_scenario(), bound=bound, harm_count=settings.harm_count)
@@ -23,8 +24,8 @@ def shield_episodes(policy: Agent, argument: str | None, settings: AgentSettings
 def shield_steps(policy: Driver, argument: str | None, settings: AgentSettings) -> Driver:
     """Return the agent or team ``policy`` behind a shield of mode ``step`` (``+step``).
 
-    ``argument`` is ignored. ``settings`` must contain a scenario. If the scenario has several learners, a copy of the
-    agent drives each of them.
+    ``argument`` is ignored. ``settings`` must contain the key ``scenario``. If the scenario has several learners, a
+    copy of the agent drives each of them.
     """
     return shielded(policy, settings.needed_scenario(), "step", harm_count=settings.harm_count)
 

@@ -1,14 +1,14 @@
-"""The first plan of a step shield at the alert: the constant actions that do the least harm.
+"""The plan that a step shield makes at the alert: the constant actions that do the least harm.
 
-For one shielded vehicle the plan repeats the action of E-V2X-BM (the coupled optimum). For several vehicles the plan is
-the one of the following plans that does the least harm:
+For one shielded vehicle the plan repeats the action of E-V2X-BM (the coupled optimum). For several shielded vehicles,
+the following plans are compared, and the one that does the least harm is used:
 
-- All vehicles brake fully.
+- Full braking: all shielded vehicles brake fully.
 
-- One vehicle repeats the action of E-V2X-BM while the others brake fully.
+- E-V2X-BM for one vehicle: this vehicle repeats the action of E-V2X-BM, and the other shielded vehicles brake fully.
 
-- All vehicles repeat the actions that a coordinate descent over the vehicles finds; it starts from the best of the
-  other plans.
+- Coordinate descent: each shielded vehicle repeats the action that a coordinate descent over the vehicles finds. The
+  descent starts from the best of the other plans.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ def best_constants(
 
     Args:
         worlds: n worlds at the alert.
-        running: the episodes of these worlds, with all possible worlds of each world.
+        running: the episodes in ``worlds``, with all possible worlds of each world.
         vehicle: index of the shielded vehicle (0 = front), or indices of several.
         width: number of decisions of a plan.
-        scenario: the scenario of these worlds.
+        scenario: the scenario of ``worlds``.
         harm_count: which harm is minimised: ``first`` (first impact of each pair) or ``total`` (every impact).
 
     """
@@ -74,7 +74,8 @@ def _best_joint_action(running: Running, optima: list[Floats], width: int) -> Fl
 
     Args:
         running: n episodes at the alert.
-        optima: for each of the K vehicles, its best constant action while the other vehicles brake fully; K arrays [n].
+        optima: for each of the K vehicles, the constant action that does the least harm while the other K - 1 vehicles
+            brake fully; K arrays [n].
         width: number of decisions of a plan.
 
     """

@@ -20,26 +20,26 @@ from ethbrake_marl.shields.step import StepShield
 
 
 class MovingAtHorizon(UserWarning):
-    """Warning: a vehicle may still be moving at the horizon; the shield's bound does not cover the time after it."""
+    """Warning: a vehicle may still be moving at the horizon; the bound does not cover the time after the horizon."""
 
 
 class StepGuard(ShieldGuard):
-    """Guard of mode ``step``: certify every proposed action, or replace it.
+    """Guard of mode ``step``, which certifies or replaces every proposed action.
 
     Args:
         engine: the engine that gets this guard.
-        policies: vehicle index -> policy that is rolled out (simulated) from each alert, and that proposes if the
-            caller gives no action.
-        shield: the shield of the engine's learners, before any episode.
+        policies: vehicle index -> policy that is simulated from each alert, and that proposes an action if the caller
+            gives no action for the vehicle.
+        shield: the shield for the engine's learners, in the state before any episode.
         mode: mode of the shield; the infos report the number of the mode.
         where: name with which error messages begin: the function or class that the user called.
-        shares: whether the infos contain the harm that each vehicle bears; if the shield has a cap, they always contain
-            this harm.
-        later_rollouts: whether a rollout of the policy from a later decision on may certify an action.
+        shares: whether the infos contain the harm that each vehicle bears; if the shield has a cap, the infos always
+            contain this harm.
+        later_rollouts: whether a rollout of the policy that starts after the alert may certify an action.
         told: the worlds at the alert, as the shield assumes them. If ``told`` is None, the shield knows the true
             worlds. Policies always observe the true worlds.
-        warns: whether to warn with ``MovingAtHorizon``, once, if a vehicle still moves at the horizon under the first
-            plan.
+        warns: whether to warn once with ``MovingAtHorizon`` if a vehicle would still move at the horizon under the plan
+            made at the alert.
 
     """
 
@@ -84,7 +84,7 @@ class StepGuard(ShieldGuard):
         """Let the shield certify or replace the proposals in all worlds whose episodes still run.
 
         Args:
-            running: the engine before the step.
+            running: the engine with its running episodes, before the step.
             memory: memory of the guard.
             proposed: proposed actions, [n, L]. A column of NaN means that the caller gave no action for the learner of
                 this column; the learner's policy then proposes. A single NaN is an invalid action and is never applied.
@@ -140,10 +140,10 @@ class StepGuard(ShieldGuard):
         return memory._replace(shield=shield)
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos of a step by name: actions, reason, margin, bound, whether each world is trusted, shares.
+        """Return the infos of a step by name: actions, reason, margin, bound, trusted, settles; shares if asked for.
 
         ``memory`` is the guard's memory. ``ruling`` is the decision in the step, None before the first decision. Each
-        value is a number, or an array with one number per world [n], learner [n, L] or vehicle [n, N].
+        value is a single number, or an array with one number per world [n], learner [n, L] or vehicle [n, N].
         """
         shield: StepShield = memory.shield
         infos = self._of_step(ruling) | why(ruling)

@@ -1,4 +1,4 @@
-"""Log of a step shield: every proposed action that the shield replaced."""
+"""The log of a step shield, which lists every proposed action that the shield replaced."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ def interventions(
     """Return one log entry for each action that a decision replaced.
 
     Args:
-        now: the n episodes before the decision.
-        episode: number of the episode in each row, [n].
+        now: the n running episodes before the decision.
+        episode: number of the episode that runs in each row (world) of the batch, [n].
         vehicles: indices of the K shielded vehicles.
         proposed: proposed actions, [n] or [n, K].
-        decision: the decision on ``proposed``.
-        held: the shield's plans before the decision.
+        decision: the shield's decision on the proposed actions.
+        held: the shield's plans before the decision, which become part of the log entries.
 
     """
     times, states, shape = now.time_s, now.nominal().states, (now.n, len(vehicles))

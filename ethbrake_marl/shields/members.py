@@ -1,4 +1,4 @@
-"""Simulate the possible worlds of a world, decision by decision, with exactly the operations of the engine's step.
+"""Simulate the possible worlds of a world, decision by decision, with the same floating-point operations as the engine.
 
 The shield's bound must hold in each of the M possible worlds (*members*) of a world. Usually M is 1: the world itself
 is its only member. K of the N vehicles are shielded. An action of the shield is an array [K] with one number per
@@ -64,7 +64,7 @@ def all_members(running: Running) -> Members:
 
 @compiled
 def members_from(every: Members, a: int, b: int) -> Members:
-    """Return the possible worlds in the rows ``a`` to ``b - 1`` of ``every``, as views (without a copy)."""
+    """Return the rows ``a`` to ``b - 1`` of ``every``, the possible worlds of all worlds, as views (without a copy)."""
     clock, bounds, lines, pieces = every.clock[a:b], every.bounds[a:b], every.lines[a:b], every.pieces[a:b]
     return Members(every.table, clock, bounds, lines, pieces, every.vehicles, every.critical)
 
@@ -86,11 +86,11 @@ def take_step(world: Members, m: int, state: Floats, step: int, action: Floats, 
 
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).
-        m: index of the possible world to advance.
+        m: index of the possible world that is advanced.
         state: present state of this possible world, [S].
         step: number of the present decision.
         action: actions of the shielded vehicles, [K].
-        after: receives the new state, [S].
+        after: receives the state of this possible world after the step, [S].
 
     Returns ``GOES_ON`` (0) if the episode continues, a positive code if the episode ended, or a negative code if the
     physics failed.
@@ -118,13 +118,13 @@ def take_steps(
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).
         states: present state of each possible world, [M, S], in the layout of ``Running.states``.
-        ended: whether the episode has ended in each possible world, [M].
+        ended: for each possible world, True if the episode has ended, [M].
         step: number of the present decision.
         action: actions of the shielded vehicles, [K].
         after: receives the state of each possible world after the step, [M, S].
-        over: receives whether the episode has ended after the step in each possible world, [M].
+        over: for each possible world, receives True if the episode has ended after the step, [M].
 
-    Returns the number of possible worlds whose episode continues, or -1 if the physics failed.
+    Returns the number of possible worlds whose episode continues, or -1 if the physics failed in one of them.
 
     """
     going = 0
@@ -164,7 +164,7 @@ def borne_by(table: Floats, total: float, i: int) -> float:
 
 @compiled
 def within_caps(world: Members, m: int) -> bool:
-    """Return whether every vehicle bears at most its cap in possible world ``m``; True without caps.
+    """Return whether every vehicle bears at most its cap in possible world ``m``; True if there are no caps.
 
     A cap is the largest harm that a vehicle may bear. ``world.table`` must contain the state of possible world ``m``.
     """
@@ -194,7 +194,7 @@ def worst_so_far(world: Members, states: Floats) -> float:
 def follow_plan(world: Members, m: int, state: Floats, ended: bool, step: int, plan: Floats, most: float) -> float:
     """Return the harm of the whole episode if a plan is executed in one possible world from now on, m2/s2.
 
-    The harm equals the engine's harm to the bit, because both are computed with the same operations.
+    The harm equals, to the bit, the harm that the engine would count, because the operations are the same.
 
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).
@@ -203,8 +203,8 @@ def follow_plan(world: Members, m: int, state: Floats, ended: bool, step: int, p
         ended: whether the episode has ended in this possible world.
         step: number of the present decision.
         plan: actions of each decision, [L, K].
-        most: largest harm of interest, m2/s2. The simulation stops when the harm exceeds ``most``, because harm never
-            falls during an episode.
+        most: the simulation stops as soon as the harm exceeds this number, m2/s2, because harm never falls during an
+            episode.
 
     Returns infinity if the harm exceeds ``most``, if a vehicle bears more than its cap, or if the physics fails.
 
@@ -233,10 +233,10 @@ def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan:
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).
         states: present state of each possible world, [M, S], in the layout of ``Running.states``.
-        ended: whether the episode has ended in each possible world, [M].
+        ended: for each possible world, True if the episode has ended, [M].
         step: number of the present decision.
-        plan: actions of each decision, [L, K]; executed from the present decision on.
-        most: largest harm of interest, m2/s2.
+        plan: actions of each decision, [L, K]; the simulation executes them from the present decision on.
+        most: the simulation stops as soon as the harm exceeds this number, m2/s2.
 
     Returns infinity if the harm exceeds ``most`` in a possible world, if a vehicle bears more than its cap, or if the
     physics fails.
@@ -256,7 +256,8 @@ def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan:
 def hold_constant(world: Members, m: int, state: Floats, ended: bool, step: int, constants: Floats, c: int) -> float:
     """Return the harm in one possible world if a constant action is held to the horizon, m2/s2.
 
-    The time until the horizon is simulated in one go, not decision by decision. Returns infinity if the physics fails.
+    The time until the horizon is simulated as one segment, not decision by decision. Returns infinity as the harm if
+    the physics fails.
 
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).

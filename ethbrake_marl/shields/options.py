@@ -31,22 +31,23 @@ class ShieldOptions:
     """Keywords of ``eb.shield``, ``HybridShield`` and the other wrappers. The mode of an extension may add keywords.
 
     Args:
-        mode: ``step`` certifies or replaces each action; an action is certified if some plan after it keeps the harm
-            within the bound. ``episode`` is the paper's Algorithm 1: the policy or E-V2X-BM drives the whole episode.
-            None means ``step``; but if ``step`` lacks one of the other settings, None means the first mode that has
-            them all.
+        mode: ``step`` certifies or replaces each action. An action is certified if some plan that begins with this
+            action keeps the harm within the bound. ``episode`` is the paper's Algorithm 1: the policy or E-V2X-BM
+            drives the whole episode. None means ``step``; but if the mode ``step`` lacks one of the other settings,
+            None means the first mode that has all of them.
         bound: method to compute ``H*``, the harm of E-V2X-BM, in mode ``episode``: ``coupled`` (the engine's physics)
             or ``pairwise`` (the paper's closed form).
         harm_count: which harm is bounded: ``first`` (first impact of each pair) or ``total`` (every impact).
         allowance: amount by which the bound is loosened, for fewer replaced actions, m2/s2; not allowed in mode
             ``episode``.
-        cap: with ``baseline``, no vehicle bears more harm than under the constant actions of least harm; only allowed
-            in mode ``step``. None: only the harm summed over all vehicles is bounded.
-        intervention_penalty: amount subtracted from the reward of a step in which the proposed action was replaced.
+        cap: ``baseline``: no vehicle bears more harm than it would bear under the constant actions that do the least
+            harm; only allowed in mode ``step``. If ``cap`` is None, only the harm summed over all vehicles is bounded.
+        intervention_penalty: amount subtracted from a learner's reward of a step in which the learner's action was
+            replaced.
         logging: whether ``shield.log`` collects the replaced actions; not allowed in mode ``episode``.
-        shares: whether ``infos`` contains the harm that each vehicle bears under the current plan and under the
-            constant actions of least harm; with a ``cap`` the infos always contain this harm. ``shares=True`` slows a
-            step by a few percent, and is not allowed in mode ``episode``.
+        shares: whether the infos contain the harm that each vehicle bears under the present plan, and under the
+            constant actions that do the least harm; if there is a ``cap``, the infos always contain this harm.
+            ``shares=True`` slows a step by a few percent, and is not allowed in mode ``episode``.
         where: name with which error messages begin: the function or class that the user called.
 
     Raises ``InvalidInput`` for an invalid setting, and ``UnknownName`` for an unknown mode.
@@ -71,7 +72,7 @@ class ShieldOptions:
     def __new__(cls, mode: str | None = None, **settings: Any) -> ShieldOptions:
         """Create an instance of the first class that has all ``settings``; the class of ``mode`` is tried first.
 
-        ``ShieldOptions(mode, setting=...)`` thus accepts the settings of every installed mode.
+        For this reason ``ShieldOptions(mode, setting=...)`` accepts the settings of every installed mode.
         """
         if cls is ShieldOptions:
             cls = _class_with("step" if mode is None else check_mode(mode), settings)
@@ -94,7 +95,7 @@ class ShieldOptions:
         object.__setattr__(self, "mode", mode)
 
     def check_switches(self, *names: str) -> None:
-        """Raise ``InvalidInput`` unless each setting named in ``names`` is True or False."""
+        """Raise ``InvalidInput`` if a setting whose name is in ``names`` is neither True nor False."""
         for name in names:
             if not isinstance(getattr(self, name), bool):
                 raise InvalidInput(f"{self.where}: {name} = {getattr(self, name)!r}: must be True or False")
@@ -106,13 +107,13 @@ class ShieldOptions:
 
     @property
     def adds(self) -> Source:
-        """Knowledge that the shield uses, in addition to the policy's own knowledge."""
+        """Knowledge that the shield uses beyond what the policy knows."""
         return Source.MODEL
 
     def shield(
         self, scenario: Scenario, vehicle: int | tuple[int, ...], others: Mapping[int, Script] | None = None
     ) -> Any:
-        """Return a new shield with these settings, for every mode except ``episode``.
+        """Return a new shield with these settings (not for mode ``episode``, whose guard is made without this method).
 
         Args:
             scenario: the scenario of all episodes.
@@ -142,7 +143,7 @@ class ShieldOptions:
             policies: vehicle index -> policy that proposes the vehicle's actions; may be empty except in mode
                 ``episode``.
             several: whether to treat a single learner as a team of one vehicle.
-            how: further keywords, passed to ``StepGuard``.
+            how: further keywords of ``StepGuard``.
 
         """
         if self.mode == "episode":
@@ -161,7 +162,7 @@ def check_mode(mode: object) -> str:
 
 
 def misplaced(name: str, value: object, mode: str, takers: list[str], where: str) -> InvalidInput:
-    """Return the error to raise for a setting that a mode does not accept.
+    """Return the error to raise for a setting that the mode ``mode`` does not accept.
 
     Args:
         name: name of the setting.
@@ -175,7 +176,7 @@ def misplaced(name: str, value: object, mode: str, takers: list[str], where: str
 
 
 def shielded_vehicle(engine: Engine, several: bool) -> int | tuple[int, ...]:
-    """Return the index of the engine's only learner, or a tuple of indices for several learners or if ``several``."""
+    """Return the index of the engine's only learner; a tuple if several vehicles learn or ``several`` is True."""
     vehicles = tuple(engine.learners)
     return vehicles if several or len(vehicles) > 1 else vehicles[0]
 
@@ -186,7 +187,7 @@ def one_learner(scenario: Scenario) -> int | None:
 
 
 def _class_with(mode: str, settings: Mapping[str, Any]) -> type[ShieldOptions]:
-    """Return the settings class of ``mode`` if it has all ``settings``, otherwise the first class that has them.
+    """Return the settings class of ``mode`` if it has all ``settings``, otherwise the first class that has them all.
 
     Raises ``UnknownName`` for a setting that no mode has.
     """

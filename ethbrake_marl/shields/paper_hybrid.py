@@ -1,7 +1,8 @@
 """The paper's hybrid (Algorithm 1): at the alert, choose the policy or the baseline for the whole episode.
 
-The policy is rolled out (simulated) in the engine from the alert on. The harm of this rollout is compared with ``H*``,
-the harm of the baseline E-V2X-BM. The policy or the baseline, whichever does less harm, drives the whole episode.
+The policy is rolled out (simulated) in the engine from the alert on. The harm of this rollout is then compared with
+``H*``, the harm of the baseline E-V2X-BM. The policy or the baseline, whichever does less harm, drives the whole
+episode.
 
 The coupled ``H*`` is computed in the same engine as the policy's harm. With the coupled ``H*``, the hybrid does at most
 the harm of the baseline in every world, provided that the policy drives exactly as in its rollout. A policy with random
@@ -35,20 +36,20 @@ Bound = Literal["coupled", "pairwise"]  # method to compute H* and a*: the engin
 
 
 class HybridAgent(AgentAround):
-    """Agent that drives by ``policy`` in worlds where the harm of its rollout is at most ``H*``, otherwise by E-V2X-BM.
+    """Agent that drives by ``policy`` where the policy's rollout does at most the harm ``H*``, otherwise by E-V2X-BM.
 
-    The rollout simulates the policy from the alert on. ``H*`` is the harm of E-V2X-BM's constant deceleration.
+    The policy's rollout simulates the policy from the alert on. ``H*`` is the harm of E-V2X-BM's constant deceleration.
 
     Args:
-        policy: the agent that is chosen or rejected in each world.
+        policy: the agent that is compared with E-V2X-BM in each world, and chosen or rejected.
         scenario: the scenario in which ``policy`` and E-V2X-BM are compared.
-        bound: method to compute ``H*`` and the deceleration: ``coupled`` (the engine's physics) or ``pairwise`` (the
-            paper's closed form).
+        bound: method to compute E-V2X-BM's deceleration and ``H*``: ``coupled`` (the engine's physics) or ``pairwise``
+            (the paper's closed form).
         harm_count: which harm is compared: ``first`` (first impact of each pair) or ``total`` (every impact).
 
-    The memory contains ``chosen_policy`` [n], true where the policy drives; the compared harms ``policy_harm`` [n] and
-    ``bound_harm`` [n]; and ``predicted_harm`` [n], the lower of these two harms. Raises ``InvalidInput`` for an unknown
-    ``bound`` or ``harm_count``, and if ``policy`` is not an agent.
+    The memory contains ``chosen_policy`` [n], True where the policy drives; ``policy_harm`` [n], the harm of the
+    policy's rollout; ``bound_harm`` [n], which is ``H*``; and ``predicted_harm`` [n], the lower of these two harms.
+    Raises ``InvalidInput`` for an unknown ``bound`` or ``harm_count``, and if ``policy`` is not an agent.
 
     """
 
@@ -112,7 +113,7 @@ class FixedCommand:
         self.command_mps2 = command_mps2
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        """Return the command of each world, [n] m/s2."""
+        """Return the fixed command of each world, [n] m/s2."""
         return self.command_mps2
 
 
@@ -141,10 +142,10 @@ class EpisodeGuard(ShieldGuard):
         return memory if shield is None else renew_memory(shield, rows, memory)
 
     def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
-        """Return the actions of the driver that was chosen at the alert.
+        """Return the actions of the driver (policy or E-V2X-BM) that was chosen at the alert.
 
         Args:
-            running: the engine before the step.
+            running: the engine with its running episodes, before the step.
             memory: memory of the guard.
             proposed: proposed actions, [n, 1]; they have no effect.
 
@@ -160,10 +161,10 @@ class EpisodeGuard(ShieldGuard):
         return np.asarray(abs(ruling.applied - ruling.proposed) > ROUNDING, np.bool_)
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos by name: chosen driver and compared harms, each [n], and the actions.
+        """Return the infos by name: chosen driver, harm of the policy, harm of E-V2X-BM (each [n]), and the actions.
 
-        ``memory`` is the guard's memory; ``ruling`` is the decision in the last step, None before the first step.
-        ``proposed_action`` is NaN where nothing was proposed.
+        ``memory`` is the guard's memory; ``ruling`` is the decision in the last step, None before the first step. The
+        info ``proposed_action`` is NaN where no action was proposed.
         """
         compared = {name: memory.shield[name] for name in ("chosen_policy", "policy_harm", "bound_harm")}
         return self._of_step(ruling) | compared

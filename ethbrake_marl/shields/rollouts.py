@@ -1,8 +1,9 @@
-"""Rollouts of the proposing policies: simulations in which the policies drive. The actions of a rollout become a plan.
+"""Rollouts of the policies that propose actions: simulations in which these policies drive. The actions of such a
+simulation are used as a plan.
 
 A plan has one action for each decision. A rollout starts at the alert or at a later decision, and its plan is certified
-like any other plan (``plan_harm``). If a policy later deviates from its rollout, the shield may have to intervene; the
-bound still holds.
+like any other plan (``plan_harm``). If a policy later deviates from its rollout, the shield may replace actions of the
+policy; the bound still holds.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from ethbrake_marl.shields.running import Running
 
 
 class Proposer(NamedTuple):
-    """The proposing policies, with the memories and the worlds from which a rollout starts."""
+    """The policies that propose actions, with the memories and the worlds from which a rollout starts."""
 
     policies: Mapping[int, Agent]  # index of each shielded vehicle -> its policy, front to rear
     memories: Mapping[int, Memory]  # index of each shielded vehicle -> memory of its policy after this decision
@@ -41,7 +42,7 @@ class Proposer(NamedTuple):
 def rolled_out(
     worlds: Worlds, policies: Mapping[int, Agent], scenario: Scenario, vehicle: int | tuple[int, ...], width: int
 ) -> Floats:
-    """Return the actions of policies that drive without a shield from the alert to the end of the episodes.
+    """Return the actions of ``policies``, which drive without a shield from the alert to the end of the episodes.
 
     Args:
         worlds: n worlds at the alert.
@@ -50,8 +51,8 @@ def rolled_out(
         vehicle: index of the only shielded vehicle, or a tuple of K indices.
         width: number of decisions for which to return actions.
 
-    Returns actions, [n, width] if ``vehicle`` is an index, [n, width, K] if it is a tuple. After the end of an episode
-    the actions are full braking.
+    Returns the actions: [n, width] if ``vehicle`` is an index, [n, width, K] if ``vehicle`` is a tuple. For decisions
+    after the end of an episode, the result contains full braking.
 
     """
     team = Team({i: _Rounded(policy) for i, policy in policies.items()}, next(iter(policies.values())).name)
@@ -64,15 +65,15 @@ def rolled_out(
 def certify_by_policy(
     decision: Decision, running: Running, proposed: Floats, budget: Floats, held: Floats, proposer: Proposer
 ) -> Decision:
-    """Return ``decision``, changed to accept each rejected proposal that a rollout of the policy can certify.
+    """Return ``decision``, changed so that each rejected proposal that a rollout of the policy certifies is accepted.
 
     Args:
-        decision: the decision of ``certify``, which tries no rollouts.
+        decision: the decision that ``certify`` made without rollouts.
         running: the n episodes at this decision.
         proposed: proposed actions, [n] or [n, K].
-        budget: largest harm that is accepted in each episode, [n] m2/s2.
+        budget: largest harm of the whole episode that the shield accepts in each world, [n] m2/s2.
         held: the shield's plans before this decision, [n, L] or [n, L, K].
-        proposer: the proposing policies, with their memories and the worlds at this decision.
+        proposer: the policies that propose actions, with their memories and the worlds at this decision.
 
     """
     rejected = (decision.reason == NO_CERTIFICATE).reshape(running.n, -1).any(axis=1)
@@ -90,20 +91,20 @@ def certify_by_policy(
 def certify_rollouts(
     running: Running, proposed: Floats, rows: Ints, budget: Floats, held: Floats, proposer: Proposer
 ) -> Decision:
-    """Decide again in worlds whose proposals were rejected, with rollouts of the policy as plans.
+    """Decide again in the worlds whose proposals were rejected; this time the plans are rollouts of the policy.
 
     In each world one plan is tried: the proposal, clipped to [-1, 1], followed by the policy's actions in a simulation
-    from the next state on. If this plan stays within the budget and the caps, it becomes the backup, and the proposal
-    is accepted. If the plan exceeds the budget or a cap, the reason stays ``NO_CERTIFICATE``. A vehicle whose proposal
-    is NaN executes its planned action.
+    from the next state on. If this plan stays within the budget and the caps, the plan becomes the backup, and the
+    proposal is accepted. If the plan exceeds the budget or a cap, the reason stays ``NO_CERTIFICATE``. If a vehicle's
+    proposal is NaN, the vehicle's planned action is used.
 
     Args:
         running: the n episodes of the whole batch.
         proposed: proposed actions of the whole batch, [n] or [n, K].
         rows: indices of the worlds in which to decide again, [m].
-        budget: largest harm that is accepted in each episode, [n] m2/s2.
+        budget: largest harm of the whole episode that the shield accepts in each world, [n] m2/s2.
         held: the shield's present plans of the whole batch, [n, L] or [n, L, K].
-        proposer: the proposing policies, with their memories and the worlds at this decision.
+        proposer: the policies that propose actions, with their memories and the worlds at this decision.
 
     Returns a decision for the m worlds in ``rows`` only.
 
@@ -128,17 +129,18 @@ def certify_rollouts(
 def _later_plan(
     running: Running, first: Floats, rows: Ints, budget: Floats, held: Floats, proposer: Proposer
 ) -> Floats:
-    """Return plans of m worlds: past actions, then ``first``, then the actions of a rollout of the policies.
+    """Return plans for m worlds: the actions so far, then ``first``, then the actions of a rollout of the policies.
 
     A rollout stops as soon as its harm exceeds the budget.
 
     Args:
         running: the n episodes of the whole batch, with one possible world each.
-        first: actions of the present decision, [m] or [m, K].
+        first: actions to apply at the present decision, [m] or [m, K].
         rows: indices of the worlds for which to make a plan, [m].
-        budget: largest harm that is accepted in each episode, [n] m2/s2.
-        held: the shield's present plans; their entries before this decision are the past actions, [n, L] or [n, L, K].
-        proposer: the proposing policies, with their memories and the worlds at this decision.
+        budget: largest harm of the whole episode that the shield accepts in each world, [n] m2/s2.
+        held: the shield's present plans, [n, L] or [n, L, K]; the entries before the present decision are the actions
+            applied so far.
+        proposer: the policies that propose actions, with their memories and the worlds at this decision.
 
     """
     policies, memories, worlds = proposer
@@ -179,7 +181,7 @@ def _later_plan(
 
 
 def no_constants(plan: Floats) -> Floats:
-    """Return an empty array of constant actions for ``Backup``, with an axis K if ``plan`` has one."""
+    """Return an array that contains no constant action, for ``Backup``: [0], or [0, K] if ``plan`` has the axis K."""
     return np.zeros((0, *plan.shape[2:]))
 
 
@@ -188,8 +190,8 @@ def proposed_actions(
 ) -> tuple[Floats, dict[int, Memory]]:
     """Return the actions that the policies propose, [n, K] in [-1, 1], and the new memory of each vehicle's policy.
 
-    ``policies`` maps the index of each of K vehicles to its policy. ``memories`` maps the same index to the policy's
-    memory. ``worlds`` are n worlds at a decision.
+    ``policies`` maps the index of each of K vehicles to its policy. ``memories`` maps the index of each of these
+    vehicles to the memory of the vehicle's policy. ``worlds`` are n worlds at a decision.
     """
     asked = {i: proposed_action(policy, worlds, memories[i], i) for i, policy in policies.items()}
     after = {i: memory for i, (_, memory) in asked.items()}
@@ -199,16 +201,16 @@ def proposed_actions(
 def proposed_action(policy: Agent, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
     """Return the actions [n] in [-1, 1] that ``policy`` proposes for ``vehicle`` (index), and the policy's new memory.
 
-    If the policy returns NaN as a command, the action is NaN.
+    In worlds where the policy commands NaN, the result is NaN.
     """
     command, memory = ask_script(policy, worlds, memory, vehicle)
     return np.where(np.isnan(command), np.nan, command_to_action(command, worlds.vehicles, vehicle)), memory
 
 
 class _Rounded(AgentAround):
-    """Policy whose commands are converted to actions and back, as in a plan.
+    """Policy whose commands are converted to actions and back, so that they are rounded as in a plan.
 
-    ``memory["action"]`` contains the last actions of the policy.
+    ``memory["action"]`` contains the last actions that the policy chose.
     """
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:

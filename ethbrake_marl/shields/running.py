@@ -17,7 +17,7 @@ class Running(NamedTuple):
 
     The possible worlds of world k are in rows k * M to k * M + M - 1. Row k * M contains world k itself, the *nominal*
     world. For K shielded vehicles, actions have the shape [n, K] and plans (one action for each of L decisions) the
-    shape [n, L, K]. For a single shielded vehicle, the axis K may be left out.
+    shape [n, L, K]. For a single shielded vehicle, actions and plans may lack the axis K.
     """
 
     problem: ProfileProblem  # parameters, commands of unshielded vehicles and times of the decisions, in n * M rows
@@ -28,7 +28,7 @@ class Running(NamedTuple):
 
     @property
     def uncapped(self) -> Running:
-        """The same episodes without ``caps`` (the limits of each vehicle's harm)."""
+        """These episodes without ``caps`` (the limits of each vehicle's harm)."""
         return self._replace(caps=np.zeros((0, 0)))
 
     @property
@@ -43,7 +43,7 @@ class Running(NamedTuple):
 
     @property
     def finished(self) -> Bools:
-        """For each world: whether the episode is over in all its members (possible worlds), [n]."""
+        """For each world: whether the episode has ended in all members (possible worlds) of the world, [n]."""
         return np.asarray(self.ended.reshape(self.n, -1).all(axis=1), np.bool_)
 
     @property
@@ -61,7 +61,7 @@ class Running(NamedTuple):
         return self._select(self.rows_of(worlds), worlds)
 
     def nominal(self) -> Running:
-        """Return the same episodes with a single possible world each: the world itself."""
+        """Return these episodes with a single possible world for each world: the world itself."""
         if self.members == 1:
             return self
         return self._select(np.arange(self.n) * self.members, np.arange(self.n))
@@ -72,7 +72,7 @@ class Running(NamedTuple):
 
 
 def begin_running(problem: ProfileProblem, members: int = 1) -> Running:
-    """Return the episodes of ``problem`` at their first decision.
+    """Return running episodes in the worlds of ``problem``, at their first decision.
 
     ``problem`` contains the states of the worlds at the first decision, and the commands of the unshielded vehicles.
     ``members`` is the number M of possible worlds of each world. M consecutive rows of ``problem`` belong to the same

@@ -19,18 +19,20 @@ from ethbrake_marl.shields.attach import Attached, Proposing
 class ShieldedVecEnv(SeededInside, VecEnvWrapper):
     """The environment of ``make_sb3_vec_env`` behind a shield, by default in mode ``step``.
 
-    Each row belongs to one learner. The shield decides on all learners of one world together. At every step the infos
-    of each row contain ``shield_bound_harm`` and the other ``shield_...`` keys. ``reset_infos`` contains these keys for
-    the alert. The episode's return in ``infos[row]["episode"]`` does not include the intervention penalty.
+    Each row of the environment belongs to one learner of one world. The shield decides on all learners of one world
+    together. At every step the infos of each row contain ``shield_bound_harm`` and the other ``shield_...`` keys.
+    ``reset_infos`` contains the ``shield_...`` keys for the alert. The episode's return in ``infos[row]["episode"]``
+    does not include the intervention penalty.
 
     Args:
         venv: an environment made by ``make_sb3_vec_env``.
-        policy: policy that is simulated from each alert. In worlds where the policy does less harm than E-V2X-BM, the
-            policy's harm is the bound (the harm that the episode will not exceed). If ``policy`` is None, the bound is
-            the harm of E-V2X-BM.
+        policy: policy that is simulated at the start of each episode, from the alert on. In worlds where the policy
+            does less harm than E-V2X-BM, the policy's harm is the bound (the harm that the episode will not exceed). If
+            ``policy`` is None, the bound is the harm of E-V2X-BM.
         options: keywords of ``ShieldOptions``.
 
-    Raises ``InvalidInput`` for another kind of environment, and for several learners if the mode is not ``step``.
+    Raises ``InvalidInput`` if ``venv`` is another kind of environment, and if several vehicles learn and the mode is
+    not ``step``.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np

@@ -1,16 +1,16 @@
 """Mode ``step`` of the shield: keep the harm of the episode within a bound, whatever actions are proposed.
 
-**Claim.** The *bound* is the harm that the episode will not exceed. Let ``B`` be the bound at the first decision: the
-harm of the first plan. If every step applies the action that ``certify`` returns, then the harm at the end of the
-episode is at most ``B``, whatever actions are proposed. The bound never rises during the episode. An episode ends at
-rest or at the scenario's horizon. The claim does not cover anything that happens after the horizon.
+**Claim.** The *bound* is the harm that the episode will not exceed. Let ``B`` be the bound at the first decision, which
+is the harm of the plan made at the alert. If every step applies the action that ``certify`` returns, then the harm at
+the end of the episode is at most ``B``, whatever actions are proposed. The bound never rises during the episode. An
+episode ends at rest or at the scenario's horizon. The claim does not cover anything that happens after the horizon.
 
-**Induction.** Between two decisions the shield has a *plan* with an action for every decision up to the horizon. Let
-``c`` be the harm of the plan: the harm of the whole episode if the plan is executed from the present state. ``c``
-includes the harm so far. In the first-impact count, ``c`` leaves out further impacts of pairs that already had an
-impact. The function ``members.follow_plan`` computes ``c``. ``follow_plan`` simulates the plan decision by decision,
-with the same floating-point operations as the engine's step, in the same order. ``follow_plan`` also adds up the harm
-in the same order as the engine. Hence:
+**Induction.** Between two decisions the shield has a *plan*, which contains an action for every decision up to the
+horizon. Let ``c`` be the harm of the plan: the harm of the whole episode if the plan is executed from the present
+state. ``c`` includes the harm so far. In the first-impact count, ``c`` leaves out further impacts of pairs that already
+had an impact. The function ``members.follow_plan`` computes ``c``. ``follow_plan`` simulates the plan decision by
+decision, with the same floating-point operations as the engine's step, in the same order. ``follow_plan`` also adds up
+the harm in the same order as the engine. Hence:
 
 1. *Start.* At the first decision ``c = B``.
 
@@ -19,7 +19,7 @@ in the same order as the engine. Hence:
    becomes ``c``. If the proposal equals the planned action, the plan and ``c`` stay the same, because a new simulation
    would repeat the same operations.
 
-3. *Otherwise the planned action is applied.* When ``follow_plan`` computed ``c``, its simulation passed through the
+3. *Otherwise the planned action is applied.* When ``follow_plan`` computed ``c``, the simulation passed through the
    state after the planned action. So from this state on, the rest of the plan again has the harm ``c``, to the last
    bit. A plan with less harm may replace the rest of the plan.
 
@@ -34,12 +34,12 @@ the last bound are the same floating-point number.
 **Several vehicles.** With several shielded vehicles, each action in the proof is an array with one action per shielded
 vehicle. The shield first tries all proposals together. If no plan after all proposals stays within the budget, the
 shield tries the proposals one by one, front to rear: one vehicle's proposal replaces that vehicle's action in the plan.
-This single proposal is accepted if some plan after it stays within the budget; if not, the vehicle's planned action
-remains. Before and after each attempt the shield has a plan whose harm is at most the budget.
+A single proposal is accepted if some plan after this proposal stays within the budget; if not, the vehicle's planned
+action remains. Before and after each proposal is tried, the shield has a plan whose harm is at most the budget.
 
 **Several members.** The shield may consider several possible worlds, the *members* of a world. With several members,
-each harm in the proof is the largest harm over the members, and the same actions are executed in all members. So the
-harm of the episode is at most ``B`` in *every* member.
+each harm in the proof is the largest harm over the members, and the same actions are executed in all members. So in
+*every* member the harm of the episode is at most ``B``.
 """
 
 from __future__ import annotations
@@ -76,23 +76,26 @@ Cap = Literal["baseline"]  # plan that sets the caps: a vehicle may bear at most
 class StepShield:
     """Bound the harm of a batch of episodes: call ``begin`` when episodes start and ``decide`` before every step.
 
-    ``begin`` and ``decide`` replace ``memory`` as a whole and change no array in place. If one of these methods raises
-    an error, the shield keeps its old memory. A copy of the shield by ``copy.copy`` is independent of the original.
+    ``begin`` and ``decide`` replace ``memory`` as a whole and change no array in place. If ``begin`` or ``decide``
+    raises an error, the shield keeps its old memory. A copy of the shield by ``copy.copy`` is independent of the
+    original.
 
     At the alert the bound is the harm of E-V2X-BM's constant deceleration, executed decision by decision. In worlds
-    where ``policy``, simulated from the alert, does less harm, the bound is the policy's harm. The bound never rises,
-    and covers the time up to the scenario's horizon. ``memory.settles`` [n] says for each world whether all vehicles
-    are at rest at the horizon under the first plan.
+    where ``policy``, simulated from the alert, does less harm than E-V2X-BM, the bound is the policy's harm. The bound
+    never rises, and covers the time up to the scenario's horizon. ``memory.settles`` [n] is True for the worlds in
+    which all vehicles are at rest at the horizon if the plan made at the alert is executed.
 
-    At each decision the observed worlds are compared with the prediction, bit by bit. If a world differs from its
-    prediction (a vehicle brakes beyond its capacity, a number is NaN, a message is missing), this world is marked in
-    ``memory.distrusted`` [n], and its bound no longer holds. In a distrusted world the shield ignores proposals for the
-    rest of the episode, and applies the rest of the plan or the best constant action, whichever does less harm. The
-    shield repeats this choice whenever a distrusted world again differs from the prediction. If an episode goes on
-    after its predicted end, the shielded vehicles brake fully.
+    At each decision the observed worlds are compared with the shield's prediction, bit by bit. If a world differs from
+    its prediction (a vehicle brakes beyond its capacity, a number is NaN, a message is missing), this world is marked
+    in ``memory.distrusted`` [n], and its bound no longer holds. In a distrusted world the shield ignores proposals for
+    the rest of the episode, and applies the rest of the plan or the best constant action, whichever does less harm. The
+    shield chooses again between the plan and the best constant action whenever a distrusted world differs from the
+    prediction. If the engine continues an episode after the end that the shield predicted, the shielded vehicles brake
+    fully.
 
     If ``begin`` gets several ``possible`` worlds for each world, each harm is the largest harm over these possible
-    worlds. Each observed number must then lie within the range of its predictions in these possible worlds.
+    worlds. With several possible worlds, each observed number must lie within the range of its predictions in these
+    worlds.
 
     Args:
         scenario: the scenario of all worlds.
@@ -101,8 +104,8 @@ class StepShield:
         allowance: amount by which the bound is loosened until the episode ends, m2/s2.
         others: scripts of the unshielded vehicles (vehicle index -> script); each script must fix its commands at the
             alert. If ``others`` is None, the scenario's scripts drive.
-        cap: with ``baseline``, no vehicle bears more harm than under the constant actions of least harm; None: only the
-            harm summed over all vehicles is bounded.
+        cap: ``baseline``: no vehicle bears more harm than it would bear under the constant actions that do the least
+            harm; None: only the harm summed over all vehicles is bounded.
         logging: whether ``log`` lists the interventions (replaced actions).
 
     Raises ``InvalidInput`` for an unknown harm count, an unknown vehicle, a negative allowance, or a script in
@@ -158,12 +161,12 @@ class StepShield:
 
     @property
     def predicted_harm(self) -> Floats:
-        """Bound of each episode at the alert, including the allowance, [n] m2/s2."""
+        """The bound that each episode had at the alert, including the allowance, [n] m2/s2."""
         return self.memory.first_bound + self.allowance
 
     @property
     def chosen_policy(self) -> Bools:
-        """For each world: true if no proposed action has been replaced so far in the running episode, [n]."""
+        """For each world: True if no proposed action has been replaced so far in the running episode, [n]."""
         return np.asarray(self.interventions == 0, np.bool_)
 
     @property
@@ -172,7 +175,7 @@ class StepShield:
         return self._entries[: self.memory.logged] if self.logging else None
 
     def clear_log(self) -> None:
-        """Delete all log entries. If this method is never called, the log grows without limit."""
+        """Delete all log entries. If ``clear_log`` is never called, the log grows without limit."""
         self._entries, self.memory = [], self.memory._replace(logged=0)
 
     @property
@@ -188,7 +191,7 @@ class StepShield:
         return ends_under(running.nominal(), backup.plan)[1][:, -self.scenario.vehicles :]
 
     def take(self, rows: Ints) -> Self:
-        """Return an independent copy of the shield with only the episodes in the rows ``rows`` (indices)."""
+        """Return an independent copy of the shield that contains only the episodes in the rows ``rows`` (indices)."""
         part = copy.copy(self)
         part.memory = self.memory.take(rows)
         return part
@@ -239,12 +242,12 @@ class StepShield:
     def _begun(
         self, worlds: Worlds, rows: Ints, policy: Agent | Mapping[int, Agent] | None, possible: Worlds
     ) -> StepMemory:
-        """Return the memory of new episodes, with the first plan and the bound of each world.
+        """Return the shield's memory of new episodes, with the plan and the bound of each world at the alert.
 
         Args:
             worlds: n worlds at the alert.
             rows: indices of the batch rows in which the new episodes start, [n].
-            policy: the proposing policy, or vehicle index -> policy for several vehicles; None: no policy.
+            policy: the policy that proposes actions, or vehicle index -> policy for several vehicles; None: no policy.
             possible: the M possible worlds of each world, [n * M].
 
         """
@@ -313,16 +316,16 @@ class StepShield:
     def _bound_at_alert(
         self, possible: Worlds, problem: ProfileProblem, rows: Ints, plan: Floats, harm: Floats
     ) -> tuple[Floats, Any]:
-        """Return the bound of each episode at the alert, [n] m2/s2, and a subclass's memory (``StepMemory.enclosure``).
+        """Return the bound of each episode at the alert, [n] m2/s2, and further memory (``StepMemory.enclosure``).
 
-        This class returns ``harm`` as the bound, and None as the memory.
+        This class returns ``harm`` as the bound, and no further memory (None); a subclass may return both.
 
         Args:
             possible: the M possible worlds of each world at the alert.
-            problem: the possible worlds, as input for the functions of ``engine.profiles``.
+            problem: the possible worlds in the form that the functions of ``engine.profiles`` need.
             rows: indices of the batch rows in which the new episodes start.
-            plan: first plan of each world, [n, L] or [n, L, K].
-            harm: largest harm of each first plan over the possible worlds, [n] m2/s2.
+            plan: plan made for each world at the alert: the actions of each decision, [n, L] or [n, L, K].
+            harm: harm of the plan made for each world at the alert, the largest over the possible worlds, [n] m2/s2.
 
         """
         return harm, None
@@ -340,15 +343,16 @@ class StepShield:
         Args:
             proposed: proposed actions, [n], or [n, K] for several vehicles; clipped to [-1, 1]. Where the proposal is
                 NaN, the planned action is applied.
-            seen: the observed worlds, with the first columns of ``Running.states``, [n, columns]; they are compared
-                with the prediction. If ``seen`` is None, nothing is compared.
-            only: true for the worlds in which to decide, [n]; the other worlds stay unchanged. If ``only`` is None, the
-                shield decides in all worlds whose episode has not ended.
-            proposer: the policies that propose. If no other plan certifies a proposal, the shield simulates the
-                policies after this proposal, and tries their actions as a plan. If ``proposer`` is None, no policy is
-                simulated.
+            seen: the observed worlds, [n, columns], which are compared with the prediction; the columns are the first
+                columns of ``Running.states``. If ``seen`` is None, nothing is compared.
+            only: True for each world in which to decide, [n]; all other worlds stay unchanged. If ``only`` is None, the
+                shield decides in every world whose episode has not ended.
+            proposer: the policies that propose actions, with their memories and the worlds at this decision. If no
+                other plan certifies a proposal, the shield simulates the policies after this proposal, and tries their
+                actions as a plan. If ``proposer`` is None, no policy is simulated.
 
-        Returns the decision with the actions to apply. After the call ``memory`` contains the predicted next state.
+        Returns the decision with the actions to apply. After the call, the attribute ``memory`` contains the state that
+        is predicted for the next decision.
 
         """
         memory = self.memory
@@ -367,8 +371,8 @@ class StepShield:
     ) -> tuple[Decision, StepMemory]:
         """Return the decision on ``proposed`` [n] or [n, K], and the memory after the decision.
 
-        ``memory`` is the memory before the decision. ``asked`` [n] says in which worlds to decide. ``proposer``
-        contains the policies to simulate; None: no policy.
+        ``memory`` is the memory before the decision. ``asked`` [n] is True for the worlds in which to decide.
+        ``proposer`` contains the policies to simulate; None: no policy.
         """
         before, held, budget = memory.running, memory.backup, self._bound_of(memory)
         assert before is not None
@@ -399,16 +403,18 @@ class StepShield:
     def _also_certified(
         self, now: Running, memory: StepMemory, budget: Floats, decision: Decision, asked: Bools
     ) -> Decision:
-        """Return the final decision; ``decision`` already stays within the budget in every possible world.
+        """Return the decision that is applied: ``decision``, in which a subclass may replace further actions.
 
-        This class returns ``decision`` unchanged; a subclass may replace more actions.
+        The plans of ``decision`` already stay within the budget in every possible world. This class returns
+        ``decision`` unchanged.
 
         Args:
             now: the running episodes before the decision.
-            memory: the shield's memory before the decision, with the old plan.
-            budget: largest harm that is accepted in each episode, [n] m2/s2.
-            decision: the decision of ``certify``, changed where a rollout of the policy certified a proposal.
-            asked: true for the trusted worlds in which to decide, [n].
+            memory: the shield's memory before the decision, which contains the old plan.
+            budget: largest harm of the whole episode that the shield accepts in each world, [n] m2/s2.
+            decision: the decision of ``certify``; where only a rollout of the policy certified a proposal, this
+                proposal is accepted.
+            asked: True for each world in which to decide (only trusted worlds), [n].
 
         """
         return decision
@@ -417,8 +423,8 @@ class StepShield:
         """Return the observed worlds ``seen`` [n, columns] in a form that can be compared with the prediction.
 
         Predictions may have a column for the gap to an obstacle ahead. In worlds without an obstacle, the observed gap
-        to the obstacle is infinite, and is replaced by the predicted number. All other numbers in ``seen`` stay the
-        same.
+        to the obstacle is infinite; the result contains the predicted number instead. The result contains all other
+        numbers of ``seen`` unchanged.
         """
         running = self.memory.running
         assert running is not None
@@ -434,7 +440,7 @@ class StepShield:
 
         With a single possible world, each observed number must equal the predicted number to the bit. With several
         possible worlds, each observed number must lie within the range of its predictions in the possible worlds. Once
-        an impact has happened in a possible world, every finite number is accepted.
+        an impact has happened in one of the possible worlds, every finite observed number agrees.
         """
         running = self.memory.running
         assert running is not None
@@ -448,10 +454,10 @@ class StepShield:
         return np.asarray(within | (self._leaves_range(running) & np.isfinite(seen).all(axis=1)), np.bool_)
 
     def _leaves_range(self, running: Running) -> Bools:
-        """Return whether an impact has happened in any possible world of each world, [n].
+        """For each world: return whether an impact has happened in at least one of its possible worlds, [n].
 
         After an impact in a possible world, the true world may lie outside the range of the possible worlds.
-        ``running`` contains the predicted episodes.
+        ``running`` contains the episodes as the shield predicted them.
         """
         N = running.problem.mass.shape[1]
         predicted = running.states.reshape(running.n, running.members, -1)
@@ -460,9 +466,9 @@ class StepShield:
     def _compared(self, memory: StepMemory, seen: Floats, asked: Bools) -> StepMemory:
         """Compare the observed worlds with the prediction in ``memory``; return the new memory.
 
-        ``seen`` [n, columns] contains the observed worlds, with the first columns of ``Running.states``. ``asked`` [n]
-        says which worlds are compared. A world that differs from the prediction becomes distrusted, and gets a new plan
-        from the observed state on.
+        ``seen`` [n, columns] contains the observed worlds; its columns are the first columns of ``Running.states``.
+        ``asked`` [n] is True for the worlds that are compared. A world that differs from the prediction becomes
+        distrusted, and gets a new plan from the observed state on.
         """
         running, backup, seen = memory.running, memory.backup, self.as_seen(seen)
         assert running is not None

@@ -29,7 +29,7 @@ Step = tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]  # observations, rew
 
 
 class _Closing:
-    """Mixin for wrappers whose ``close`` removes the guard from the engine, then closes the environment."""
+    """Mixin with a method ``close``, which removes the guard from the engine and then closes the environment."""
 
     attached: Attached  # the link to the engine and its guard
 
@@ -44,15 +44,15 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
 
     Mode ``step`` (the default) certifies or replaces the actions of all learners together. In mode ``episode`` (the
     paper's Algorithm 1) the policy or E-V2X-BM drives the whole episode, whatever actions are proposed. The bounds hold
-    as long as the other vehicles follow their scripts. ``infos[agent]`` reports each decision under ``shield_reason``
-    and other ``shield_...`` keys. See docs/shield.md.
+    as long as the other vehicles follow their scripts. The infos of each agent, ``infos[agent]``, describe the shield's
+    decision under the keys ``shield_...``. See docs/shield.md.
 
     Args:
         env: ``eb.parallel_env(...)`` with one learner (in mode ``step`` one or more), or a wrapper around it.
-        policy: an agent or a policy, a ``Team``, or a mapping from learner name to policy. The policy proposes the
+        policy: an agent, a policy, a ``Team``, or a mapping from learner name to policy. The policy proposes the
             actions that the caller leaves out. In worlds where the policy does less harm than E-V2X-BM, the policy's
             harm is the bound (the harm that the episode will not exceed). Mode ``episode`` needs a policy.
-        agents: names of the shielded learners, which must be all learners; None: all learners.
+        agents: names of the learners to shield; must contain every learner. None: all learners.
         options: keywords of ``ShieldOptions``, including ``mode``.
 
     Raises ``InvalidInput`` for invalid arguments.
@@ -123,7 +123,7 @@ def shielded_aec(env: ParallelEnv[str, Observations, NDArray[Any]], *args: Any, 
     """Return a shielded environment in which the agents act one after the other (AEC), front to rear.
 
     ``env`` is a parallel environment, because the shield needs the actions of all agents at once. ``args`` and
-    ``settings`` are further arguments of ``HybridShield``.
+    ``settings`` are the other arguments of ``HybridShield``.
     """
     return InTurns.around(HybridShield(env, *args, **settings))
 
@@ -133,16 +133,16 @@ class ShieldedEnv(
 ):
     """``EthBrake-v1`` behind a shield, by default in mode ``step``, which certifies or replaces each action.
 
-    The info reports each decision under ``shield_reason`` and other ``shield_...`` keys.
+    The info describes the shield's decision under the keys ``shield_...``, such as ``shield_reason``.
 
     Args:
         env: an ``EthBrake-v1`` environment, or a wrapper around it.
-        policy: policy that is simulated from each alert. In worlds where the policy does less harm than E-V2X-BM, the
-            policy's harm is the bound (the harm that the episode will not exceed). ``policy`` may be None, except in
-            mode ``episode``.
+        policy: policy that is simulated at the start of each episode, from the alert on. In worlds where the policy
+            does less harm than E-V2X-BM, the policy's harm is the bound (the harm that the episode will not exceed). In
+            all modes except ``episode``, ``policy`` may be None.
         options: keywords of ``ShieldOptions``, including ``mode``.
 
-    Raises ``InvalidInput`` for another kind of environment, and for invalid arguments.
+    Raises ``InvalidInput`` if ``env`` is another kind of environment, and for invalid arguments.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.ShieldedEnv(eb.EthBrakeEnv("paper-random"))
@@ -179,8 +179,8 @@ class ShieldedEnv(
     def step(self, action: NDArray[Any]) -> Any:
         """Advance by one time step; the shield certifies or replaces the action [1].
 
-        Returns the values that the wrapped environment returns, with the intervention penalty subtracted from the
-        reward. If the environment contains a ``CostEnv``, these values include the cost.
+        Returns what ``step`` of the wrapped environment returns, but with the intervention penalty subtracted from the
+        reward. If the environment contains a ``CostEnv``, the cost is among the returned values.
         """
         self.attached.check_open()
         observation, reward, *others = self.env.step(action)
@@ -192,17 +192,17 @@ class ShieldedEnv(
 class ShieldedVectorEnv(_Closing, VectorWrapper):
     """``EthBrakeVectorEnv`` behind a shield, by default in mode ``step``, which certifies or replaces each action.
 
-    In a row where a new episode has just started, ``infos["shield_bound_harm"]`` and the other infos describe the new
-    alert. ``infos["final_info"]`` describes the last step of the old episode in this row.
+    In a row where a new episode has just started, ``infos["shield_bound_harm"]`` and the other infos describe the alert
+    of this episode. ``infos["final_info"]`` describes the last step of the old episode in this row.
 
     Args:
         env: an ``EthBrakeVectorEnv``, or a wrapper around it.
-        policy: policy that is simulated from each alert. In worlds where the policy does less harm than E-V2X-BM, the
-            policy's harm is the bound (the harm that the episode will not exceed). ``policy`` may be None, except in
-            mode ``episode``.
+        policy: policy that is simulated at the start of each episode, from the alert on. In worlds where the policy
+            does less harm than E-V2X-BM, the policy's harm is the bound (the harm that the episode will not exceed). In
+            all modes except ``episode``, ``policy`` may be None.
         options: keywords of ``ShieldOptions``, including ``mode``.
 
-    Raises ``InvalidInput`` for another kind of environment, and for invalid arguments.
+    Raises ``InvalidInput`` if ``env`` is another kind of environment, and for invalid arguments.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -256,15 +256,15 @@ def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, *
             shield certifies the changed action. ``env`` may also be an agent or a team; ``options`` must then contain
             ``scenario``, the scenario in which actions are certified.
         policy: policy that proposes the actions that the caller leaves out. In worlds where the policy does less harm
-            than E-V2X-BM, the policy's harm is the bound (the harm that the episode will not exceed). ``policy`` may be
-            None, except in mode ``episode``.
-        mode: ``step``, ``episode``, or the mode of an extension. None means ``step``; but if ``step`` lacks one of the
-            ``options``, None means the first mode that has them all.
+            than E-V2X-BM, the policy's harm is the bound (the harm that the episode will not exceed). In all modes
+            except ``episode``, ``policy`` may be None.
+        mode: ``step``, ``episode``, or the mode of an extension. None means ``step``; but if the mode ``step`` lacks
+            one of the ``options``, None means the first mode that has all of them.
         options: further keywords of ``ShieldOptions``.
 
     Returns a ``HybridShield`` (for AEC, an AEC environment around a ``HybridShield``), a ``ShieldedEnv``, a
-    ``ShieldedVectorEnv`` or a ``ShieldedVecEnv``. If ``env`` is an agent or a team, returns this agent or team behind a
-    shield. Raises ``InvalidInput`` for any other object, and for invalid arguments.
+    ``ShieldedVectorEnv`` or a ``ShieldedVecEnv``. If ``env`` is an agent or a team, returns the same agent or team with
+    a shield. Raises ``InvalidInput`` if ``env`` is of any other type, and for invalid arguments.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.shield(eb.parallel_env(scenario="paper-random"))
