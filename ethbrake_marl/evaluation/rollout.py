@@ -253,7 +253,7 @@ def outcome_of(team: Team, episodes: Episodes) -> Outcome:
     """
     memory: Any = next(iter(episodes.memories.values()), None) if len(team.drivers) == 1 else None
     if episodes.guarded is not None:
-        memory = episodes.guarded.told
+        memory = episodes.guarded.results
     predicted, chosen = (
         _read_column(team, memory, what, episodes.final.n) for what in ("predicted_harm", "chosen_policy")
     )

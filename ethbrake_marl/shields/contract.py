@@ -73,7 +73,7 @@ class Guarded(NamedTuple):
         return Guarded(shield, take_memory(self.policies, rows))
 
     @property
-    def told(self) -> dict[str, Any]:
+    def results(self) -> dict[str, Any]:
         """The shield's values ``predicted_harm`` [n] and ``chosen_policy`` [n], by name; None for a missing value.
 
         ``predicted_harm`` is the harm predicted at the alert (m2/s2). ``chosen_policy`` is True in the worlds where the

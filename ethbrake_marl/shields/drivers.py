@@ -29,7 +29,7 @@ class ShieldedDriver(ByPolicy):
         policy: the agent or team that proposes actions.
         scenario: the scenario in which actions are certified.
         later_rollouts: whether a rollout of the policy that starts after the alert may certify an action.
-        told: the worlds at the alert, as the shield assumes them. If ``told`` is None, the shield knows the true
+        assumed: the worlds at the alert, as the shield assumes them. If ``assumed`` is None, the shield knows the true
             worlds. The policy always observes the true worlds.
         options: keywords of ``ShieldOptions``.
 
@@ -48,7 +48,7 @@ class ShieldedDriver(ByPolicy):
         scenario: Scenario,
         *,
         later_rollouts: bool = True,
-        told: Worlds | None = None,
+        assumed: Worlds | None = None,
         **options: Any,
     ) -> None:
         self.options = ShieldOptions(**options)
@@ -58,8 +58,10 @@ class ShieldedDriver(ByPolicy):
             )
         check_agent(policy, str(self.options.mode), alone=not isinstance(policy, Team))
         check_scenario(scenario, str(self.options.mode))
-        if not (told is None or isinstance(told, Worlds)):
-            raise InvalidInput(f"step: told = {told!r}: must be a Worlds object (the worlds at the alert) or None")
+        if not (assumed is None or isinstance(assumed, Worlds)):
+            raise InvalidInput(
+                f"step: assumed = {assumed!r}: must be None or a Worlds object (the worlds at the alert)"
+            )
         if isinstance(policy, Team) and (
             undriven := [scenario.vehicle_names[i] for i in scenario.learners if i not in policy.drivers]
         ):
@@ -68,7 +70,7 @@ class ShieldedDriver(ByPolicy):
                 " learner of the scenario"
             )
         self.policy, self.scenario = policy, scenario
-        self._how = {"later_rollouts": later_rollouts, "told": told}
+        self._how = {"later_rollouts": later_rollouts, "assumed": assumed}
         self.name = f"{policy.name}+{self.options.written}"
         self.options.check_in(scenario, several=isinstance(policy, Team))
 

@@ -36,7 +36,7 @@ class StepGuard(ShieldGuard):
         shares: whether the infos contain the harm that each vehicle bears; if the shield has a cap, the infos always
             contain this harm.
         later_rollouts: whether a rollout of the policy that starts after the alert may certify an action.
-        told: the worlds at the alert, as the shield assumes them. If ``told`` is None, the shield knows the true
+        assumed: the worlds at the alert, as the shield assumes them. If ``assumed`` is None, the shield knows the true
             worlds. Policies always observe the true worlds.
         warns: whether to warn once with ``MovingAtHorizon`` if a vehicle would still move at the horizon under the plan
             made at the alert.
@@ -53,21 +53,21 @@ class StepGuard(ShieldGuard):
         where: str = "shield",
         shares: bool = False,
         later_rollouts: bool = True,
-        told: Worlds | None = None,
+        assumed: Worlds | None = None,
         warns: bool = False,
     ) -> None:
         super().__init__(engine, policies, shield, mode=mode, where=where)
         self._several = isinstance(shield.vehicle, tuple)
         self._shares = shares or shield.cap is not None
-        self._later_rollouts, self._told, self._to_warn = later_rollouts, told, warns
+        self._later_rollouts, self._assumed, self._to_warn = later_rollouts, assumed, warns
 
     def _started(self, shield: StepShield, alert: Worlds, rows: Ints) -> StepShield:
-        if self._told is not None and not (rows < self._told.n).all():
+        if self._assumed is not None and not (rows < self._assumed.n).all():
             raise InvalidInput(
-                f"shield: told has {count_of(self._told.n, 'world')}, but an episode begins in row {rows.max()}; told"
-                " must have one world for every row"
+                f"shield: assumed has {count_of(self._assumed.n, 'world')}, but the environment has a row {rows.max()};"
+                " assumed must have one world for every row of the environment"
             )
-        shield.begin(alert if self._told is None else self._told.take(rows), rows, self._policies or None)
+        shield.begin(alert if self._assumed is None else self._assumed.take(rows), rows, self._policies or None)
         moving = int((~shield.memory.settles[rows]).sum())
         if moving and self._to_warn:
             self._to_warn = False
@@ -92,13 +92,13 @@ class StepGuard(ShieldGuard):
         """
         shield: StepShield = memory.shield
         goes_on, finished = ~running.ended, shield.memory.running.finished  # type: ignore[union-attr]  # it has begun
-        worlds = running.worlds if self._policies or self._told is not None else None  # computed at each access
+        worlds = running.worlds if self._policies or self._assumed is not None else None  # computed at each access
         proposed, memories = self._asked(worlds, memory.policies, proposed)
         seen = seen_columns(running.packed)
         after = copy.copy(shield)
         decision = after.decide(
             proposed if self._several else proposed[:, 0],
-            seen=seen if self._told is None else seen[:, : (3 * seen.shape[1] + 2) // 5],  # without harm
+            seen=seen if self._assumed is None else seen[:, : (3 * seen.shape[1] + 2) // 5],  # without harm
             only=goes_on,
             proposer=self._proposer(memories, worlds) if self._later_rollouts else None,
         )
@@ -110,8 +110,8 @@ class StepGuard(ShieldGuard):
         """Compare the worlds after the step with the shield's prediction; return the guard's memory.
 
         ``ruling`` is the decision that was applied. ``after`` is the engine after the step. Raises ``UncertifiedStep``
-        if a world differs from the prediction. If the shield assumes the worlds ``told``, which may be wrong, a world
-        that differs from the prediction becomes distrusted, and no error is raised. Worlds in which the physics failed
+        if a world differs from the prediction. If the shield has assumed worlds, which may be wrong, a world that
+        differs from the prediction becomes distrusted, and no error is raised. Worlds in which the physics failed
         are not compared.
         """
         memory: Guarded = ruling.memory
@@ -130,7 +130,7 @@ class StepGuard(ShieldGuard):
         surprising = wanted & ~shield.expects(seen)
         if not surprising.any():
             return memory
-        if self._told is None:
+        if self._assumed is None:
             k = int(np.argmax(surprising))
             raise UncertifiedStep(
                 f"shield: after this step of world {k}, {difference(running.nominal().states[k], seen[k])}"

@@ -224,7 +224,7 @@ WRAPPED = {
     [
         *((when, r"(begin|act) on .*read-only") for when in ("begin", "act", "vehicles")),
         *(
-            (name, rf"the agent changed its attribute '{name}', .*; an agent with memory has begin\(alert, ")
+            (name, rf"the agent changed its attribute '{name}', .*: an agent with memory has begin\(alert, ")
             for name in ("name", "plan")  # an attribute that there is, and a new one
         ),
     ],

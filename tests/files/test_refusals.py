@@ -134,7 +134,7 @@ def test_link__is_not_followed_where_it_must_not_be(empty_folder: Path) -> None:
 
 def test_output__replaces_no_file_unasked_and_nothing_else_even_if_asked(empty_folder: Path) -> None:
     Path("out.csv").write_text("mine")
-    with refused("out.csv: already exists; give another name, or pass force=True (--force) to overwrite the file", AlreadyExists):
+    with refused("out.csv: already exists; give another name, or pass force=True", AlreadyExists):
         write_output("out.csv", b"new")
     for link, target in (("link", "out.csv"), ("dangling", "nowhere")):
         Path(link).symlink_to(target)

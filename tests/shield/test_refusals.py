@@ -83,8 +83,8 @@ STEP_SHIELD: dict[str, Callable[[], object]] = {
     "shield: policy has a policy for the vehicle indices [1]; must have one for each shielded vehicle, [1,": lambda: (
         StepShield(PAIR, (1, 2)).begin(PAIR.sample(1, 0).worlds, np.arange(1), COAST)
     ),
-    "shield: told has 2 worlds, but an episode begins in row 4; told must have one world for every row": lambda: drive(
-        WORLDS, ShieldedDriver(COAST, PAPER, told=WORLDS.take([0, 1])), PAPER, 1
+    "shield: assumed has 2 worlds, but the environment has a row 4; assumed must have one world for every row": lambda: (
+        drive(WORLDS, ShieldedDriver(COAST, PAPER, assumed=WORLDS.take([0, 1])), PAPER, 1)
     ),
     "review: the shield has no log; make the shield with logging=True, and run episodes": lambda: review(
         drive(WORLDS, ShieldedDriver(COAST, PAPER), PAPER, 1).guarded.shield, COAST, WORLDS
@@ -103,8 +103,8 @@ def test_step_shield__refuses(message: str) -> None:
 
 AGENTS: dict[str, Callable[[], object]] = {
     "must be a Scenario; eb.load_scenario(name) loads one": lambda: ShieldedDriver(COAST, "paper-random"),
-    "step: told = 3: must be a Worlds object (the worlds at the alert) or None": lambda: ShieldedDriver(
-        COAST, PAPER, told=3
+    "step: assumed = 3: must be None or a Worlds object (the worlds at the alert)": lambda: ShieldedDriver(
+        COAST, PAPER, assumed=3
     ),
     "shield: mode = 'episode': is not possible with ShieldedDriver; use HybridAgent": lambda: ShieldedDriver(
         COAST, PAPER, mode="episode"

@@ -344,7 +344,7 @@ def test_rollout__once_accepted_is_what_the_policy_then_does_and_the_bound_is_ex
 def test_rollout__leaves_the_past_in_the_plan_what_was_applied(distrusted):
     weaker = replace(ROLLED.vehicles, braking_capacity_mps2=0.9 * ROLLED.vehicles.braking_capacity_mps2)
     told = replace(ROLLED, vehicles=weaker) if distrusted else None
-    guarded, _, reasons, applied = driven(eb.LearnedAgent(Weights()), logging=True, told=told)
+    guarded, _, reasons, applied = driven(eb.LearnedAgent(Weights()), logging=True, assumed=told)
     shield, running = guarded.shield, ~np.isin(reasons, [-1, ShieldReason.ENDED])
     assert (shield.memory.distrusted == distrusted).all()
     assert (shield.memory.backup.plan.T[: len(applied)] == applied)[running].all() and running[0].all()

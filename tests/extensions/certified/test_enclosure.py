@@ -236,7 +236,7 @@ def test_engine__with_an_uncertain_own_latency_no_world_of_the_box_is_distrusted
     told = scenario.sample(1, 3).worlds.take(np.zeros(4, np.int64))
     uncertainty = parse_uncertainty("latency_s.vehicle_2=0.15")
     driver = ShieldedDriver(
-        eb.make_agent("constant:3"), scenario, uncertainty=uncertainty, robust="interior", told=told
+        eb.make_agent("constant:3"), scenario, uncertainty=uncertainty, robust="interior", assumed=told
     )
     episodes = drive(uncertainty.draw(told, np.random.default_rng(1)), driver, scenario, 1)
     shield = episodes.guarded.shield

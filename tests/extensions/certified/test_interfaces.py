@@ -80,7 +80,9 @@ def test_begin__of_some_rows_leaves_the_others_alone() -> None:
 def test_world__that_goes_on_after_the_shields_own_end_is_braked_fully():
     worlds = PAPER.sample(40, 7).worlds
     slower = parse_uncertainty("braking_capacity_mps2=20%").draw(worlds, np.random.default_rng(0), corners=True)
-    engine = episode_engine(worlds, ShieldedDriver(drives_off, PAPER, told=slower, uncertainty="gaps_m=0.02"), PAPER, 1)
+    engine = episode_engine(
+        worlds, ShieldedDriver(drives_off, PAPER, assumed=slower, uncertainty="gaps_m=0.02"), PAPER, 1
+    )
     braking, after = -worlds.vehicles.braking_capacity_mps2[:, 1], np.zeros(40, bool)
     while not engine.ended.all():
         over = engine.guarded.shield.memory.running.finished & ~engine.ended

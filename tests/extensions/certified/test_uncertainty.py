@@ -77,7 +77,7 @@ def test_every_member__realises_at_most_the_bound_to_the_bit(N, harm_count, who)
     M = members.n // worlds.n
     for m in range(0, M, 16 if N == 3 else 8):
         driver = ShieldedDriver(
-            Hostile(who, m), scenario, harm_count=harm_count, uncertainty=uncertainty, told=worlds,
+            Hostile(who, m), scenario, harm_count=harm_count, uncertainty=uncertainty, assumed=worlds,
             later_rollouts=m == 0,
         )  # fmt: skip
         episodes = drive(members.take(np.arange(worlds.n) * M + m), driver, scenario, vehicle)
@@ -109,7 +109,7 @@ OPEN = parse_uncertainty("gaps_m=2,speeds_mps.vehicle_2=1")
 @pytest.mark.parametrize(("gap", "surprising"), [(13.2, False), (12.9, True)])
 def test_seen__inside_the_range_of_the_members_is_no_surprise_outside_is_one(gap, surprising):
     told, truth = (scenario.sample(1, 0).worlds for scenario in (STANDING, STANDING.replace(gaps_m=gap)))
-    driver = ShieldedDriver(make_agent("full_brake"), STANDING, uncertainty=OPEN, told=told)
+    driver = ShieldedDriver(make_agent("full_brake"), STANDING, uncertainty=OPEN, assumed=told)
     episodes = drive(truth, driver, STANDING, 1)
     shield = episodes.guarded.shield
     assert shield.memory.distrusted.tolist() == [surprising]
@@ -189,7 +189,7 @@ def test_friction__no_truth_of_its_box_is_distrusted_and_no_corner_is_above_the_
     told, rng = wet.sample(60, 7).worlds, np.random.default_rng(0)
     uncertainty = parse_uncertainty("friction=0.1")
     for corners, spec in ((True, "coast"), (True, "full_brake"), (False, "full_brake")):
-        shield = ShieldedDriver(make_agent(spec), wet, told=told, uncertainty=uncertainty)
+        shield = ShieldedDriver(make_agent(spec), wet, assumed=told, uncertainty=uncertainty)
         found = drive(uncertainty.draw(told, rng, corners=corners), shield, wet, 1)
         assert not found.guarded.shield.memory.distrusted.any()
         harm = found.ledger.world_harm("first")
@@ -202,7 +202,7 @@ def test_robust_shield__trusts_a_longer_line_inside_its_box() -> None:
     shift = Draws(2).uniform(-0.4, 0.4, (20, 4)) * [1.0, 0.0, 0.0, 0.0]
     task = Task(five, five.learners, "first")
     uncertain = parse_uncertainty("gaps_m.pair_1=0.5")
-    shielded = ShieldedDriver.around(make_agent("full_brake"), task, mode="robust", uncertainty=uncertain, told=told)
+    shielded = ShieldedDriver.around(make_agent("full_brake"), task, mode="robust", uncertainty=uncertain, assumed=told)
     driven = drive(replace(told, gaps_m=told.gaps_m + shift), shielded, five)
     assert driven.guarded.shield.memory.distrusted.sum() == 0
     assert driven.ledger.world_harm("first").sum() > 0.0

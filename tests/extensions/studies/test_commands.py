@@ -27,7 +27,7 @@ def test_again__runs_no_code_that_only_a_file_names(ethbrake: Command) -> None:
     whole = Path("worst.yaml").read_text()
     for line in ("agent: coast\n", "against: full_brake\n"):
         Path("worst.yaml").write_text(whole.replace(line, f'{line.partition(" ")[0]} "mine.py:make"\n'))
-        check_refused(ethbrake("study", "falsify", "--again", "worst.yaml"), "is not run")
+        check_refused(ethbrake("study", "falsify", "--again", "worst.yaml"), "does not run code")
     assert not Path("ran").exists()
 
 
