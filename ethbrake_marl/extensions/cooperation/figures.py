@@ -97,7 +97,8 @@ def _harm_curve(results: Json, caption: str) -> Figure:
 def _change_figure(results: Json, caption: str) -> Figure:
     """Draw the change of harm from level to level and from each level to its copies with a worse V2X channel.
 
-    Whiskers show 95 % intervals. A mark to the left of 0 means that the later level has less harm.
+    Whiskers show 95 % confidence intervals. A mark to the left of 0 means less harm at the level that the label names
+    last.
     """
     changes = results["steps"] + results["channels"]
     figure, panels = new_panels((10.5, max(_LEAST_IN, 1.6 + 0.6 * len(changes))), columns=2, sharey=True)
@@ -183,7 +184,7 @@ def _reached(
         axes: axes to draw on.
         levels: results of all levels, from ``ablation.json``.
         ladder: names of the levels from left to right.
-        harm_count: count of harm to draw, ``first`` or ``total``.
+        harm_count: which harm to draw, first-impact harm (``first``) or total harm (``total``).
         algorithm: name of the training algorithm.
         number: index of the training algorithm, which determines the colour and the offset of its marks.
 

@@ -1,7 +1,7 @@
 """Write recorded episodes as a Minari dataset or a Parquet file.
 
-A Minari dataset also contains the environment: ``dataset.recover_environment()`` returns it. In this environment, the
-recorded actions repeat the episodes bit for bit. To start in the world of an episode, call ``env.reset(seed=seed,
+A Minari dataset also contains the environment, which ``dataset.recover_environment()`` returns. In this environment,
+the recorded actions repeat the episodes bit for bit. To start in the world of an episode, call ``env.reset(seed=seed,
 options=options)`` with the ``seed`` and ``options`` in the metadata of the episode.
 """
 
@@ -93,7 +93,7 @@ def minari_folder(
         path: path of the folder, named ``NAME-vNUMBER``.
         task: scenario, seed, reward and observation of the recordings.
         told: metadata (result of ``tell``), which are stored in the dataset as JSON under the key ``ethbrake_marl``
-            when the ``with`` block ends. Inside the block, the caller may still add entries.
+            when the ``with`` block ends. The caller may add entries to ``told`` until the block ends.
         force: whether to replace an existing dataset.
 
     """
@@ -133,7 +133,7 @@ def minari_folder(
 def env_spec(task: Task) -> EnvSpec:
     """Return a Gymnasium spec of the environment in which recorded actions can be repeated.
 
-    ``gymnasium.make(spec)`` makes this environment. The spec contains only plain data, so it can be stored as JSON.
+    ``gymnasium.make(spec)`` creates this environment. The spec contains only plain data, so it can be stored as JSON.
     Raises ``InvalidInput`` if the scenario does not have exactly one learner.
     """
     names = [task.scenario.vehicle_names[i] for i in task.scenario.learners]
@@ -220,17 +220,18 @@ def write_dataset(
 ) -> DatasetSummary:
     """Let agents drive in worlds of a scenario, and write the episodes as a Parquet file or a Minari dataset.
 
-    If an environment starts in a recorded world and gets the recorded actions, it repeats the episode bit for bit.
-    docs/extensions/datasets.md describes the files. Before it begins to record, the function raises ``InvalidInput`` if
+    An environment that starts in a recorded world and gets the recorded actions repeats the episode bit for bit.
+    docs/extensions/datasets.md describes the files. Before the first episode, the function raises ``InvalidInput`` if
     an argument is invalid, ``AlreadyExists`` if ``path`` exists and ``force`` is false, and ``MissingExtra`` if a
-    library is not installed. At the end it raises ``PhysicsError`` if the physics could simulate none of the worlds.
+    library is not installed. After the last episode, the function raises ``PhysicsError`` if the physics could simulate
+    none of the worlds.
 
     Args:
         path: file (``.parquet``) or folder (``NAME-v0``) to write.
         agents: names of agents as on the command line, or a mapping from names to agents or teams. Each agent drives
             the learners of the scenario. The function does not change the agents.
         scenario: a ``Scenario``, or its name or path.
-        episodes: each agent drives in this number of worlds: worlds 0 to ``episodes`` - 1 of ``seed``.
+        episodes: number of worlds in which each agent drives: the worlds 0 to ``episodes`` - 1 of ``seed``.
         seed: seed from which the worlds are drawn.
         format: ``parquet`` or ``minari``; None: the ending of ``path`` selects the format.
         reward: reward to record: a name such as ``harm``, or the weights of the reward's terms.
@@ -287,7 +288,7 @@ def check_dataset(
 ) -> DatasetFormat:
     """Check that a dataset of ``scenario`` can be written to ``path``, and return the format of the dataset.
 
-    Raises the exceptions that ``write_dataset`` raises before it begins to record.
+    Raises the exceptions that ``write_dataset`` raises before the first episode.
 
     Args:
         path: file (``.parquet``) or folder (``NAME-v0``) to write.

@@ -167,14 +167,14 @@ class FoundHost(NamedTuple):
             sample: the worlds at the alert.
             agents: dictionary from names to agents or teams.
             scenario: scenario of the worlds.
-            seed: seed from which the worlds were drawn, which is stored in the evaluation; None: there is no seed.
+            seed: seed from which the worlds were drawn, which is stored in the evaluation; None: no seed is stored.
             at_once: largest number of worlds in one simulation.
-            on_progress: function that is called with the name of an agent and the number of worlds that it has
-                finished.
+            on_progress: function that is called with the name of an agent and the number of worlds in which this agent
+                has finished its episodes.
 
-        Returns the evaluation, and a dictionary from each agent's name to an array [n] bool: whether the motion in a
-        world differed from the prediction of the agent's shield. The entry is None if the agent has no shield that
-        makes predictions.
+        Returns the evaluation, and a dictionary from each agent's name to an array [n] bool: True for the worlds in
+        which the motion differed from the prediction of the agent's shield. For an agent without a shield that makes
+        predictions, the dictionary contains None instead of an array.
 
         """
         results: dict[str, Hosted] = {}
