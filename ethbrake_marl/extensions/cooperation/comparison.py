@@ -125,7 +125,8 @@ def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: 
         one: results of the level without a shield.
         shielded: results of the same policies in the same worlds, with a shield that bounds the harm ``harm_count``.
         harm_count: impacts that count as harm: the first impact of each pair (``first``), or all (``total``).
-        searched: the result contains, under the key ``searched``, the mean harm over the first ``searched`` worlds.
+        searched: number of worlds in which the joint optimum was searched; the result also contains the mean harm over
+            the first ``searched`` worlds.
 
     """
     before, after = one.reached.vehicle[harm_count], shielded.vehicle_harm
@@ -150,7 +151,7 @@ def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: 
 
 
 def _change(before: Measured, after: Measured, algorithm: str) -> Json:
-    """Return the change of harm from level ``before`` to level ``after`` in the same worlds; positive: more harm.
+    """Return (harm at level ``after``) - (harm at level ``before``), averaged over the same worlds.
 
     The result has the form ``{"from": name, "to": name, "algorithm": name, "first": changes, "total": changes}``. For
     each count of harm, ``changes`` contains the change of harm of the whole line and of each vehicle. ``algorithm`` is

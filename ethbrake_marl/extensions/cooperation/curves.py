@@ -36,7 +36,7 @@ def swept_axis(results: Json) -> str | None:
 
 
 def sweep_figures(results: Json, caption: str) -> list[Figure]:
-    """Return the two figures of a sweep, with the values of the varied key on a linear x axis, and with 95 % intervals.
+    """Return the two figures of a sweep, with swept values on a linear x axis, and with 95 % confidence intervals.
 
     Args:
         results: content of ``ablation.json``.
@@ -136,7 +136,7 @@ def _curve(
     shade: bool = False,
     **style: Any,
 ) -> None:
-    """Draw an estimate for each swept value; its confidence interval is a whisker, or a band if ``shade`` is true."""
+    """Draw an estimate for each swept value, with its confidence interval as whiskers, or as a band if ``shade``."""
     at = _places(levels, beside)
     if not shade:
         with_intervals(axes, at, estimates, **style)
@@ -164,7 +164,7 @@ def _span(levels: Sequence[Json]) -> tuple[float, float]:
 def _number_axis(axes: Axes, results: Json) -> None:
     """Set range, ticks and label of the x axis, and let the y axis begin at 0.
 
-    The x axis has ticks at 0 and at the number of each level, unless the labels of these ticks would overlap.
+    The x axis has ticks at 0 and at each swept value, unless the labels of these ticks would overlap.
     """
     numbers = sorted({0.0, *(level["swept_number"] for level in results["levels"])})
     low, high = _span(results["levels"])

@@ -84,12 +84,12 @@ class _Game(NamedTuple):
         return Profiles(np.minimum(steps + 1, self.joint.last_step[:, np.newaxis]), np.stack(at, axis=1))
 
     def amount(self, c: int, own: list[Profiles]) -> Floats:
-        """Return the objective of learner ``c`` (0: first learner), [n] m2/s2, if all follow their profiles ``own``."""
+        """Return the objective of learner ``c`` (from 0), [n] m2/s2, if all learners follow the profiles ``own``."""
         problem = minimising(self.joint, self.worlds, self.declared, self.task.vehicles[c : c + 1])
         return problem.values(self.together(own))[self.task.harm_count]
 
     def response(self, c: int, own: list[Profiles], effort: Mapping[str, int]) -> Profiles:
-        """Return the best profile of learner ``c`` (0: first learner) that a search finds if the others follow ``own``.
+        """Search the best profile of learner number ``c`` (from 0) if the other learners follow the profiles ``own``.
 
         ``effort`` contains keyword arguments of ``search_profiles``. The search for one learner may compute the harm of
         a profile slightly differently than the search problem ``joint`` of all learners, because of rounding.
@@ -105,7 +105,7 @@ class _Game(NamedTuple):
         return search_profiles(problem, joined(starts, problem.n), **effort)[0]
 
     def _following(self, c: int, own: list[Profiles]) -> Vehicles:
-        """Return vehicle parameters with which all learners except learner ``c`` follow their profiles in ``own``."""
+        """Return vehicle parameters with which all learners but number ``c`` (from 0) follow the profiles ``own``."""
         vehicles, clock, old = self.worlds.vehicles, self.joint.clock, self.worlds.vehicles.pieces
         count = old.shape[2] // 2
         pieces = np.full((*old.shape[:2], 2, max(count, MOST_PHASES)), np.inf)
@@ -138,7 +138,7 @@ def find_equilibria(
     In every round, each learner searches a better profile, and changes its profile if the new one is better by more
     than ``tolerance``. If no learner changes its profile in a round, the result is an approximate equilibrium of
     open-loop profiles. The equilibrium is only approximate because a search tries only ``budget`` candidate profiles.
-    The world may have further equilibria. The result for a world does not depend on the other worlds or on ``threads``.
+    A world may have further equilibria. The result for a world does not depend on the other worlds or on ``threads``.
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.extensions.cooperation import compare_starts, find_equilibria
@@ -266,7 +266,7 @@ def best_joint_harm(
 
 
 def price_of_anarchy(borne: Floats, optimum: Floats) -> Estimate | None:
-    """Return (line's mean harm in equilibrium) / (line's mean harm in the joint optimum), with confidence interval.
+    """Return (line's mean harm in equilibrium) / (line's mean harm in the joint optimum) and its confidence interval.
 
     If ``borne`` is ``Spread.worst``, this ratio is called the price of anarchy; if ``borne`` is ``Spread.best``, the
     price of stability. The function returns None if the harm of the joint optimum is 0 in every world.

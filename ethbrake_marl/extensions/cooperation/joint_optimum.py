@@ -164,7 +164,10 @@ def _harms(own: LevelOptimum, other: LevelOptimum, rows: Ints) -> Iterator[dict[
 
 @dataclass(frozen=True, slots=True)
 class Harms:
-    """Harm of all training runs (seeds) of one level in the same worlds; a level without learners has one seed."""
+    """Harm in the same worlds with the policies of each training run (seed) of one level.
+
+    A level without learners counts as one training run.
+    """
 
     world: dict[HarmCount, Floats]  # count of harm -> [seeds, worlds] harm of the whole line (m2/s2)
     vehicle: dict[HarmCount, Floats]  # count of harm -> [seeds, worlds, N] harm of each vehicle (m2/s2)
@@ -206,7 +209,7 @@ class Goal(NamedTuple):
 
     @property
     def missed(self) -> bool:
-        """Whether the trained policies do worse on average than full braking of all vehicles."""
+        """Whether the mean of the quantity is larger, so worse, with the trained policies than with full braking."""
         return self.reached > self.full_brake + TOLERANCE
 
 

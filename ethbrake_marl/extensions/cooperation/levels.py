@@ -320,7 +320,7 @@ def plan_ablation(
         recipes: names or paths of recipes, separated by commas.
         settings: settings ``KEY=VALUE`` of scenarios and recipes; None: no settings.
         sweep: key of a scenario and its values, ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``; None: no sweep.
-        quick: if True, numbers that ``given`` does not contain, such as the number of seeds, are small.
+        quick: if True, numbers that ``given`` does not contain, such as the number of seeds, get small defaults.
         tell: function that is called with a note if ``gamma`` and ``reward.shaping_discount`` of a recipe differ.
         given: further fields of ``Plan``, such as ``seeds``; a field that is None gets its default.
 

@@ -289,7 +289,7 @@ def _sheet(rows: Sequence[Json], columns: _Columns) -> Sheet:
 
 
 def interval_words(seeds: int) -> str:
-    """Return a phrase for captions: whether 95 % intervals are for other worlds only, or also for other seeds."""
+    """Return a phrase for captions: whether the 95 % intervals allow for other worlds only, or also for other seeds."""
     if seeds == 1:
         return "95 % intervals for other worlds only: one seed says nothing about others"
     rough = f" (rough: {seeds} seeds)" if seeds < 3 else ""
@@ -306,7 +306,7 @@ def write_ablation(plan: Plan, measured: Sequence[Measured], machine: str) -> tu
     Args:
         plan: settings of the ablation.
         measured: result of ``measure``.
-        machine: description of this machine, which the page and ``ablation.json`` show.
+        machine: description of the computer on which the ablation ran, for the page and ``ablation.json``.
 
     Returns the content of ``ablation.json``, and the paths of the page, the Markdown file and the figures.
 

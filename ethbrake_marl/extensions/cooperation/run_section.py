@@ -1,4 +1,4 @@
-"""Section of a run's report on several learners: who bears the harm, and how much each learner and messages help."""
+"""Section of a run's report on several learners: harm of each vehicle, benefit of each learner and of messages."""
 
 from __future__ import annotations
 
@@ -265,7 +265,8 @@ def _borne(outcomes: Mapping[str, Outcome], harm_count: HarmCount, evaluation: E
 def _added(experiment: Experiment) -> Sheet:
     """Return a table of the harm that each learner of the team prevents.
 
-    The harm that a learner prevents is (harm of the line if this learner brakes fully) - (harm with the whole team).
+    The harm that a learner prevents is (harm of the line if this learner brakes fully) - (harm of the line with the
+    whole team).
     """
     evaluation, scenario = experiment.evaluation, experiment.evaluation.scenario
     columns = [Column("Learner", "learner", text=True)]

@@ -90,5 +90,5 @@ class Swept(NamedTuple):
 
     @property
     def columns(self) -> dict[str, Any]:
-        """Columns that tables of results have in a sweep: key, value as text, and number in the value."""
+        """Columns of result tables for the swept key: the key, its value as text, and the number in this value."""
         return {"swept_key": self.key, "swept_value": f"{self.word}{self.text}", "swept_number": self.number}

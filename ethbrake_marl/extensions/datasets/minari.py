@@ -168,7 +168,7 @@ def _episodes(recording: Recording) -> Iterator[dict[str, Any]]:
 
 
 def _infos(recording: Recording, vehicle: int) -> dict[str, NDArray[Any]]:
-    """Return the environment's ``info`` for ``vehicle`` (0 = front), as name of the entry -> values [T + 1, n, ...]."""
+    """Return the environment's ``info`` for ``vehicle`` (0 = front): dictionary from keys to values [T + 1, n, ...]."""
     infos = {name: recording.told(name)[:, :, vehicle] for name in recording.reports[0].columns()}
     cost = np.stack([each.cost for each in recording.reports])
     news = [each.known_from_s[:, vehicle] for each in recording.reports if each.known_from_s is not None]
@@ -237,7 +237,8 @@ def write_dataset(
         reward: reward to record: a name such as ``harm``, or the weights of the reward's terms.
         observation: features to record as observation; None: the features that ``observation_for(scenario)`` returns.
         force: whether to replace an existing dataset.
-        on_progress: function that is called with the name of an agent and the number of its worlds recorded so far.
+        on_progress: function that is called with the name of an agent and the number of worlds so far recorded with
+            this agent.
 
     """
     check_whole_number("write_dataset: episodes", episodes, 1)

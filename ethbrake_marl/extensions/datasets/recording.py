@@ -82,7 +82,7 @@ class Recording:
         return mask
 
     def told(self, column: str) -> Floats:
-        """Return the values [T + 1, n, N] of the entry of the environment's ``info`` with the name ``column``."""
+        """Return the values, [T + 1, n, N], that the environment's ``info`` has under the key ``column``."""
         return np.stack([each.columns()[column] for each in self.reports])
 
     def terms(self) -> dict[str, Floats]:
@@ -150,9 +150,9 @@ def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Re
 def _rounded(commanded: Floats, worlds: Worlds, evaluated: Ledger, task: Task) -> tuple[Float32s, Floats]:
     """Round the commands to float32 actions; in each world, choose the rounding that changes the harm least.
 
-    The roundings are: all commands to the nearest action, all down, or all up. Down and up are tried only if the
-    nearest actions change the harm of the world by more than ``SLACK``. Returns the rounded actions, [T, n, L], and how
-    much the rounding changes the harm of each world, [n] m2/s2.
+    Three roundings are possible: all commands of a world to the nearest action, all down, or all up. Rounding down and
+    rounding up are tried only if the nearest actions change the harm of the world by more than ``SLACK``. Returns the
+    rounded actions, [T, n, L], and how much the rounding changes the harm of each world, [n] m2/s2.
 
     Args:
         commanded: commands as float64 actions in [-1, 1], before rounding, [T, n, L].

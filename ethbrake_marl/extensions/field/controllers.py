@@ -88,7 +88,7 @@ class Seen(NamedTuple):
 
     @property
     def headway_s(self) -> Floats:
-        """Gap to the vehicle ahead divided by the own speed, [n] s; infinite if the own speed is not above 0."""
+        """Gap to the vehicle ahead / speed of this vehicle, [n] s; infinite if this vehicle's speed is not above 0."""
         return np.where(self.speed_mps > 0.0, self.gap_m / np.where(self.speed_mps > 0.0, self.speed_mps, 1.0), np.inf)
 
     def built_up(self, wanted_mps2: Floats, rate_mps3: float) -> Floats:

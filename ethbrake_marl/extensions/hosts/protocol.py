@@ -166,7 +166,7 @@ class Hosted(NamedTuple):
 
     @classmethod
     def join(cls, parts: list[Hosted]) -> Hosted:
-        """Join the results ``parts``, each for some worlds, into one result for all worlds, in the order of ``parts``."""
+        """Join the results ``parts`` of different worlds into one result for all worlds, in the order of ``parts``."""
         distrusted = [part.distrusted for part in parts if part.distrusted is not None]
         outcome = Outcome.join([part.outcome for part in parts])
         return cls(outcome, np.concatenate(distrusted) if distrusted else None)
@@ -176,7 +176,7 @@ def drive_host(host: Host, agent: Driver, scenario: str | Path | Scenario, world
     """Let an agent or a team drive the scenario's learners in a host, from the alert to the end of every episode.
 
     Args:
-        host: the host, whose vehicles are at the alert.
+        host: the host, in which all worlds must be at the alert.
         agent: agent or team that drives the learners, with or without a shield, for instance from ``make_agent``. The
             function does not change the agent.
         scenario: the scenario. The scenario's scripts drive all vehicles that do not learn; agents know these scripts.
@@ -597,7 +597,8 @@ class _Motion:
                 checked.
             change: [n, N] change of each vehicle's speed in the step if the vehicle follows its command exactly (m/s).
 
-        Returns the index of the world with the speed, and an error message; None if all speeds agree with the commands.
+        Returns the index of the world with the wrong speed, and an error message. Returns None if all speeds agree with
+        the commands.
 
         """
         began = self.led_mps + step.begin_mps - self.speeds_mps

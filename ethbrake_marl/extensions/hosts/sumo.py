@@ -1,4 +1,4 @@
-"""SUMO as a host. Each world is a straight road of one simulation, which runs in this process (libsumo)."""
+"""Use the traffic simulator SUMO as a host. Each world is a straight road of one simulation in this process."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ _SUMO_OPTIONS = (
 class SumoHost:
     """Host that runs worlds as parallel roads of one SUMO simulation. A process can run only one simulation at a time.
 
-    At the end of each step, every vehicle has the commanded speed. SUMO integrates the motion with its ballistic
-    method, and lets vehicles pass through one another. SUMO has no negative speeds, so a vehicle that should move
-    backwards after an impact stands still. The method ``close`` ends the simulation.
+    At the end of each step, every vehicle has exactly the speed that its command requires. SUMO integrates the motion
+    with its ballistic method, and lets vehicles pass through one another. SUMO has no negative speeds, so a vehicle
+    that should move backwards after an impact stands still. The method ``close`` ends the simulation.
 
     Args:
         worlds: the worlds at the alert.

@@ -39,7 +39,7 @@ class Link(NamedTuple):
 
 
 class Chains:
-    """Cuts the queues of vehicles in one recorded file into chains, and compares gaps and positions with the speeds.
+    """Cuts the queues of vehicles in a recording into chains, and checks that gaps and positions agree with speeds.
 
     Args:
         file: path of the file, for error messages.
@@ -111,8 +111,8 @@ class Chains:
             there: states of all vehicles at the moment.
             by_id: dictionary from the id of a vehicle to its state at the moment. If a vehicle is recorded twice, the
                 dictionary contains the state that is recorded first.
-            row: whether chains are formed at the moment. If False, the function does not count the data that it leaves
-                out, nor faulty data.
+            row: whether chains are formed at the moment. If ``row`` is False, the function counts neither the data that
+                it leaves out nor faulty data.
 
         """
         behind, in_lane = dict[float, Link](), dict[float, float]()  # in_lane: vehicle -> vehicle ahead in the lane

@@ -24,8 +24,8 @@ SLOWEST_MPS, LONGEST_S = 0.5, 60.0  # least speed and longest time gap of rows t
 def fit_rows(rows: Floats, draw: DataDraw) -> dict[str, Any]:
     """Return scenario keys with distributions of time gaps, of the line's mean speed, and of deviations from this mean.
 
-    Raises ``InvalidInput`` if fewer than ``QUANTILES`` chains have speeds of at least ``SLOWEST_MPS`` and time gaps
-    above 0 of at most ``LONGEST_S``.
+    Raises ``InvalidInput`` if fewer than ``QUANTILES`` chains have speeds of at least ``SLOWEST_MPS``, and time gaps
+    above 0 and at most ``LONGEST_S``.
 
     Args:
         rows: [k, 2 N - 1] gaps (m) and speeds (m/s) of k chains of N vehicles.

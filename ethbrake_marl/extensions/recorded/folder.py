@@ -101,9 +101,9 @@ def _search(folder: Path, entry: Format) -> tuple[dict[str, Path], list[str], li
     """Find the files of a format in a folder and its subfolders by their names.
 
     Returns a dictionary from printable paths to files, the errors for subfolders that cannot be read, and the names of
-    files that are left out because they repeat another file. A link to another file or a copy of another file repeats
-    the other file. A text file without a header repeats a CSV file of the same name in the same folder. Files and
-    folders whose names begin with a dot are ignored, and links to folders are not followed.
+    files that are left out because they repeat another file. Copies of a file and links to a file repeat this file. A
+    text file without a header repeats a CSV file of the same name in the same folder. Files and folders whose names
+    begin with a dot are ignored, and links to folders are not followed.
     """
     if folder.is_file():
         return {plain_text(folder.name): folder}, [], []
@@ -135,7 +135,7 @@ def _size(file: Path) -> int:
 
 
 def _content(file: Path) -> object:
-    """Return a hash, which is equal for files with the same content; if the file is unreadable, its real path."""
+    """Return a hash of the content of ``file``, or, if the file cannot be read, its path after following links."""
     try:
         with open_plain(file, LARGEST_BYTES) as stream:
             return hashlib.file_digest(stream, "sha256").digest()

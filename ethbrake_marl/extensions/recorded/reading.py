@@ -82,7 +82,7 @@ def read_pieces(
 ) -> Iterator[Piece]:
     """Yield the numbers in the columns ``columns`` of a file, with up to ``PIECE`` rows at a time.
 
-    All numbers are finite, with one exception: if the format has gaps instead of positions, an empty cell gives NaN.
+    All numbers are finite, with one exception: if the format has gaps instead of positions, empty cells become NaN.
 
     Args:
         file: path of the file.
@@ -123,7 +123,7 @@ def _is_parquet(file: Path) -> bool:
 def _numbers(
     file: Path, rows: Iterable[_Row], shown: Sequence[str], readers: Sequence[tuple[int, Callable[[str], float]]]
 ) -> Iterator[tuple[int, list[float]]]:
-    """Yield, for each row, the number of its line and the numbers in those of its cells that ``readers`` names.
+    """Yield, for each row, its line number and the numbers in the cells that ``readers`` selects.
 
     ``readers`` contains, for each cell to read, the index of the cell and the function that converts the text of the
     cell to a number.
@@ -195,7 +195,7 @@ def _text(text: TextIOWrapper, file: Path, entry: Format, columns: Sequence[str]
 
 
 def _rows(file: Path, lines: Iterator[tuple[int, str]], separator: str, streets: Sequence[str]) -> Iterator[_Row]:
-    """Yield the line number and the cells of each line that is not blank and contains no text of ``streets``."""
+    """Yield the line number and the cells of each line that is not blank and contains none of the texts ``streets``."""
     elsewhere = seen = 0
     for number, line in lines:
         if streets and any(street in line for street in streets):
@@ -241,7 +241,7 @@ def _measured(cell: str) -> float:
 
 
 def _number_of(names: dict[str, float], cell: str) -> float:
-    """Return the number that stands in ``names`` for the name in ``cell``; a new name gets the next number (1, 2, ...).
+    """Return the number of the name in ``cell`` from the dictionary ``names``; a new name gets the next whole number.
 
     Raises ``ValueError`` for an empty name.
     """
@@ -253,7 +253,7 @@ def _number_of(names: dict[str, float], cell: str) -> float:
 def _match(file: Path, columns: Sequence[str], shown: Sequence[str]) -> tuple[list[int], list[str]]:
     """Find columns of a file by name; return the indices of these columns, and the names of the missing columns.
 
-    If a name stands for numbered columns (Speed1, Speed2, ...), the indices are in the order of the columns' numbers.
+    If a name matches numbered columns (Speed1, Speed2, ...), the indices are in the order of the columns' numbers.
 
     Raises ``InvalidInput`` if two columns of the file have the same name.
 

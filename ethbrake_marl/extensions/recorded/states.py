@@ -104,7 +104,7 @@ def keep_states(
 
 
 def moments(store: sqlite3.Connection) -> Iterator[tuple[float, list[Any]]]:
-    """Yield each moment in the table ``state``, in order of time: its tick, and all states in the order of the file."""
+    """Yield (tick, states) for each moment in the table ``state``, in order of time; states have the file's order."""
     for tick, rows in groupby(store.execute("SELECT * FROM state ORDER BY tick, line"), itemgetter(0)):
         yield tick, [State(*row) for row in rows]
 
