@@ -1,9 +1,9 @@
 """Equilibria of several learners: each learner in turn improves its own commands, until no learner can improve.
 
 A *profile* is the sequence of a learner's commands in a whole episode. The profile is fixed at the alert (open loop),
-so no learner reacts to what the others do. The learners know the whole world. One learner after the other searches the
-profile that is best for its objective while the other learners keep their profiles. The search ends if no learner
-finds a better profile.
+so no learner reacts to what the other learners do. The learners know the whole world. One learner after the other
+searches for the profile that is best for its own objective while the other learners keep their profiles. The search
+ends if no learner finds a better profile.
 """
 
 from __future__ import annotations
@@ -89,10 +89,11 @@ class _Game(NamedTuple):
         return problem.values(self.together(own))[self.task.harm_count]
 
     def response(self, c: int, own: list[Profiles], effort: Mapping[str, int]) -> Profiles:
-        """Search the best profile of learner number ``c`` (from 0) if the other learners follow the profiles ``own``.
+        """Search for the best profile of learner ``c`` (from 0) if the other learners follow the profiles ``own``.
 
-        ``effort`` contains keyword arguments of ``search_profiles``. The search for one learner may compute the harm of
-        a profile slightly differently than the search problem ``joint`` of all learners, because of rounding.
+        ``effort`` contains keyword arguments of ``search_profiles``, such as ``budget``. Because of rounding, the
+        search for one learner may compute a slightly different harm of a profile than ``joint``, the search problem of
+        all learners.
         """
         task, others = replace(self.task, vehicles=self.task.vehicles[c : c + 1]), self.others
         problem = profile_problem(
@@ -135,8 +136,8 @@ def find_equilibria(
 ) -> dict[str, Equilibrium]:
     """Search equilibria of the scenario's learners by alternating best responses, once from each start in ``STARTS``.
 
-    In every round, each learner searches a better profile, and changes its profile if the new one is better by more
-    than ``tolerance``. If no learner changes its profile in a round, the result is an approximate equilibrium of
+    In every round, each learner searches for a better profile, and changes its profile if the gain is larger than
+    ``tolerance``. If no learner changes its profile in a round, the result is an approximate equilibrium of
     open-loop profiles. The equilibrium is only approximate because a search tries only ``budget`` candidate profiles.
     A world may have further equilibria. The result for a world does not depend on the other worlds or on ``threads``.
 
