@@ -204,7 +204,7 @@ class LineTask(TaskClass):  # type: ignore[misc]
 
     @staticmethod
     def env_name() -> str:
-        """Return the name of this group of tasks in BenchMARL."""
+        """Return ``ethbrake``, the first part of the names of these tasks in BenchMARL."""
         return "ethbrake"
 
 

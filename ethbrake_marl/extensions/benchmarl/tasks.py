@@ -1,8 +1,8 @@
 """Register every shipped scenario that has a learner as a BenchMARL task (needs the extra ``marl``).
 
 The command ``python -m ethbrake_marl.extensions.benchmarl.tasks algorithm=mappo task=ethbrake/paper_random`` registers
-these tasks and then runs BenchMARL's own command line, which also accepts Hydra overrides. This is necessary because
-BenchMARL searches tasks only in its own folder.
+these tasks and then runs BenchMARL's own command line, which also accepts Hydra overrides. BenchMARL alone does not
+find these tasks, because it searches only its own folder.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
 
 
 class _Scenarios(Task):  # type: ignore[misc]  # Task has no types if the extra is not installed
-    """The tasks as an enumeration, as BenchMARL needs it: one task for each shipped scenario with a learner."""
+    """Enumeration of the tasks for BenchMARL: one task for each shipped scenario with a learner."""
 
     @staticmethod
     def associated_class() -> type[LineTask]:
@@ -26,7 +26,7 @@ class _Scenarios(Task):  # type: ignore[misc]  # Task has no types if the extra 
         return LineTask
 
     def get_from_yaml(self, path: str | None = None) -> LineTask:
-        """Return the task for the scenario file ``path``; if ``path`` is None, for the shipped scenario of this task.
+        """Return a task for the scenario file ``path``, or, if ``path`` is None, for the shipped scenario of this task.
 
         The reward of the task is minus the harm, and there is no shield.
         """

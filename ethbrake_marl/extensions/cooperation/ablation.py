@@ -1,4 +1,4 @@
-"""Run an ablation (train and compare policies at several levels of cooperation), and estimate the time it takes."""
+"""Run an ablation (train and compare policies at several levels of cooperation), and estimate how long this takes."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def run_ablation(
 
     Args:
         plan: settings of the ablation.
-        jobs: number of training runs at the same time, and of threads in the search for the joint optima.
-        machine: description of this machine, which is stored with the results.
+        jobs: number of training runs that run at the same time, and number of threads in the search for joint optima.
+        machine: description of the computer on which the ablation runs; it is stored with the results.
         tell: function that is called with each progress report; None: progress is not reported.
 
     Returns the content of ``ablation.json``, and the paths of the page, the Markdown file and the figures. Returns None
@@ -85,8 +85,8 @@ def ablation_cost(plan: Plan) -> Cost:
     """Estimate the time that an ablation still needs, as processor time of one core.
 
     The function measures the time of a short training run for each level and recipe, of a short evaluation, and of a
-    short search for the joint optimum. In a sweep, the function measures these times for one level only, because all
-    levels of a sweep take about the same time.
+    short search for the joint optimum. In a sweep, the function measures the time of one level only, because all levels
+    of a sweep take about the same time.
 
     Raises the exceptions of ``TrainingJob.steps_left``. Raises the exceptions of ``load_team`` if the policies of a
     finished training run cannot be loaded.

@@ -69,8 +69,9 @@ def ablate_command(
 ) -> None:
     """Compare several levels of cooperation in the same worlds.
 
-    The command first prints how long it will take. Then it trains and compares, and writes ablation.html, ablation.md,
-    ablation.csv, ablation.json and three figures. After an interruption, repeat the command to continue.
+    The command first prints an estimate of its running time. The command then trains policies at all levels, compares
+    the levels, and writes ablation.html, ablation.md, ablation.csv, ablation.json and three figures. After an
+    interruption, repeat the command to continue.
 
     With --sweep, the levels are copies of one scenario in which one key has different values. The command then draws
     two figures, with the values of this key on the x axis and the harm on the y axis.

@@ -36,8 +36,8 @@ def compare(measured: Sequence[Measured], searched: int) -> Json:
 
     Args:
         measured: result of ``measure``.
-        searched: the joint optimum was searched in this number of worlds, counted from the first. Only these worlds
-            count in comparisons with the joint optimum.
+        searched: number of worlds in which the joint optimum was searched: the first worlds of the list. Comparisons
+            with the joint optimum use only the first ``searched`` worlds.
 
     """
     algorithms = [m.algorithm for m in measured if m.algorithm is not None]
@@ -68,10 +68,10 @@ def _undertrained(measured: Sequence[Measured]) -> list[str]:
 
 
 def _level(one: Measured, searched: int) -> Json:
-    """Return the results of one level with one algorithm: harm (m2/s2) in all worlds, and in the searched worlds.
+    """Return the results of one level with one algorithm: mean harm (m2/s2) in all worlds and in the searched worlds.
 
-    The searched worlds are the first ``searched`` worlds. The result also has the joint optimum in the searched worlds,
-    and the share of the possible reduction.
+    The searched worlds are the first ``searched`` worlds. The result also contains the mean joint optimum and the share
+    of the possible reduction, both for the searched worlds.
     """
     scenario = one.level.scenario
     of_searched = None if one.clusters is None else one.clusters[:searched]
@@ -125,7 +125,8 @@ def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: 
         one: results of the level without a shield.
         shielded: results of the same policies in the same worlds, with a shield that bounds the harm ``harm_count``.
         harm_count: impacts that count as harm: the first impact of each pair (``first``), or all (``total``).
-        searched: the result contains, under the key ``searched``, the mean harm over the first ``searched`` worlds.
+        searched: number of worlds in which the joint optimum was searched; the result also contains the mean harm over
+            the first ``searched`` worlds.
 
     """
     before, after = one.reached.vehicle[harm_count], shielded.vehicle_harm
@@ -150,11 +151,11 @@ def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: 
 
 
 def _change(before: Measured, after: Measured, algorithm: str) -> Json:
-    """Return the change of harm from level ``before`` to level ``after`` in the same worlds; positive: more harm.
+    """Return (harm at level ``after``) - (harm at level ``before``), averaged over the same worlds.
 
     The result has the form ``{"from": name, "to": name, "algorithm": name, "first": changes, "total": changes}``. For
-    each count of harm, ``changes`` has the change for the whole line and for each vehicle. ``algorithm`` is the name of
-    the training algorithm, which is stored in the result.
+    each count of harm, ``changes`` contains the change of harm of the whole line and of each vehicle. ``algorithm`` is
+    the name of the training algorithm, which is stored in the result.
     """
     entry: Json = {"from": before.level.name, "to": after.level.name, "algorithm": algorithm}
     if before.level.swept is not None and after.level.swept is not None:

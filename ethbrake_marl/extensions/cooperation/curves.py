@@ -36,7 +36,7 @@ def swept_axis(results: Json) -> str | None:
 
 
 def sweep_figures(results: Json, caption: str) -> list[Figure]:
-    """Return the two figures of a sweep, with the values of the varied key on a linear x axis, and with 95 % intervals.
+    """Return the two figures of a sweep, with swept values on a linear x axis, and with 95 % confidence intervals.
 
     Args:
         results: content of ``ablation.json``.
@@ -47,7 +47,7 @@ def sweep_figures(results: Json, caption: str) -> list[Figure]:
 
 
 def _harm_curves(results: Json, caption: str) -> Figure:
-    """Draw mean harm against the value of the varied key, with full braking and the joint optimum for comparison.
+    """Draw the mean harm of the trained policies, of full braking and of the joint optimum at each swept value.
 
     All means are over the worlds in which the joint optimum was searched.
     """
@@ -98,7 +98,7 @@ def _who_bears(results: Json, caption: str) -> Figure:
 
 
 def algorithms(results: Json) -> list[str]:
-    """Return the name of each training algorithm once."""
+    """Return the names of the training algorithms, without repetitions."""
     return list(dict.fromkeys(level["algorithm"] for level in results["levels"] if level["algorithm"] is not None))
 
 
@@ -109,9 +109,9 @@ def with_intervals(
 
     Args:
         axes: axes to draw on.
-        at: position of each mark.
+        at: position of each mark on the axis that does not show the values.
         estimates: value and confidence interval of each mark.
-        upright: if True, the y axis shows the values and the x axis the positions ``at``; if False, the reverse.
+        upright: if True, the y axis shows the values; if False, the x axis shows the values.
         style: further arguments of matplotlib's ``errorbar``.
 
     """
@@ -136,7 +136,7 @@ def _curve(
     shade: bool = False,
     **style: Any,
 ) -> None:
-    """Draw estimates for each value of the varied key; intervals are whiskers, or a band if ``shade`` is true."""
+    """Draw an estimate for each swept value, with its confidence interval as whiskers, or as a band if ``shade``."""
     at = _places(levels, beside)
     if not shade:
         with_intervals(axes, at, estimates, **style)
@@ -147,13 +147,16 @@ def _curve(
 
 
 def _places(levels: Sequence[Json], beside: int) -> list[float]:
-    """Return the x position of each level: the number in its value, moved right by ``beside`` small steps."""
+    """Return the x position of each level's mark: the varied key's value, moved right by ``beside`` small distances.
+
+    The small distance is ``_BESIDE`` times the length of the axis.
+    """
     low, high = _span(levels)
     return [level["swept_number"] + beside * _BESIDE * (high - low) for level in levels]
 
 
 def _span(levels: Sequence[Json]) -> tuple[float, float]:
-    """Return the smallest and the largest number on the x axis, which covers the numbers of all levels and 0."""
+    """Return the smallest and the largest number on the x axis, which covers 0 and the varied key's values."""
     numbers = [level["swept_number"] for level in levels]
     return min(*numbers, 0.0), max(*numbers, 0.0)
 
@@ -161,7 +164,7 @@ def _span(levels: Sequence[Json]) -> tuple[float, float]:
 def _number_axis(axes: Axes, results: Json) -> None:
     """Set range, ticks and label of the x axis, and let the y axis begin at 0.
 
-    The x axis has ticks at 0 and at the number of each level, unless the labels of these ticks would overlap.
+    The x axis has ticks at 0 and at each swept value, unless the labels of these ticks would overlap.
     """
     numbers = sorted({0.0, *(level["swept_number"] for level in results["levels"])})
     low, high = _span(results["levels"])

@@ -1,9 +1,9 @@
-"""Equilibria of several learners: each learner in turn improves its own commands, until none can.
+"""Equilibria of several learners: each learner in turn improves its own commands, until no learner can improve.
 
 A *profile* is the sequence of a learner's commands in a whole episode. The profile is fixed at the alert (open loop),
-so no learner reacts to what the others do. The learners know the whole world. One learner after the other searches the
-profile that is best for its objective while the other learners keep their profiles. The search ends if no learner
-improves any more.
+so no learner reacts to what the other learners do. The learners know the whole world. One learner after the other
+searches for the profile that is best for its own objective while the other learners keep their profiles. The search
+ends if no learner finds a better profile.
 """
 
 from __future__ import annotations
@@ -75,21 +75,25 @@ class _Game(NamedTuple):
         return self._replace(worlds=self.worlds.take(rows), joint=self.joint.take(rows), others=self.others[rows])
 
     def together(self, own: list[Profiles]) -> Profiles:
-        """Join the profiles ``own`` of the single learners into one profile of all, with a phase for each decision."""
+        """Join the profiles ``own``, one for each learner, into one profile with the commands of all learners.
+
+        A phase of the result is the time from one decision to the next.
+        """
         steps = np.arange(int(self.joint.last_step.max()))
         at = [np.concatenate([each.at(np.full(self.joint.n, step)) for each in own], axis=1) for step in steps]
         return Profiles(np.minimum(steps + 1, self.joint.last_step[:, np.newaxis]), np.stack(at, axis=1))
 
     def amount(self, c: int, own: list[Profiles]) -> Floats:
-        """Return the objective of learner number ``c``, [n] m2/s2, if all learners follow their profiles in ``own``."""
+        """Return the objective of learner ``c`` (from 0), [n] m2/s2, if all learners follow the profiles ``own``."""
         problem = minimising(self.joint, self.worlds, self.declared, self.task.vehicles[c : c + 1])
         return problem.values(self.together(own))[self.task.harm_count]
 
     def response(self, c: int, own: list[Profiles], effort: Mapping[str, int]) -> Profiles:
-        """Search the best profile of learner number ``c`` while the other learners follow their profiles in ``own``.
+        """Search for the best profile of learner ``c`` (from 0) if the other learners follow the profiles ``own``.
 
-        ``effort`` contains keyword arguments of ``search_profiles``. Because of rounding, this search may compute a
-        slightly different harm than the search problem ``joint`` of all learners.
+        ``effort`` contains keyword arguments of ``search_profiles``, such as ``budget``. Because of rounding, the
+        search for one learner may compute a slightly different harm of a profile than ``joint``, the search problem of
+        all learners.
         """
         task, others = replace(self.task, vehicles=self.task.vehicles[c : c + 1]), self.others
         problem = profile_problem(
@@ -102,7 +106,7 @@ class _Game(NamedTuple):
         return search_profiles(problem, joined(starts, problem.n), **effort)[0]
 
     def _following(self, c: int, own: list[Profiles]) -> Vehicles:
-        """Return vehicle parameters with which all learners except number ``c`` follow their profiles in ``own``."""
+        """Return vehicle parameters with which all learners but number ``c`` (from 0) follow the profiles ``own``."""
         vehicles, clock, old = self.worlds.vehicles, self.joint.clock, self.worlds.vehicles.pieces
         count = old.shape[2] // 2
         pieces = np.full((*old.shape[:2], 2, max(count, MOST_PHASES)), np.inf)
@@ -132,10 +136,10 @@ def find_equilibria(
 ) -> dict[str, Equilibrium]:
     """Search equilibria of the scenario's learners by alternating best responses, once from each start in ``STARTS``.
 
-    In every round, each learner searches a better profile, and changes its profile if the new one is better by more
-    than ``tolerance``. If no learner changes its profile in a round, the result is an approximate equilibrium of
+    In every round, each learner searches for a better profile, and changes its profile if the gain is larger than
+    ``tolerance``. If no learner changes its profile in a round, the result is an approximate equilibrium of
     open-loop profiles. The equilibrium is only approximate because a search tries only ``budget`` candidate profiles.
-    Other equilibria may exist. The result for a world does not depend on the other worlds or on ``threads``.
+    A world may have further equilibria. The result for a world does not depend on the other worlds or on ``threads``.
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.extensions.cooperation import compare_starts, find_equilibria
@@ -188,7 +192,7 @@ def find_equilibria(
 
 
 def _settle(game: _Game, own: list[Profiles], rounds: int, tolerance: float, effort: Mapping[str, int]) -> Equilibrium:
-    """Let the learners search in turns, from the profiles ``own``, until none gains more than ``tolerance``."""
+    """Let the learners improve the profiles ``own`` in turn, until no learner gains more than ``tolerance`` (m2/s2)."""
     active, taken = np.arange(game.joint.n), np.zeros(game.joint.n, np.int64)
     for turn in range(rounds):
         part, mine = game.take(active), [each.take(active) for each in own]
@@ -214,8 +218,8 @@ def compare_starts(ends: Mapping[str, Equilibrium], harm_count: HarmCount, toler
 
     Args:
         ends: result of ``find_equilibria``.
-        harm_count: count of harm to compare, ``first`` or ``total``.
-        tolerance: two equilibria count as different if the harm of some vehicle differs by more than this (m2/s2).
+        harm_count: which harm to compare, first-impact harm (``first``) or total harm (``total``).
+        tolerance: two equilibria count as equal if the harm of each vehicle differs by at most ``tolerance`` (m2/s2).
 
     """
     converged = np.stack([each.converged for each in ends.values()])
@@ -239,16 +243,16 @@ def best_joint_harm(
     """Return the harm of each vehicle in the joint optimum, as a mapping: count of harm -> [n, N] harm (m2/s2).
 
     The joint optimum is the least known harm of the line that the learners can achieve together. In each world, the
-    function takes the best of the equilibria ``ends`` and of the result of ``best_harm``, which searches the commands
-    of all learners together.
+    joint optimum is the result with the least harm among the equilibria ``ends`` and the result of ``best_harm``, which
+    searches the commands of all learners together.
 
     Args:
         scenario: scenario of the worlds.
         worlds: the n worlds at the alert.
-        ends: equilibria of the same learners in the same worlds, for any objectives.
+        ends: equilibria of the scenario's learners in ``worlds``; the learners may have had any objectives.
         harm_count: impacts that count as harm in the search: ``first`` (first impact of each pair), or ``total`` (all).
         budget: number of candidate profiles that ``best_harm`` tries per world.
-        seed: seed of ``best_harm``.
+        seed: seed of the random numbers in ``best_harm``.
         threads: number of threads of ``best_harm``.
 
     """
@@ -263,7 +267,7 @@ def best_joint_harm(
 
 
 def price_of_anarchy(borne: Floats, optimum: Floats) -> Estimate | None:
-    """Return (mean harm of the line in equilibrium) / (mean harm of the line in the joint optimum), with its interval.
+    """Return (line's mean harm in equilibrium) / (line's mean harm in the joint optimum) and its confidence interval.
 
     If ``borne`` is ``Spread.worst``, this ratio is called the price of anarchy; if ``borne`` is ``Spread.best``, the
     price of stability. The function returns None if the harm of the joint optimum is 0 in every world.

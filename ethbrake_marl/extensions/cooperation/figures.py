@@ -1,4 +1,4 @@
-"""Figures of an ablation: harm at each level, change of harm from level to level, and this change for each vehicle."""
+"""Figures of an ablation: harm at each level, and change of harm from level to level, also for each vehicle alone."""
 
 from __future__ import annotations
 
@@ -41,8 +41,9 @@ _BESIDE = 0.42  # distance at which a level with a worse channel is drawn to the
 def ablation_figures(results: Json, caption: str) -> list[Figure]:
     """Return the three figures of an ablation, or the two figures of a sweep (``sweep_figures``).
 
-    The three figures show the harm at each level, the change of harm from level to level, and this change for each
-    vehicle. Red text above a figure names the levels whose trained policies do worse than full braking.
+    The three figures show the line's harm at each level, the change of the line's harm from level to level, and the
+    change of each vehicle's harm. Red text above a figure names the levels whose trained policies do worse than full
+    braking.
 
     Args:
         results: content of ``ablation.json``.
@@ -65,9 +66,9 @@ def ablation_figures(results: Json, caption: str) -> list[Figure]:
 
 
 def _harm_curve(results: Json, caption: str) -> Figure:
-    """Draw first-impact and total harm at each level, with full braking and the joint optimum for comparison.
+    """Draw the mean harm of the trained policies, of full braking and of the joint optimum at each level.
 
-    All harms are means over the worlds in which the joint optimum was searched.
+    All means are over the worlds in which the joint optimum was searched.
     """
     figure, panels = new_panels((10.5, 4.8), columns=2)
     ladder = list(dict.fromkeys(level["level"] for level in results["levels"] if level["clear"] is None))
@@ -97,7 +98,8 @@ def _harm_curve(results: Json, caption: str) -> Figure:
 def _change_figure(results: Json, caption: str) -> Figure:
     """Draw the change of harm from level to level and from each level to its copies with a worse V2X channel.
 
-    Whiskers show 95 % intervals. A mark to the left of 0 means that the later level has less harm.
+    Whiskers show 95 % confidence intervals. A mark to the left of 0 means less harm at the level that the label names
+    last.
     """
     changes = results["steps"] + results["channels"]
     figure, panels = new_panels((10.5, max(_LEAST_IN, 1.6 + 0.6 * len(changes))), columns=2, sharey=True)
@@ -183,7 +185,7 @@ def _reached(
         axes: axes to draw on.
         levels: results of all levels, from ``ablation.json``.
         ladder: names of the levels from left to right.
-        harm_count: count of harm to draw, ``first`` or ``total``.
+        harm_count: which harm to draw, first-impact harm (``first``) or total harm (``total``).
         algorithm: name of the training algorithm.
         number: index of the training algorithm, which determines the colour and the offset of its marks.
 

@@ -54,9 +54,10 @@ class LevelOptimum:
 
 
 def questions(plan: Plan, samples: Sequence[Sample]) -> list[tuple[Level, Sample, list[Level]]]:
-    """Return the searches for joint optima that an ablation needs, each as (first level, worlds, all levels).
+    """Return the searches for joint optima that an ablation needs, each as (level, worlds to search, list of levels).
 
-    Levels with the same search problem share one search. Levels without learners need no search.
+    Levels with the same search problem share one search: the list contains all of them, and ``level`` is the first of
+    them. Levels without learners need no search.
 
     Args:
         plan: settings of the ablation.
@@ -108,8 +109,8 @@ def best_known(own: LevelOptimum, answers: Sequence[LevelOptimum]) -> dict[HarmC
 
     Args:
         own: the level, with the result of its search and its trained teams.
-        answers: all levels, including ``own``, with their search results and teams. In a world in which the learners of
-            ``own`` can give the same commands as the learners of another level, the results of that level count, too.
+        answers: all levels, including ``own``, with their search results and teams. The function uses the results of
+            another level in the worlds in which the learners of ``own`` can give the commands of that level's learners.
 
     """
     best = {harm_count: np.full(own.worlds.n, np.inf) for harm_count in HARM_COUNTS}
@@ -125,10 +126,10 @@ def best_known(own: LevelOptimum, answers: Sequence[LevelOptimum]) -> dict[HarmC
 def _can_imitate(own: LevelOptimum, other: LevelOptimum) -> Bools:
     """Return for each world, [n] bool, whether learners of ``own`` can give the commands of the learners of ``other``.
 
-    They can do this if five conditions are met: each learner of ``other`` is also a learner in ``own``; each scripted
-    vehicle of ``own`` has the same script in ``other``; the lines of vehicles are the same; the latencies are equal;
-    and each decision time of ``other`` is also a decision time of ``own``. It does not matter if only ``own`` has an
-    obstacle on the road, because ``_harms`` simulates the commands of ``other`` again with this obstacle.
+    The result is True in a world if five conditions are met: each learner of ``other`` is also a learner in ``own``;
+    each scripted vehicle of ``own`` has the same script in ``other``; the lines of vehicles are the same; the latencies
+    are equal; and each decision time of ``other`` is also a decision time of ``own``. The result may be True if only
+    ``own`` has an obstacle on the road, because ``_harms`` simulates the commands of ``other`` with this obstacle.
     """
     mine, theirs = own.level.scenario, other.level.scenario
     same_scripts = all(theirs.scripts.get(i) == script for i, script in mine.scripts.items())
@@ -145,9 +146,10 @@ def _can_imitate(own: LevelOptimum, other: LevelOptimum) -> Bools:
 
 
 def _harms(own: LevelOptimum, other: LevelOptimum, rows: Ints) -> Iterator[dict[HarmCount, Floats]]:
-    """Yield the harm that the search results and the teams of level ``other`` cause in the worlds ``rows`` of ``own``.
+    """Yield the harm in the worlds ``rows`` of level ``own`` if its learners give commands from level ``other``.
 
-    Each search result and each team yields one mapping: count of harm -> [rows] harm (m2/s2).
+    The function yields one mapping (count of harm -> [rows] harm in m2/s2) for each search result and for each team of
+    ``other``.
     """
     scenario, task = other.level.scenario, Task(other.level.scenario, other.level.scenario.learners)
     worlds = replace(other.worlds, obstacle_gap_m=own.worlds.obstacle_gap_m).take(rows)
@@ -162,7 +164,10 @@ def _harms(own: LevelOptimum, other: LevelOptimum, rows: Ints) -> Iterator[dict[
 
 @dataclass(frozen=True, slots=True)
 class Harms:
-    """Harm of all training runs (seeds) of one level in the same worlds; a level without learners has one seed."""
+    """Harm in the same worlds with the policies of each training run (seed) of one level.
+
+    A level without learners counts as one training run.
+    """
 
     world: dict[HarmCount, Floats]  # count of harm -> [seeds, worlds] harm of the whole line (m2/s2)
     vehicle: dict[HarmCount, Floats]  # count of harm -> [seeds, worlds, N] harm of each vehicle (m2/s2)
@@ -172,7 +177,7 @@ class Harms:
 
 
 class Goal(NamedTuple):
-    """Quantity that the training at a level minimises, with its mean for the trained policies and for full braking."""
+    """Quantity that the training at a level minimises: its mean with the trained policies, and with full braking."""
 
     name: str  # name of the quantity: ``objective``, ``first-impact harm`` or ``total harm``
     reached: float  # mean over seeds, worlds and learners with the trained policies
@@ -180,10 +185,10 @@ class Goal(NamedTuple):
 
     @classmethod
     def of(cls, training: Training, reached: Harms, full_brake: Harms) -> Goal:
-        """Return the quantity that a training run minimises, with its mean for the policies and for full braking.
+        """Return the quantity that a training run minimises: its mean with the trained policies and with full braking.
 
-        If the recipe or the scenario has objectives, the quantity is the learners' objective. If neither has one, the
-        quantity is the harm of the whole line.
+        If the recipe or the scenario has objectives, the quantity is the learners' objective. If neither the recipe nor
+        the scenario has objectives, the quantity is the harm of the whole line.
 
         Args:
             training: one training run at the level.
@@ -204,7 +209,7 @@ class Goal(NamedTuple):
 
     @property
     def missed(self) -> bool:
-        """Whether the trained policies do worse on average than full braking of all vehicles."""
+        """Whether the mean of the quantity is larger, so worse, with the trained policies than with full braking."""
         return self.reached > self.full_brake + TOLERANCE
 
 
@@ -228,8 +233,8 @@ class Measured:
 def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[Measured]:
     """Evaluate the trained policies of all levels in the same worlds, and search the joint optimum of each level.
 
-    Results of earlier searches are reused. If a policy causes less harm in a world than the best commands of the
-    search, the policy's harm is the joint optimum of this world.
+    Results of earlier searches are reused. If a trained policy does less harm in a world than the best commands of the
+    search, the joint optimum of this world is the policy's harm.
 
     Args:
         plan: settings of the ablation. All training runs of the ablation must be finished.
@@ -237,8 +242,8 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
         tell: function that is called with each progress report; None: progress is not reported.
 
     Returns one result for each level and algorithm: levels in the order of ``plan.levels``, and for each level the
-    algorithms in the order of ``plan.algorithms``. Before it evaluates or searches, the function raises the exceptions
-    of ``load_team`` and ``common_worlds``.
+    algorithms in the order of ``plan.algorithms``. Raises the exceptions of ``load_team`` and ``common_worlds`` before
+    the evaluation and the search begin.
 
     """
     say = tell or (lambda progress: None)
@@ -288,7 +293,7 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
 def _drive(scenario: Scenario, sample: Sample, drivers: Sequence[Driver], tell: OnProgress) -> Harms:
     """Let each of the agents or teams ``drivers`` drive in the same worlds; return their harm.
 
-    In the result, each agent or team counts as one training seed.
+    In the arrays [seeds, worlds] of the result, each agent or team has one row, as if it were one training seed.
     """
     outcomes = []
     for driver in drivers:

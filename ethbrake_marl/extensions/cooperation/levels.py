@@ -69,7 +69,7 @@ class Level:
 
     @property
     def name(self) -> str:
-        """Name of the scenario; in a sweep with the value of the key, such as ``cooperation-3-pair-social-15``."""
+        """Name of the scenario; in a sweep followed by the swept value, such as ``cooperation-3-pair-social-15``."""
         return self.scenario.name if self.swept is None else f"{self.scenario.name}-{self.swept.label}"
 
     @property
@@ -79,7 +79,7 @@ class Level:
 
     @property
     def columns(self) -> Json:
-        """Columns on the key and value of a sweep, for tables of results; an empty dictionary without a sweep."""
+        """Columns of result tables for the swept key and its value; an empty dictionary if there is no sweep."""
         return {} if self.swept is None else self.swept.columns
 
 
@@ -87,14 +87,15 @@ def read_levels(names: Sequence[str], settings: Sequence[Override] = ()) -> list
     """Load the levels of an ablation.
 
     A level that differs from an earlier level only in ``v2x`` is compared with this earlier level (``Level.clear``).
-    All other levels form the *ladder*, in which each level is compared with the previous one.
+    The levels without such an earlier level form the *ladder*: a sequence in which each level is compared with the
+    previous level.
 
     Args:
         names: names or paths of scenarios, in the order of the comparison.
         settings: settings ``KEY=VALUE`` that replace values in every scenario.
 
-    Raises ``InvalidInput`` if there are fewer than two levels or if a level is repeated. Also raises the exceptions of
-    ``load_runnable``.
+    Raises ``InvalidInput`` if there are fewer than two levels or if a level is repeated. Raises the exceptions of
+    ``load_runnable`` if a scenario cannot be loaded.
 
     """
     levels: list[Level] = []
@@ -126,8 +127,8 @@ def sweep_levels(name: str, sweep: str, settings: Sequence[Override], recipes: S
         recipes: training recipes of the ablation.
 
     Raises ``InvalidInput`` if the key of the sweep is not a key of a scenario; if ``settings`` or a recipe also set
-    this key; or if levels with different values of this key cannot be compared. Also raises the exceptions of
-    ``Swept.parse`` and ``load_runnable``.
+    this key; or if levels with different values of this key cannot be compared. Raises the exceptions of
+    ``Swept.parse`` for an invalid ``sweep``, and of ``load_runnable`` if the scenario cannot be loaded.
 
     """
     values = Swept.parse(sweep)
@@ -159,17 +160,17 @@ def sweep_levels(name: str, sweep: str, settings: Sequence[Override], recipes: S
 def common_worlds(levels: Sequence[Level], episodes: int, seed: int) -> list[Sample]:
     """Draw worlds for each level; world k has the same line of vehicles at all levels.
 
-    Two levels with different ``v2x`` may have different latencies. There may be an obstacle at some levels only. If a
-    sweep varies a key of the vehicles, world k is drawn with the same random numbers at all levels, but its vehicles
-    differ.
+    Two levels with different ``v2x`` may have different latencies. A level may have an obstacle that other levels do
+    not have. If a sweep varies a key of the vehicles, world k is drawn with the same random numbers at all levels, but
+    the vehicles of world k differ from level to level.
 
     Args:
         levels: the levels.
-        episodes: number of worlds.
-        seed: seed of the worlds.
+        episodes: number of worlds for each level.
+        seed: seed from which the worlds are drawn.
 
-    Raises ``InvalidInput`` if a quantity that must be the same at all levels differs. The message names the level and
-    the quantity.
+    Raises ``InvalidInput``, which names the level and the quantity, if a quantity differs that must be the same at all
+    levels.
 
     """
     samples = [level.scenario.sample(episodes, seed) for level in levels]
@@ -200,9 +201,9 @@ def _check_same(one: Level, first: Sample, other: Level, sample: Sample, names: 
 
 
 def _values(name: str, level: Level, sample: Sample) -> Floats:
-    """Return the quantity ``name``, such as ``gaps_m``, in the worlds of ``sample``, with one row per world.
+    """Return an array with one row per world: the quantity ``name``, such as ``gaps_m``, in the worlds of ``sample``.
 
-    If ``name`` is a key of the scenario, such as ``time_step_s``, the result has a single row.
+    If ``name`` is ``vehicles``, ``time_step_s`` or ``horizon_s``, the array has a single number: the scenario's value.
     """
     if name in _LINE:
         return np.array([getattr(level.scenario, name)], np.float64)
@@ -245,7 +246,7 @@ class Plan:
         return tuple(algorithm(recipe) for recipe in self.recipes)
 
     def trainings(self) -> Iterator[tuple[Level, str, TrainingJob]]:
-        """Yield all training runs as (level, name of the algorithm, training run), ordered by seed.
+        """Yield each training run of the ablation as (level, name of the algorithm, training run), ordered by seed.
 
         Levels without learners have no training runs.
         """
@@ -280,7 +281,7 @@ class Plan:
         }
 
     def study_folder(self) -> StudyFolder:
-        """Return the folder of the ablation, which raises an error if it contains results of other settings."""
+        """Return a ``StudyFolder`` for the ablation, which refuses a folder that contains results of other settings."""
         advice = f"give another folder (--output); to reuse its trained policies, give a copy without {SETTINGS}"
         written = (*FIGURES, *SWEEP_FIGURES, *(f"ablation.{ending}" for ending in ("html", "md", "csv", "json")))
         return StudyFolder(self.folder, "an ablation", self.settings(), record=SETTINGS, advice=advice, writes=written)
@@ -319,12 +320,12 @@ def plan_ablation(
         recipes: names or paths of recipes, separated by commas.
         settings: settings ``KEY=VALUE`` of scenarios and recipes; None: no settings.
         sweep: key of a scenario and its values, ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``; None: no sweep.
-        quick: whether to use few seeds, worlds and decisions if ``given`` does not say how many.
+        quick: if True, numbers that ``given`` does not contain, such as the number of seeds, get small defaults.
         tell: function that is called with a note if ``gamma`` and ``reward.shaping_discount`` of a recipe differ.
         given: further fields of ``Plan``, such as ``seeds``; a field that is None gets its default.
 
-    Raises ``InvalidInput`` for recipes with the same name, numbers below 1, an unknown shield, levels none of which has
-    a learner, and levels that cannot be trained or compared.
+    Raises ``InvalidInput`` if two recipes have the same name, if a number is below 1, if the shield is unknown, if no
+    level has a learner, or if levels cannot be trained or compared.
 
     """
     usual_names: tuple[str, ...] = (LADDER if quick else STANDARD) if sweep is None else (SWEPT,)

@@ -34,8 +34,9 @@ _MOST, _USUAL, _LEAST = 3, 2, 2  # number of example worlds with the largest, a 
 def choose_worlds(measured: Sequence[Measured]) -> list[Played]:
     """Choose worlds for the page by the decrease of total harm from the first to the last level.
 
-    Some of the chosen worlds have the largest decrease, some a median decrease, and some the least decrease, each with
-    the policies of the first seed. Copies of levels with a worse V2X channel are ignored.
+    Some of the chosen worlds have the largest decrease, some a median decrease, and some the least decrease. The
+    decrease is computed with the policies of the first seed. Levels that are copies of an earlier level with a worse
+    V2X channel are ignored.
     """
     ladder = [one for one in measured if one.level.clear is None]
     first, last = ladder[0], ladder[-1]
@@ -90,7 +91,7 @@ def levels_csv(measured: Sequence[Measured], searched: int) -> str:
     """Return CSV text with one row per level, algorithm and seed. Harms are means over all worlds (m2/s2).
 
     The columns ``searched_*`` are means over the first ``searched`` worlds, in which the joint optimum was searched.
-    The columns on the shield are empty if the teams were not evaluated with a shield.
+    The columns with results of the shield are empty if the teams were not evaluated with a shield.
     """
     return csv_text(_seed_row(one, seed, searched) for one in measured for seed in range(len(one.reached.collided)))
 
@@ -266,10 +267,10 @@ _Columns = list[tuple[Column | str, str]]
 def _sheet(rows: Sequence[Json], columns: _Columns) -> Sheet:
     """Return a table with values from ``ablation.json``.
 
-    If all rows are for the same algorithm, the table has no column with the name of the algorithm.
+    If all rows are results of the same algorithm, the table has no column with the name of the algorithm.
 
     Args:
-        rows: for each row of the table, a nested mapping with its values.
+        rows: for each row of the table, a nested mapping that contains the values of this row.
         columns: for each column, its heading and the path of its values in ``rows``; the path ``first harm`` means
             ``row["first"]["harm"]``.
 
@@ -288,7 +289,7 @@ def _sheet(rows: Sequence[Json], columns: _Columns) -> Sheet:
 
 
 def interval_words(seeds: int) -> str:
-    """Return a phrase for captions that says what the 95 % intervals cover: other worlds, or also other seeds."""
+    """Return a phrase for captions: whether the 95 % intervals allow for other worlds only, or also for other seeds."""
     if seeds == 1:
         return "95 % intervals for other worlds only: one seed says nothing about others"
     rough = f" (rough: {seeds} seeds)" if seeds < 3 else ""
@@ -305,7 +306,7 @@ def write_ablation(plan: Plan, measured: Sequence[Measured], machine: str) -> tu
     Args:
         plan: settings of the ablation.
         measured: result of ``measure``.
-        machine: description of this machine, which the page and ``ablation.json`` show.
+        machine: description of the computer on which the ablation ran, for the page and ``ablation.json``.
 
     Returns the content of ``ablation.json``, and the paths of the page, the Markdown file and the figures.
 

@@ -1,4 +1,4 @@
-"""Section of a run's report on several learners: who bears the harm, and how much each learner and messages help."""
+"""Section of a run's report on several learners: harm of each vehicle, benefit of each learner and of messages."""
 
 from __future__ import annotations
 
@@ -125,10 +125,10 @@ def _train_alone(experiment: Experiment, tell: OnProgress) -> dict[str, Team]:
 
 
 def _without_messages(experiment: Experiment, tell: OnProgress) -> tuple[list[Compared], str]:
-    """Train a team with sensors instead of messages; return comparisons with this team, and a sentence on them.
+    """Train a team with sensors instead of messages; return comparisons with this team, and a sentence about this team.
 
-    If the scenario has no messages or is a mixture, or if such a team cannot be trained, the list of comparisons is
-    empty, and the sentence says why.
+    If the scenario has no messages or is a mixture, or if a team with sensors cannot be trained, the list of
+    comparisons is empty, and the sentence says why there are no comparisons.
     """
     evaluation, scenario = experiment.evaluation, experiment.evaluation.scenario
     if scenario.members or scenario.v2x.channel.hears == "none":
@@ -163,11 +163,10 @@ def _without_messages(experiment: Experiment, tell: OnProgress) -> tuple[list[Co
 def _joint_optimum(
     experiment: Experiment, outcomes: Mapping[str, Outcome], tell: OnProgress
 ) -> tuple[list[Compared], str]:
-    """Search the joint optimum; return a list with one comparison, and a sentence on the search.
+    """Search the joint optimum; return a list with one comparison, and a sentence about the search.
 
-    The comparison is between the trained team and the joint optimum.
-
-    If the search is impossible, the list of comparisons is empty, and the sentence says why.
+    The comparison is between the trained team and the joint optimum. If the search is impossible, the list of
+    comparisons is empty, and the sentence says why the search is impossible.
     """
     evaluation = experiment.evaluation
     rows = np.arange(min(SEARCHED, evaluation.worlds.n))
@@ -207,7 +206,7 @@ def _train(experiment: Experiment, scenario: Scenario, folder: str, share: int, 
         experiment: the finished run, whose recipe is used.
         scenario: scenario to train in.
         folder: name of the folder for this training run, inside the folder of the finished run.
-        share: the number of decisions is the finished run's number of decisions divided by ``share``.
+        share: divisor: this training run makes (number of decisions of the finished run) / ``share`` decisions.
         tell: function that is called with each progress report.
 
     """
@@ -266,7 +265,8 @@ def _borne(outcomes: Mapping[str, Outcome], harm_count: HarmCount, evaluation: E
 def _added(experiment: Experiment) -> Sheet:
     """Return a table of the harm that each learner of the team prevents.
 
-    The harm that a learner prevents is (harm of the line if this learner brakes fully) - (harm with the whole team).
+    The harm that a learner prevents is (harm of the line if this learner brakes fully) - (harm of the line with the
+    whole team).
     """
     evaluation, scenario = experiment.evaluation, experiment.evaluation.scenario
     columns = [Column("Learner", "learner", text=True)]

@@ -29,11 +29,11 @@ class Swept(NamedTuple):
     def parse(cls, text: str) -> list[Swept]:
         """Read a sweep ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``; return its values in ascending order.
 
-        A word may precede the numbers, such as ``social:`` in ``objective=social:0..90:15``. A list separated by commas
-        may contain single numbers and ranges.
+        A word may precede the numbers, such as ``social:`` in ``objective=social:0..90:15``. After ``KEY=``, single
+        numbers and ranges may stand together, separated by commas.
 
-        Raises ``InvalidInput`` for a value that is not a number, for a range whose length is not a multiple of its
-        step, for a repeated number, and for fewer than 2 or more than ``MOST`` numbers.
+        Raises ``InvalidInput`` for a value that is not a number, for a range whose length HIGH - LOW is not a multiple
+        of its step, for a repeated number, and for fewer than 2 or more than ``MOST`` numbers.
         """
         key, equals, values = (part.strip() for part in text.partition("="))
         word = match.group(1) or "" if (match := _WORD.match(values)) else ""
@@ -65,12 +65,12 @@ class Swept(NamedTuple):
 
     @property
     def number(self) -> float:
-        """The number in the value of the key, such as 15 in ``social:15``; figures show it on the x axis."""
+        """The number in the value of the swept key, such as 15 in ``social:15``; figures show it on the x axis."""
         return float(self.text)
 
     @property
     def setting(self) -> str:
-        """Key and value as a setting ``KEY=VALUE``, such as ``objective=social:15``."""
+        """The swept key and this value as a setting ``KEY=VALUE``, such as ``objective=social:15``."""
         return f"{self.key}={self.word}{self.text}"
 
     @property
@@ -80,7 +80,7 @@ class Swept(NamedTuple):
 
     @property
     def same_lines(self) -> bool:
-        """Whether world k has the same vehicles and the same physics for every value of the key."""
+        """Whether world k has the same vehicles and the same physics for every value of the swept key."""
         return self.key.partition(".")[0] in ("objective", "obstacle_gap_m", "roles", "v2x")
 
     @property
@@ -90,5 +90,5 @@ class Swept(NamedTuple):
 
     @property
     def columns(self) -> dict[str, Any]:
-        """Columns that tables of results have in a sweep: key, value as text, and number in the value."""
+        """Columns of result tables for the swept key: the key, its value as text, and the number in this value."""
         return {"swept_key": self.key, "swept_value": f"{self.word}{self.text}", "swept_number": self.number}

@@ -1,7 +1,7 @@
 """Write recorded episodes as a Minari dataset or a Parquet file.
 
-A Minari dataset also contains the environment: ``dataset.recover_environment()`` returns it. In this environment, the
-recorded actions repeat the episodes bit for bit. To start in the world of an episode, call ``env.reset(seed=seed,
+A Minari dataset also contains the environment, which ``dataset.recover_environment()`` returns. In this environment,
+the recorded actions repeat the episodes bit for bit. To start in the world of an episode, call ``env.reset(seed=seed,
 options=options)`` with the ``seed`` and ``options`` in the metadata of the episode.
 """
 
@@ -95,7 +95,7 @@ def minari_folder(
         path: path of the folder, named ``NAME-vNUMBER``.
         task: scenario, seed, reward and observation of the recordings.
         told: metadata (result of ``tell``), which are stored in the dataset as JSON under the key ``ethbrake_marl``
-            when the ``with`` block ends. Inside the block, the caller may still add entries.
+            when the ``with`` block ends. The caller may add entries to ``told`` until the block ends.
         force: whether to replace an existing dataset.
 
     """
@@ -135,7 +135,7 @@ def minari_folder(
 def env_spec(task: Task) -> EnvSpec:
     """Return a Gymnasium spec of the environment in which recorded actions can be repeated.
 
-    ``gymnasium.make(spec)`` makes this environment. The spec contains only plain data, so it can be stored as JSON.
+    ``gymnasium.make(spec)`` creates this environment. The spec contains only plain data, so it can be stored as JSON.
     Raises ``InvalidInput`` if the scenario does not have exactly one learner.
     """
     names = [task.scenario.vehicle_names[i] for i in task.scenario.learners]
@@ -170,7 +170,7 @@ def _episodes(recording: Recording) -> Iterator[dict[str, Any]]:
 
 
 def _infos(recording: Recording, vehicle: int) -> dict[str, NDArray[Any]]:
-    """Return the environment's ``info`` for ``vehicle`` (0 = front), as name of the entry -> values [T + 1, n, ...]."""
+    """Return the environment's ``info`` for ``vehicle`` (0 = front): dictionary from keys to values [T + 1, n, ...]."""
     infos = {name: recording.told(name)[:, :, vehicle] for name in recording.reports[0].columns()}
     cost = np.stack([each.cost for each in recording.reports])
     news = [each.known_from_s[:, vehicle] for each in recording.reports if each.known_from_s is not None]
@@ -222,23 +222,25 @@ def write_dataset(
 ) -> DatasetSummary:
     """Let agents drive in worlds of a scenario, and write the episodes as a Parquet file or a Minari dataset.
 
-    If an environment starts in a recorded world and gets the recorded actions, it repeats the episode bit for bit.
-    docs/extensions/datasets.md describes the files. Before it begins to record, the function raises ``InvalidInput`` if
+    An environment that starts in a recorded world and gets the recorded actions repeats the episode bit for bit.
+    docs/extensions/datasets.md describes the files. Before the first episode, the function raises ``InvalidInput`` if
     an argument is invalid, ``AlreadyExists`` if ``path`` exists and ``force`` is false, and ``MissingExtra`` if a
-    library is not installed. At the end it raises ``PhysicsError`` if the physics could simulate none of the worlds.
+    library is not installed. After the last episode, the function raises ``PhysicsError`` if the physics could simulate
+    none of the worlds.
 
     Args:
         path: file (``.parquet``) or folder (``NAME-v0``) to write.
         agents: names of agents as on the command line, or a mapping from names to agents or teams. Each agent drives
             the learners of the scenario. The function does not change the agents.
         scenario: a ``Scenario``, or its name or path.
-        episodes: each agent drives in this number of worlds: worlds 0 to ``episodes`` - 1 of ``seed``.
+        episodes: number of worlds in which each agent drives: the worlds 0 to ``episodes`` - 1 of ``seed``.
         seed: seed from which the worlds are drawn.
         format: ``parquet`` or ``minari``; None: the ending of ``path`` selects the format.
         reward: reward to record: a name such as ``harm``, or the weights of the reward's terms.
         observation: features to record as observation; None: the features that ``observation_for(scenario)`` returns.
         force: whether to replace an existing dataset.
-        on_progress: function that is called with the name of an agent and the number of its worlds recorded so far.
+        on_progress: function that is called with the name of an agent and the number of worlds so far recorded with
+            this agent.
 
     """
     check_whole_number("write_dataset: episodes", episodes, 1)
@@ -289,7 +291,7 @@ def check_dataset(
 ) -> DatasetFormat:
     """Check that a dataset of ``scenario`` can be written to ``path``, and return the format of the dataset.
 
-    Raises the exceptions that ``write_dataset`` raises before it begins to record.
+    Raises the exceptions that ``write_dataset`` raises before the first episode.
 
     Args:
         path: file (``.parquet``) or folder (``NAME-v0``) to write.

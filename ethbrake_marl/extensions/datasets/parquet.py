@@ -32,7 +32,7 @@ def parquet_dataset(path: Path, told: Mapping[str, Any]) -> Iterator[Callable[[R
     Args:
         path: path of the file.
         told: metadata (result of ``tell``), which are stored in the file as JSON under the key ``ethbrake_marl`` when
-            the ``with`` block ends. Inside the block, the caller may still add entries.
+            the ``with`` block ends. The caller may add entries to ``told`` until the block ends.
 
     """
     with naming_extras():
@@ -58,11 +58,11 @@ def decision_columns(recording: Recording) -> Columns:
     before = recording.told
 
     def each(values: NDArray[Any]) -> NDArray[Any]:
-        """Return one element of ``values`` [T or T + 1, n, ...] for each decision, ordered by world, then by time."""
+        """Return, for each decision, its element of ``values`` [T or T + 1, n, ...], ordered by world, then by time."""
         return values[: running.shape[1]].swapaxes(0, 1)[running]
 
     def whole(values: NDArray[Any]) -> NDArray[Any]:
-        """Repeat each episode's element of ``values`` [n] for every decision of this episode."""
+        """Return, for each decision, the element of ``values`` [n] that belongs to the episode of the decision."""
         return np.repeat(values, recording.decisions)
 
     in_force, chosen = before("command_in_force_mps2"), before("chosen_command_mps2")[1:]

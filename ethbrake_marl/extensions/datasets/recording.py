@@ -6,8 +6,8 @@ and its commands are rounded to actions. In the second episode, which is recorde
 environment that gets the recorded actions repeats the second episode bit for bit.
 
 If two vehicles almost miss each other, the last bit of an action can decide whether they have an impact. Therefore, if
-rounding to the nearest action changes the harm of a world, the code also tries to round all actions of this world down,
-and to round them up. It uses the rounding that changes the world's harm least.
+rounding to the nearest action changes the harm of a world, the code also rounds all actions of this world down, and all
+up. The recording contains the actions of the rounding that changes the harm of the world least.
 """
 
 from __future__ import annotations
@@ -77,21 +77,18 @@ class Recording:
 
     @cached_property
     def running(self) -> Bools:
-        """Whether decision t is part of the episode in world k, [n, T]; False after the end of the episode."""
+        """Whether decision t belongs to the episode of world k, [n, T]; False after the end of the episode."""
         mask: Bools = np.arange(len(self.steps)) < self.decisions[:, np.newaxis]
         return mask
 
     def told(self, column: str) -> Floats:
-        """Return the values of one entry of the environment's ``info``, [T + 1, n, N].
-
-        ``column`` is the name of the entry, such as ``time_s``.
-        """
+        """Return the values, [T + 1, n, N], that the environment's ``info`` has under the key ``column``."""
         return np.stack([each.columns()[column] for each in self.reports])
 
     def terms(self) -> dict[str, Floats]:
         """Return the terms of the reward without their weights: name of the term -> values [T + 1, n, L].
 
-        The first index is the time: values at index t + 1 belong to step t, and values at index 0 are 0.
+        Values with the first index t + 1 belong to time step t. Values with the first index 0 are 0.
         """
         shape = (len(self.index), self.task.scenario.vehicles)
         terms = {}
@@ -106,8 +103,8 @@ def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Re
     """Let an agent drive the learners of the scenario, and record the episodes.
 
     The commands of the agent are rounded to float32 actions, and the recorded episodes use these actions. If there are
-    worlds that the physics cannot simulate, raises ``PhysicsError``, which names these worlds. Also raises the
-    exceptions of ``episode_engine``.
+    worlds that the physics cannot simulate, raises ``PhysicsError``, which names these worlds. Raises the exceptions of
+    ``episode_engine`` before the first episode begins.
 
     Args:
         sample: worlds at the alert.
@@ -151,9 +148,11 @@ def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Re
 
 
 def _rounded(commanded: Floats, worlds: Worlds, evaluated: Ledger, task: Task) -> tuple[Float32s, Floats]:
-    """Round all commands of a world to the nearest float32 action, down or up, whichever changes its harm least.
+    """Round the commands to float32 actions; in each world, choose the rounding that changes the harm least.
 
-    Returns the rounded actions, [T, n, L], and how much the rounding changes the harm of each world, [n] m2/s2.
+    Three roundings are possible: all commands of a world to the nearest action, all down, or all up. Rounding down and
+    rounding up are tried only if the nearest actions change the harm of the world by more than ``SLACK``. Returns the
+    rounded actions, [T, n, L], and how much the rounding changes the harm of each world, [n] m2/s2.
 
     Args:
         commanded: commands as float64 actions in [-1, 1], before rounding, [T, n, L].
@@ -178,7 +177,7 @@ def _rounded(commanded: Floats, worlds: Worlds, evaluated: Ledger, task: Task) -
 def _off_by(actions: Float32s, worlds: Worlds, evaluated: Ledger, task: Task) -> Floats:
     """Return by how much the harm with ``actions`` [T, n, L] differs from the harm ``evaluated``, [n] m2/s2.
 
-    The result is the absolute difference of first-impact harm or of total harm, whichever is larger.
+    The result is the larger of two absolute differences: of first-impact harm, and of total harm.
     """
     engine = _learners_engine(worlds, task)
     step = 0

@@ -41,9 +41,9 @@ class Parameters:
 class Seen(NamedTuple):
     """Motion of one vehicle in ``n`` worlds, and what it knows from sensors or messages about the vehicle ahead.
 
-    If information about the vehicle ahead is old, its motion is extrapolated to the present time with the acceleration
-    that it reported. Vehicle 1 treats an obstacle like a vehicle ahead. The road ahead counts as free if nothing is
-    ahead, or if the vehicle knows nothing about the vehicle ahead.
+    If information about the vehicle ahead is old, the motion of the vehicle ahead is extrapolated to the present time
+    with the last known acceleration of the vehicle ahead. Vehicle 1 treats an obstacle like a vehicle ahead. If nothing
+    is ahead, or if the vehicle knows nothing about the vehicle ahead, the gap is infinite.
     """
 
     gap_m: Floats  # [n] gap to the vehicle or obstacle ahead; infinite if nothing is ahead
@@ -88,7 +88,7 @@ class Seen(NamedTuple):
 
     @property
     def headway_s(self) -> Floats:
-        """Gap to the vehicle ahead divided by the own speed, [n] s; infinite if the own speed is not above 0."""
+        """Gap to the vehicle ahead / speed of this vehicle, [n] s; infinite if this vehicle's speed is not above 0."""
         return np.where(self.speed_mps > 0.0, self.gap_m / np.where(self.speed_mps > 0.0, self.speed_mps, 1.0), np.inf)
 
     def built_up(self, wanted_mps2: Floats, rate_mps3: float) -> Floats:
@@ -284,7 +284,7 @@ class Controller:
         return np.full(alert.n, np.nan)
 
     def act(self, worlds: Worlds, memory: Floats, vehicle: int) -> tuple[Floats, Floats]:
-        """Return the command, [n] m/s2, and the new memory [n]. The vehicle's capacities limit the command.
+        """Return the command, [n] m/s2, limited by the vehicle's capacities, and the new memory [n].
 
         Args:
             worlds: present state of the n worlds.
@@ -307,12 +307,12 @@ class Controller:
 
 
 def make_controller(argument: str | None, settings: AgentSettings) -> Controller:
-    """Return the controller that a text such as ``idm:T=1.0`` names.
+    """Return the controller with the name ``settings.spec``, such as ``idm:T=1.0``.
 
     Args:
-        argument: part of this text after the name of the law: values of parameters, such as ``T=1.0`` or ``T=1.0:a=2``;
+        argument: part of the name after the name of the law: values of parameters, such as ``T=1.0`` or ``T=1.0:a=2``;
             None: all parameters have their default values.
-        settings: the whole text (``settings.spec``), and the time step of the scenario.
+        settings: settings of the agent, of which the name (``settings.spec``) and the scenario's time step are used.
 
     Raises ``UnknownName`` for a parameter that the law does not have. Raises ``InvalidInput`` if a value is not a
     number or is out of range, or if a parameter is repeated.

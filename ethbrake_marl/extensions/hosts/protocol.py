@@ -6,11 +6,11 @@ at rest, resolves impacts and records the harm. Every time step has three parts:
 1. *Decide.* Agents whose decision is due choose actions in the state that the host reported. A shield may replace
    these actions.
 2. *Move.* The host receives a command and moves the vehicles for one step.
-3. *Meet.* If the host resolves impacts itself, it reports them. If not, this package computes the speeds after an
-   impact of vehicles that overlap and still approach each other.
+3. *Meet.* A host that resolves impacts itself reports the impacts. If the host does not resolve impacts, this package
+   does: vehicles that overlap and still approach each other get the speeds after an impact.
 
-Latencies are rounded up to whole steps of the host, because commands can change only between two steps. Agents know the
-rounded latencies.
+Latencies are rounded up to whole steps of the host, because commands can change only between two steps. If an agent
+knows a latency, it knows the rounded latency.
 """
 
 from __future__ import annotations
@@ -103,7 +103,8 @@ class Host(Protocol):
     ``Host``.
 
     The attribute ``dt`` is the length of every step (s). If ``dt = math.inf``, each call of ``apply`` moves every world
-    to the time ``command.until_s`` of its next decision. A world that is already at this time does not move.
+    to the time ``command.until_s`` of its next decision. A world that has already reached ``command.until_s`` does not
+    move.
 
     >>> import ethbrake_marl as eb
 
@@ -128,7 +129,7 @@ class Host(Protocol):
     dt: float
 
     def state(self) -> HostState:
-        """Return the present time, gaps and speeds; if the host resolves impacts, also those since the last call."""
+        """Return the present time, gaps, speeds and, if the host resolves impacts, the impacts since the last call."""
 
     def apply(self, command: HostCommand) -> None:
         """Move all vehicles for one time step with the accelerations in ``command``."""
@@ -165,7 +166,7 @@ class Hosted(NamedTuple):
 
     @classmethod
     def join(cls, parts: list[Hosted]) -> Hosted:
-        """Join the results ``parts``, each for some of the worlds, into one result for all worlds, in this order."""
+        """Join the results ``parts`` of different worlds into one result for all worlds, in the order of ``parts``."""
         distrusted = [part.distrusted for part in parts if part.distrusted is not None]
         outcome = Outcome.join([part.outcome for part in parts])
         return cls(outcome, np.concatenate(distrusted) if distrusted else None)
@@ -175,15 +176,16 @@ def drive_host(host: Host, agent: Driver, scenario: str | Path | Scenario, world
     """Let an agent or a team drive the scenario's learners in a host, from the alert to the end of every episode.
 
     Args:
-        host: the host, whose vehicles are at the alert.
+        host: the host, in which all worlds must be at the alert.
         agent: agent or team that drives the learners, with or without a shield, for instance from ``make_agent``. The
             function does not change the agent.
-        scenario: the scenario. Its scripts drive all vehicles that do not learn, and agents know these scripts.
+        scenario: the scenario. The scenario's scripts drive all vehicles that do not learn; agents know these scripts.
         worlds: the worlds at the alert. The vehicles of the host must begin with the gaps and speeds of these worlds.
 
-    Returns the outcome of the episodes, and a mask of the worlds in which the motion differed from the prediction of
-    the shield. Raises ``InvalidInput`` if the scenario, agent or worlds cannot be used with a host. Raises
-    ``HostFailed`` if the host raises an exception or reports an impossible state.
+    Returns the outcome of the episodes, and a mask [n]: True for the worlds in which the motion differed from the
+    prediction of the shield. The mask is None if no shield makes predictions. Raises ``InvalidInput`` if the scenario,
+    agent or worlds cannot be used with a host. Raises ``HostFailed`` if the host raises an exception or reports an
+    impossible state.
 
     """
     scenario = load_scenario(scenario)
@@ -205,13 +207,13 @@ def drive_host(host: Host, agent: Driver, scenario: str | Path | Scenario, world
 class _Grid:
     """Decision times of vehicles that always decide together: in each world a first time, then every time step.
 
-    The attribute ``made`` [n] is the number of decisions made so far, and ``all`` [n] the number of decisions until the
-    horizon.
+    For each world, the attribute ``made`` [n] is the number of decisions so far, and ``all`` [n] is the number of
+    decisions from the alert to the horizon.
 
     Args:
         first_s: [n] time of the first decision in each world (s).
-        vehicles: indices (0 = front) of the vehicles that decide at these times.
-        scenario: the scenario, whose time step and horizon are used.
+        vehicles: indices (0 = front) of the vehicles that decide together.
+        scenario: scenario that provides the time step and the horizon.
 
     """
 
@@ -222,18 +224,19 @@ class _Grid:
 
     @property
     def next_s(self) -> Floats:
-        """Time of the next decision in each world, [n] s. After the last decision, this is the horizon."""
+        """Time of the next decision in each world, [n] s; the horizon if no decision is left."""
         return np.where(self.made < self.all, self.decisions.at(self.made), self.horizon_s)
 
     def is_due(self, time_s: Floats) -> Bools:
-        """Return for each world, [n] bool, whether its next decision time ``next_s`` is reached at ``time_s``."""
+        """Return for each world, [n] bool, whether a decision is due: ``time_s`` has reached the time ``next_s``."""
         return self.next_s <= time_s + ROUNDING * self.decisions.time_step_s
 
 
 class _Run:
     """Episodes that run in a host.
 
-    The arguments are the arguments of ``drive_host``; ``team`` contains the agent of each learner.
+    The arguments are the same as in ``drive_host``, but with ``team``, the agents of all learners, instead of
+    ``agent``.
     """
 
     def __init__(self, host: Host, worlds: Worlds, team: Team, scenario: Scenario) -> None:
@@ -305,7 +308,7 @@ class _Run:
         Args:
             worlds: present state of the n worlds.
             due: [n] whether a decision is due in each world.
-            idle: indices of the worlds in which no decision is due; in these worlds, agents keep their memories.
+            idle: indices of the worlds in which no decision is due and the agents' memories do not change.
 
         """
         engine = self.engine
@@ -329,7 +332,7 @@ class _Run:
         return self.alert.running(self.time_s, gaps, speeds, command_mps2=in_force, pair_hit=self.ledger.count > 0)
 
     def _end(self) -> None:
-        """Mark the episodes that ended with the last step. In these worlds, the learners brake fully from now on."""
+        """Mark the episodes that ended with the last step, and let the learners of these episodes brake fully."""
         first = self.grids[0]
         if not (stepped := ~self.ended & first.is_due(self.time_s) & (first.made > 0)).any():
             return
@@ -374,16 +377,16 @@ class _Run:
         """Resolve the impacts of a step by the paper's eq. (13), for one pair after another from rear to front.
 
         A pair has an impact if, at the end of the step, its gap g is at most 0 and its closing speed w is above 0. Let
-        b be the mean closing acceleration in the step. If the pair was apart before the step, the closing speed at the
-        contact was ``sqrt(w^2 + 2 b g)``; harm and eq. (13) use this speed. If the pair was already in contact before
-        the step, harm and eq. (13) use w.
+        b be the mean closing acceleration of the pair in the step. If the pair was apart before the step, harm and eq.
+        (13) are computed with the closing speed at the contact, ``sqrt(w^2 + 2 b g)``. If the pair was already in
+        contact before the step, harm and eq. (13) are computed with w.
 
         Args:
             before_m: [n, P] gaps before the step (m).
             begin: [n, N] speeds at the start of the step (m/s).
             step_s: [n] length of the step (s).
 
-        Changes the attribute ``speeds_mps``, and returns the impacts.
+        Returns the impacts. The attribute ``speeds_mps`` of this object gets the speeds after the impacts.
 
         """
         v, gaps, speeds, speeds_seen = self.alert.vehicles, self.gaps_m, self.speeds_mps, self.speeds_mps.copy()
@@ -439,7 +442,7 @@ class _Run:
         return read[0] - self.origin_s, read[1], read[2], impacts
 
     def _first_state(self) -> tuple[Floats, Floats]:
-        """Return the host's gaps [n, P] and speeds [n, N] at the alert, and store its clock time at the alert.
+        """Return the host's gaps [n, P] and speeds [n, N] at the alert, and store the host's clock time at the alert.
 
         Raises ``HostFailed`` if the gaps or speeds in the host differ from the gaps or speeds of the worlds.
         """
@@ -486,19 +489,20 @@ class _Motion:
 
     ``refusal`` returns an error for a state that breaks one of three rules:
 
-    1. *Speed in a step.* In one step, a speed changes by no more than the commands since the alert make possible.
-    2. *Gaps since the alert.* Each gap changes as the speeds at the start and at the end of each step require.
+    1. *Speed in a step.* In one step, a vehicle's speed changes by no more than its commands since the alert allow.
+    2. *Gaps since the alert.* Each gap changes in each step as the speeds at the start and the end of the step require.
     3. *Speed since the alert.* A vehicle follows its commands with a delay of at most ``LAG_S``, and its acceleration
        differs from the command by at most ``OFF_MPS2`` plus ``OFF_SHARE`` times the command.
 
     If the host does not report impacts, the rules assume that its vehicles pass through one another. If the host
-    reports impacts, vehicles in contact may push one another. For such vehicles, rule 1 allows every speed that the
-    commands of the whole line make possible, and after an impact every speed that the energy of the line makes
-    possible. Rules 2 and 3 then start again from the reported state, as if this state were the alert.
+    reports impacts, vehicles in contact may push one another. For vehicles that may have been pushed, rule 1 allows
+    every speed that the commands of the whole line make possible, and after an impact every speed that the energy of
+    the line makes possible. For these vehicles, rules 2 and 3 use the reported state instead of the alert as their new
+    start.
 
     Args:
         alert: the worlds at the alert.
-        dt: length of the host's steps (s); if it is infinite, each step ends at the time of a decision.
+        dt: length of the host's steps (s); math.inf if each step ends at the time of a decision.
 
     """
 
@@ -513,7 +517,8 @@ class _Motion:
     def refusal(self, step: _Step) -> tuple[int, str] | None:
         """Check the state that the host reported at the end of ``step``.
 
-        Returns the index of a world with an impossible state and an error message; None if all states are possible.
+        Returns the index of a world with an impossible state, and an error message. Returns None if the states of all
+        worlds are possible.
         """
         acting_s = np.maximum(step.until_s[:, np.newaxis] - np.maximum(self._now, self.vehicles.latency_s), 0.0)
         command = np.where(acting_s > 0.0, step.wanted_mps2, 0.0)
@@ -588,10 +593,12 @@ class _Motion:
 
         Args:
             step: commands and reported state of the step.
-            met: [n, N] whether another vehicle may have pushed the vehicle, so that its speed is not checked.
-            change: [n, N] change of speed in this step according to the command (m/s).
+            met: [n, N] True for each vehicle that another vehicle may have pushed; the speed of this vehicle is not
+                checked.
+            change: [n, N] change of each vehicle's speed in the step if the vehicle follows its command exactly (m/s).
 
-        Returns the index of the world and an error message; None if all speeds agree with the commands.
+        Returns the index of the world with the wrong speed, and an error message. Returns None if all speeds agree with
+        the commands.
 
         """
         began = self.led_mps + step.begin_mps - self.speeds_mps
@@ -611,10 +618,10 @@ class _Motion:
 def _refused(
     values: Floats, low: Floats, high: Floats, describe: Callable[[int, int, str], str]
 ) -> tuple[int, str] | None:
-    """Find the first element of ``values`` [n, k] that is outside its range, which is ``low`` to ``high``.
+    """Find the first element of ``values`` [n, k] that is outside its range, ``low`` to ``high`` (both [n, k]).
 
-    Returns the row of this element and the error message ``describe(row, column, range as text)``. Returns None if all
-    elements are in their ranges.
+    Returns the row of the element, and the result of ``describe(row, column, range as text)``, an error message.
+    Returns None if all elements are in their ranges.
     """
     good = (low <= values) & (values <= high)
     if good.all():
@@ -648,7 +655,7 @@ def _checked_dt(host: Host, scenario: Scenario) -> float:
 def _check_known(worlds: Worlds, scenario: Scenario, vehicles: tuple[int, ...]) -> None:
     """Raise ``InvalidInput`` if the worlds have a feature that hosts do not support.
 
-    Hosts do not support brakes that build up at a finite rate, periodic messages, and obstacles. ``vehicles`` are the
+    The features are brakes that build up at a finite rate, periodic messages, and obstacles. ``vehicles`` are the
     indices of the controlled vehicles.
     """
     scenario.play_pieces(worlds, vehicles).refuse_build_up("host")

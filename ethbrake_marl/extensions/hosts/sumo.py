@@ -1,4 +1,4 @@
-"""SUMO as a host. Each world is a straight road of one simulation, which runs in this process (libsumo)."""
+"""Use the traffic simulator SUMO as a host. Each world is a straight road of one simulation in this process."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ _SUMO_OPTIONS = (
 class SumoHost:
     """Host that runs worlds as parallel roads of one SUMO simulation. A process can run only one simulation at a time.
 
-    At the end of each step, every vehicle has the commanded speed. SUMO integrates the motion with its ballistic
-    method, and lets vehicles pass through one another. SUMO has no negative speeds, so a vehicle that should move
-    backwards after an impact stands still. The method ``close`` ends the simulation.
+    At the end of each step, every vehicle has exactly the speed that its command requires. SUMO integrates the motion
+    with its ballistic method, and lets vehicles pass through one another. SUMO has no negative speeds, so a vehicle
+    that should move backwards after an impact stands still. The method ``close`` ends the simulation.
 
     Args:
         worlds: the worlds at the alert.
@@ -167,14 +167,14 @@ class FoundHost(NamedTuple):
             sample: the worlds at the alert.
             agents: dictionary from names to agents or teams.
             scenario: scenario of the worlds.
-            seed: seed from which the worlds were drawn, which is stored in the evaluation; None: there is no seed.
+            seed: seed from which the worlds were drawn, which is stored in the evaluation; None: no seed is stored.
             at_once: largest number of worlds in one simulation.
-            on_progress: function that is called with the name of an agent and the number of worlds that it has
-                finished.
+            on_progress: function that is called with the name of an agent and the number of worlds in which this agent
+                has finished its episodes.
 
-        Returns the evaluation, and a dictionary from each agent's name to an array [n] bool: whether the motion in a
-        world differed from the prediction of the agent's shield. The entry is None if the agent has no shield that
-        makes predictions.
+        Returns the evaluation, and a dictionary from each agent's name to an array [n] bool: True for the worlds in
+        which the motion differed from the prediction of the agent's shield. For an agent without a shield that makes
+        predictions, the dictionary contains None instead of an array.
 
         """
         results: dict[str, Hosted] = {}

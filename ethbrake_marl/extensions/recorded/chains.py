@@ -1,4 +1,4 @@
-"""Form chains of vehicles that follow each other, and check recorded gaps and positions against recorded speeds.
+"""Form chains of vehicles that follow each other; check that recorded gaps and positions agree with recorded speeds.
 
 A *queue* is a sequence of vehicles, each of which follows the vehicle in front of it, at one moment of a recording. A
 queue is cut into *chains* of a fixed number of vehicles. Each chain is one row of gaps and speeds.
@@ -31,7 +31,7 @@ LEAST_M2 = 100.0  # positions are checked if the squared distances driven in a l
 
 
 class Link(NamedTuple):
-    """A vehicle that follows another vehicle, and the gap between the two."""
+    """A vehicle that follows another vehicle, and the gap to the vehicle ahead."""
 
     gap_m: float  # length of the gap (m)
     opens_mps: float  # speed at which the gap opens (m/s)
@@ -39,12 +39,12 @@ class Link(NamedTuple):
 
 
 class Chains:
-    """Cuts the queues of vehicles in one recorded file into chains, and checks the recorded gaps and positions.
+    """Cuts the queues of vehicles in a recording into chains, and checks that gaps and positions agree with speeds.
 
     Args:
         file: path of the file, for error messages.
         entry: format of the file.
-        every_s: chains are formed at moments that are this time apart (s).
+        every_s: time between two moments at which chains are formed (s).
         vehicles: number of vehicles in a chain.
         names: dictionary from the number of a vehicle or lane to its name, for error messages. If a number has no name,
             the message shows the number.
@@ -67,8 +67,8 @@ class Chains:
         The first chain of a queue begins with the front vehicle of the queue; the next chain begins directly behind the
         first chain, and so on. At one moment, a vehicle belongs to at most one chain.
 
-        After the last chain, the function raises ``InvalidInput`` if too many vehicles have faulty data, or if changes
-        of the recorded gaps or positions do not agree with the recorded speeds.
+        After the last chain, the function raises ``InvalidInput`` if too many vehicles have faulty data, or if the
+        recorded gaps or positions change by amounts that do not agree with the recorded speeds.
 
         Args:
             moments: pairs of a time (in units of ``every_s``) and the states of all vehicles at this time.
@@ -105,14 +105,14 @@ class Chains:
         return self.names.get(number) or f"{number:.0f}"
 
     def _links(self, there: list[Any], by_id: dict[float, Any], row: bool) -> dict[float, Link]:
-        """Return a dictionary from a vehicle's id to the vehicle that follows it at this moment; count faulty data.
+        """Return a dictionary from a vehicle's id to the vehicle that follows it at one moment; count faulty data.
 
         Args:
-            there: states of all vehicles at this moment.
-            by_id: dictionary from the id of a vehicle to its state. If a vehicle is recorded twice, this is the first
-                state.
-            row: whether chains are formed at this moment. If False, the function does not count the data that it leaves
-                out.
+            there: states of all vehicles at the moment.
+            by_id: dictionary from the id of a vehicle to its state at the moment. If a vehicle is recorded twice, the
+                dictionary contains the state that is recorded first.
+            row: whether chains are formed at the moment. If ``row`` is False, the function counts neither the data that
+                it leaves out nor faulty data.
 
         """
         behind, in_lane = dict[float, Link](), dict[float, float]()  # in_lane: vehicle -> vehicle ahead in the lane
@@ -159,13 +159,13 @@ class Chains:
         by_id_before: dict[float, Any],
         passed_s: float,
     ) -> None:
-        """Add the changes of gaps and positions since the previous moment to sums, which ``cut`` checks at the end.
+        """Add the changes of gaps and positions between two moments to running sums, which ``cut`` checks at the end.
 
         Args:
-            behind: result of ``_links`` at this moment: the follower of each vehicle.
-            before: result of ``_links`` at the previous moment.
-            by_id: dictionary from the id of a vehicle to its state at this moment.
-            by_id_before: dictionary from the id of a vehicle to its state at the previous moment.
+            behind: result of ``_links`` at the later moment: the follower of each vehicle.
+            before: result of ``_links`` at the earlier moment.
+            by_id: dictionary from the id of a vehicle to its state at the later moment.
+            by_id_before: dictionary from the id of a vehicle to its state at the earlier moment.
             passed_s: time between the two moments (s).
 
         """
@@ -209,7 +209,7 @@ class Chains:
 def _gap(ahead: Any, state: Any) -> float:
     """Return the gap (m) from the rear of the vehicle ``ahead`` to the front of the vehicle ``state``.
 
-    The gap is measured in the direction of travel of ``state``.
+    The gap is measured along the direction of travel of the vehicle ``state``.
     """
     along = ahead.front - ahead.length * ahead.dx - state.front
     across = ahead.side - ahead.length * ahead.dy - state.side

@@ -24,7 +24,8 @@ SLOWEST_MPS, LONGEST_S = 0.5, 60.0  # least speed and longest time gap of rows t
 def fit_rows(rows: Floats, draw: DataDraw) -> dict[str, Any]:
     """Return scenario keys with distributions of time gaps, of the line's mean speed, and of deviations from this mean.
 
-    Raises ``InvalidInput`` if too few chains have speeds and time gaps in the range that is used for fits.
+    Raises ``InvalidInput`` if fewer than ``QUANTILES`` chains have speeds of at least ``SLOWEST_MPS``, and time gaps
+    above 0 and at most ``LONGEST_S``.
 
     Args:
         rows: [k, 2 N - 1] gaps (m) and speeds (m/s) of k chains of N vehicles.
@@ -52,7 +53,7 @@ def fit_rows(rows: Floats, draw: DataDraw) -> dict[str, Any]:
 
 
 def _fit(values: Floats, draw: DataDraw) -> Any:
-    """Return a distribution as a scenario file declares it, fitted to ``values`` [k] and limited to their range.
+    """Fit a distribution to ``values`` [k], limited to their range; return it in the form of a scenario file.
 
     ``draw`` is the kind of distribution: ``normal``, ``lognormal`` or ``quantiles``.
     """

@@ -1,8 +1,8 @@
-"""Read all recordings in a folder, and return rows: the gaps and speeds of a chain of vehicles at one moment.
+"""Read all recordings in a folder; return rows, each with the gaps and speeds of one chain of vehicles at one moment.
 
 Each file is read once. The states of its vehicles at regular times are stored in a temporary database on disk, which
-returns the states in order of time. Therefore memory contains only some lines of a file, the states at one moment, and
-the resulting rows.
+returns the states in order of time. Therefore memory contains only some lines of a file, the vehicles' states at one
+moment, and the rows of gaps and speeds.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def read_rows(
     Args:
         folder: folder with the recordings, or a single file.
         entry: format of the files.
-        every_s: chains are read at moments that are this time apart (s).
+        every_s: time between two moments at which chains are formed (s).
         vehicles: number of vehicles in a chain.
         progress: function that is called with the name of a file, the amount of data read from it so far (KiB), and its
             size (KiB).
@@ -101,9 +101,9 @@ def _search(folder: Path, entry: Format) -> tuple[dict[str, Path], list[str], li
     """Find the files of a format in a folder and its subfolders by their names.
 
     Returns a dictionary from printable paths to files, the errors for subfolders that cannot be read, and the names of
-    files that are left out because they repeat another file. A file repeats another file if it is a link to it or a
-    copy of it, or if it is a text file without a header beside a CSV file of the same name. Names that begin with a dot
-    are ignored, and links to folders are not followed.
+    files that are left out because they repeat another file. Copies of a file and links to a file repeat this file. A
+    text file without a header repeats a CSV file of the same name in the same folder. Files and folders whose names
+    begin with a dot are ignored, and links to folders are not followed.
     """
     if folder.is_file():
         return {plain_text(folder.name): folder}, [], []
@@ -135,7 +135,7 @@ def _size(file: Path) -> int:
 
 
 def _content(file: Path) -> object:
-    """Return a hash, which is equal for files with the same content; if the file is unreadable, its real path."""
+    """Return a hash of the content of ``file``, or, if the file cannot be read, its path after following links."""
     try:
         with open_plain(file, LARGEST_BYTES) as stream:
             return hashlib.file_digest(stream, "sha256").digest()

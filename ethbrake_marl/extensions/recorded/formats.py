@@ -43,7 +43,7 @@ class Format(NamedTuple):
 
     @property
     def gaps(self) -> bool:
-        """Whether files contain gaps instead of positions and lengths; an empty gap in such a file was not measured."""
+        """Whether files contain gaps instead of positions and lengths; an empty cell means a gap was not measured."""
         return "gap" in self.columns
 
     @property
@@ -102,13 +102,14 @@ _ROLES = {"time": "tick", "vehicle": "id", "lane": "lane", "front": "front", "le
 
 
 def format_of(name: DataFormat, columns: str = "") -> Format:
-    """Return the format that is called ``name``.
+    """Return the format of recorded traffic with the name ``name``.
 
     Args:
-    name: name of the format.
-    columns: for the format ``table``: ``time=t,vehicle=id,lane=lane,front=x,length=l,speed=v,units=m``. Each value
-        except ``units`` is the name of a column of the file. ``time=t/1000`` means that the column ``t`` contains times
-        in 1/1000 s. ``units`` is ``m`` (lengths in m, speeds in m/s), ``ft`` (ft and ft/s) or ``km/h`` (m and km/h).
+        name: name of the format.
+        columns: for the format ``table`` only: ``time=t,vehicle=id,lane=lane,front=x,length=l,speed=v,units=m``. All
+            values except the value of ``units`` are names of columns of the file. ``time=t/1000`` means that the column
+            ``t`` contains times in 1/1000 s. ``units`` is ``m`` (lengths in m, speeds in m/s), ``ft`` (lengths in ft,
+            speeds in ft/s) or ``km/h`` (lengths in m, speeds in km/h).
 
     Raises ``InvalidInput`` if ``columns`` has missing, repeated or unknown keys, or unknown units.
 

@@ -1,7 +1,7 @@
 """Read files of recorded traffic (CSV, text with blanks, Parquet), some lines at a time.
 
-Each row of numbers is stored with its line number in the file (in a Parquet file, its row number), which error messages
-show.
+Each row of numbers is stored with its line number, which error messages show. In a Parquet file, which has no lines,
+the row number takes the place of the line number.
 """
 
 from __future__ import annotations
@@ -52,13 +52,14 @@ class Piece(NamedTuple):
     lines: Floats  # [rows] number of the line of each row
 
     def refuse(self, bad: Bools, k: int, right: str, shown: Floats | None = None) -> None:
-        """Raise ``InvalidInput``, which names file, line and column, if a value of one column is wrong.
+        """Raise ``InvalidInput``, which names file, line and column, if at least one value of column ``k`` is wrong.
 
         Args:
-            bad: [rows] whether the value in each row is wrong. The error message names the first wrong row.
-            k: index of the column whose values are wrong.
+            bad: [rows] True for each row whose value is wrong. The error message names the first wrong row.
+            k: index of the checked column.
             right: end of the error message, which says what a valid value is.
-            shown: [rows] values that the error message shows; None: the values in column ``k``.
+            shown: [rows] values to show in the error message instead of the values in column ``k``, for instance in
+                another unit; None: the values in column ``k``.
 
         """
         if bad.any():
@@ -81,18 +82,18 @@ def read_pieces(
 ) -> Iterator[Piece]:
     """Yield the numbers in the columns ``columns`` of a file, with up to ``PIECE`` rows at a time.
 
-    All numbers that it yields are finite. If the format has gaps instead of positions, an empty cell is read as NaN.
+    All numbers are finite, with one exception: if the format has gaps instead of positions, empty cells become NaN.
 
     Args:
         file: path of the file.
         entry: format of the file.
         columns: names of the columns to read, in this order.
-        names: dictionary from names to numbers, for columns that contain names instead of numbers; the function adds
-            new names.
+        names: dictionary from names of vehicles and lanes to numbers, for columns that contain names instead of
+            numbers; the function adds new names to the dictionary.
         progress: function that is called with the amount of data read so far (KiB) and the size of the file (KiB).
 
     Raises ``InvalidInput``, which names file, line and column, for a missing column or a cell that is not a number.
-    Raises ``NotARecording`` for a file that is not a recording.
+    Raises ``NotARecording`` for a table that is not a recording of traffic.
 
     """
     with open_plain(file, LARGEST_BYTES) as stream:
@@ -122,9 +123,10 @@ def _is_parquet(file: Path) -> bool:
 def _numbers(
     file: Path, rows: Iterable[_Row], shown: Sequence[str], readers: Sequence[tuple[int, Callable[[str], float]]]
 ) -> Iterator[tuple[int, list[float]]]:
-    """Yield, for each row, its line number and the numbers in some of its cells.
+    """Yield, for each row, its line number and the numbers in the cells that ``readers`` selects.
 
-    ``readers`` contains, for each cell to read, its index and the function that converts its text to a number.
+    ``readers`` contains, for each cell to read, the index of the cell and the function that converts the text of the
+    cell to a number.
     """
     for line, cells in rows:
         if len(cells) != len(shown):
@@ -171,7 +173,7 @@ def _parquet(text: TextIOWrapper, file: Path, entry: Format, columns: Sequence[s
 def _text(text: TextIOWrapper, file: Path, entry: Format, columns: Sequence[str]) -> _Table:
     """Find the header among the first lines of a text file.
 
-    Returns the names of all columns, the indices of the columns ``columns``, and an iterator over the rows below.
+    Returns the names of all columns, the indices of the columns ``columns``, and an iterator over the rows of data.
     """
     lines, best, have = _lines(file, text), list(columns), list[str]()
     for number, line in islice(lines, HEAD):
@@ -193,7 +195,7 @@ def _text(text: TextIOWrapper, file: Path, entry: Format, columns: Sequence[str]
 
 
 def _rows(file: Path, lines: Iterator[tuple[int, str]], separator: str, streets: Sequence[str]) -> Iterator[_Row]:
-    """Yield the line number and the cells of each line that is not blank and contains no text of ``streets``."""
+    """Yield the line number and the cells of each line that is not blank and contains none of the texts ``streets``."""
     elsewhere = seen = 0
     for number, line in lines:
         if streets and any(street in line for street in streets):
@@ -239,7 +241,7 @@ def _measured(cell: str) -> float:
 
 
 def _number_of(names: dict[str, float], cell: str) -> float:
-    """Return the number that ``names`` gives to the name in ``cell``; a new name gets the next number: 1, 2, 3, ...
+    """Return the number of the name in ``cell`` from the dictionary ``names``; a new name gets the next whole number.
 
     Raises ``ValueError`` for an empty name.
     """
@@ -251,7 +253,7 @@ def _number_of(names: dict[str, float], cell: str) -> float:
 def _match(file: Path, columns: Sequence[str], shown: Sequence[str]) -> tuple[list[int], list[str]]:
     """Find columns of a file by name; return the indices of these columns, and the names of the missing columns.
 
-    The indices of numbered columns (Speed1, Speed2, ...) are in the order of these numbers.
+    If a name matches numbered columns (Speed1, Speed2, ...), the indices are in the order of the columns' numbers.
 
     Raises ``InvalidInput`` if two columns of the file have the same name.
 
@@ -274,7 +276,8 @@ def _match(file: Path, columns: Sequence[str], shown: Sequence[str]) -> tuple[li
 def _unknown(file: Path, entry: Format, missing: list[str], have: Sequence[str]) -> InvalidInput:
     """Return the error for a file that lacks the columns ``missing``.
 
-    The list ``have`` contains the cells of the file's first lines, which show whether the file has another format.
+    The list ``have`` contains the cells of the file's first lines. If these cells are the column names of another
+    format, the error message names the other format.
     """
     small = {name.lower() for name in have}
     for title, (there, absent) in REFUSED.items():

@@ -53,10 +53,10 @@ def scenario_from_data(
 ) -> FromData:
     """Create a scenario from the recordings in a folder and in all its subfolders.
 
-    At regular times, each queue of vehicles in a recording is cut into chains, beginning at its front. A chain has as
-    many vehicles as the scenario ``based_on``. At one time, a vehicle belongs to at most one chain. Each chain is one
-    row of speeds and gaps. If there are more rows than a table may have, every k-th row is used. Files with errors are
-    left out; all other files are used.
+    At regular times, each queue of vehicles in a recording is cut into chains, beginning at the front of the queue. A
+    chain has as many vehicles as the scenario ``based_on``. At one time, a vehicle belongs to at most one chain. Each
+    chain is one row of gaps and speeds. If there are more rows than the table of a scenario may have, only every k-th
+    row is used.
 
     Args:
         name: name of the scenario.
@@ -64,10 +64,10 @@ def scenario_from_data(
         format: format of the files.
         columns: for the format ``table`` only: names of the columns, in the form that ``format_of`` describes.
         based_on: scenario that provides the number of vehicles and all quantities that are not recorded.
-        every_s: chains are formed at moments of a recording that are this time apart (s).
+        every_s: time between two moments of a recording at which chains are formed (s).
         draw: how the scenario draws a world: ``rows`` draws a recorded chain; ``normal``, ``lognormal`` and
             ``quantiles`` draw each quantity from a distribution of this kind, which is fitted to the chains.
-        strict: whether to raise an error if at least one file has errors.
+        strict: if True, an error in at least one file raises an exception; if False, files with errors are left out.
         progress: function that is called with the name of a file, the amount of data read from it so far (KiB), and its
             size (KiB).
 
@@ -130,7 +130,7 @@ def scenario_from_data(
 
 
 def _name(file: str, vehicles: str) -> str:
-    """Return the name of a chain, such as ``drive_1.csv: 2-3-4``; a long name loses its beginning."""
+    """Return the name of a chain, such as ``drive_1.csv: 2-3-4``; the beginning of a long name is cut off."""
     return f"{file}: {vehicles}".strip()[-MOST_CHARACTERS:].strip()
 
 

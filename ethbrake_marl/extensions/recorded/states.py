@@ -43,10 +43,10 @@ STATE_TABLE = f"CREATE TABLE state({','.join(State._fields)})"
 
 
 def check_every(every_s: float, entry: Format, what: str) -> int:
-    """Return how many ticks (intervals between recorded moments) the time ``every_s`` contains.
+    """Return the number of ticks (intervals between recorded moments) in the time ``every_s``.
 
-    Raises ``InvalidInput`` if ``every_s`` is not a multiple of a tick. The text ``what`` names the data in the error
-    message.
+    Raises ``InvalidInput`` if ``every_s`` is not a multiple of a tick. ``what`` is the name of the recorded data in the
+    error message.
     """
     stride = every_s * entry.hertz
     off = 0.01 * stride if entry.title == "the table" else 1e-6  # video has 29.97 pictures in a second
@@ -70,13 +70,13 @@ def keep_states(
 
     Args:
         store: database with an empty table ``state``.
-        file: path of the file.
+        file: path of the recording.
         entry: format of the file.
-        every_s: chains of vehicles are formed at moments that are this time apart (s).
+        every_s: time between two moments at which chains of vehicles are formed (s).
         names: dictionary from the name of a vehicle or lane to its number; the function adds new names.
         progress: function that is called with the amount of data read so far (KiB) and the size of the file (KiB).
 
-    Raises ``InvalidInput``, which names file, line and column, for an impossible value.
+    Raises ``InvalidInput``, which names file, line and column, for an impossible value, for instance a length of 0 m.
 
     """
     turned, first, stride, cars, states = np.empty((0, 2)), None, 1, 0, 0
@@ -104,7 +104,7 @@ def keep_states(
 
 
 def moments(store: sqlite3.Connection) -> Iterator[tuple[float, list[Any]]]:
-    """Yield each moment in the table ``state``, in order of time: its tick, and all states in the order of the file."""
+    """Yield (tick, states) for each moment in the table ``state``, in order of time; states have the file's order."""
     for tick, rows in groupby(store.execute("SELECT * FROM state ORDER BY tick, line"), itemgetter(0)):
         yield tick, [State(*row) for row in rows]
 
@@ -117,11 +117,12 @@ def _directions(file: Path, entry: Format) -> Floats:
 
 
 def _with_rate(entry: Format, times: Floats, every_s: float) -> Format:
-    """Return the format with the sampling rate of one file, whose recorded times are ``times`` [rows].
+    """Return the format ``entry`` with the sampling rate of a file, computed from the file's times ``times`` [rows].
 
     A tick is the smallest difference between two times, and the rate is 1 / tick. If some times are not multiples of
-    the tick, the recorded times were rounded. A rate within 2 % of a whole number is then replaced by this whole
-    number; for example, times of 0.033 s and 0.067 s mean 30 Hz. If all times are equal, the tick is ``every_s``.
+    the tick, the recorded times were rounded; if the rate is also within 2 % of a whole number, the function returns
+    this whole number as the rate. For example, times of 0.033 s and 0.067 s mean 30 Hz. If all times are equal, the
+    tick is ``every_s``.
     """
     seconds = np.unique(np.round(times * entry.ticks, 6))
     steps = np.diff(seconds)
@@ -133,10 +134,10 @@ def _with_rate(entry: Format, times: Floats, every_s: float) -> Format:
 
 
 def _states(piece: Piece, entry: Format, ticks: Floats, turned: Floats) -> Floats:
-    """Return the states of the vehicles in rows of a file, [states, fields of ``State``].
+    """Return the states that the rows ``piece`` of a file contain, one per vehicle and time, [states, fields of State].
 
     Args:
-        piece: rows of a file.
+        piece: consecutive rows of the file, as numbers.
         entry: format of the file.
         ticks: [rows] time of each row, in units of the time between two moments at which chains are formed.
         turned: [vehicles, 2] id and driving direction of each vehicle, sorted by id; used for highD only.
@@ -172,11 +173,11 @@ def _states(piece: Piece, entry: Format, ticks: Floats, turned: Floats) -> Float
 
 
 def _of_gaps(piece: Piece, entry: Format, ticks: Floats) -> Floats:
-    """Return the states of the cars in rows of an OpenACC file, [states, fields of ``State``].
+    """Return the states that the rows ``piece`` of an OpenACC file contain, one per car and time, [states, fields].
 
     Car k follows car k - 1 if the speeds of both cars and the gap between these cars (column ``IVS`` with the number
     k - 1) are recorded. The first car of a queue has position 0. The position of every other car is minus the sum of
-    the gaps ahead of it.
+    the gaps between this car and the first car of its queue.
     """
     at = {name.lower(): k for k, name in enumerate(piece.columns)}
     cars = sorted(int(name.removeprefix("speed")) for name in at if name.startswith("speed"))
