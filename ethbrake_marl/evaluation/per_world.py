@@ -224,8 +224,8 @@ class Result:
 def read_result(path: Path) -> Result:
     """Read and check a JSON results file of ``ethbrake evaluate``, ``ethbrake shield`` or ``ethbrake run``.
 
-    Raises ``InvalidInput`` if ``path`` is not such a results file, if its kind of results cannot be compared, or if it
-    lacks a hash.
+    Raises ``InvalidInput`` if ``path`` is not a results file of these commands, if results of this kind cannot be
+    compared, or if the file does not contain the hash of its worlds.
     """
     try:
         content = parse_strict_json(read_plain(path, _LIMIT_BYTES))

@@ -130,7 +130,7 @@ def drive_chunk(
         sample: the worlds of the chunk, at the alert.
         agents: agents or teams by name.
         scenario: scenario of the worlds.
-        seed: seed of the evaluation list, which is recorded in the result.
+        seed: seed of the evaluation list; the result contains this seed.
         vehicles: indices (0 = front) of the controlled vehicles.
         first: position of the chunk's first world among all evaluated worlds (from 0), for error messages.
         aftermath: whether to also measure how far Vehicle 1 is shoved, sampled harm, and measures that the user

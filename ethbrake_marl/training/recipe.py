@@ -72,7 +72,7 @@ class Shape(FileModel):
 
         Args:
             observation_size: number of features of an observation.
-            more: fields of the returned ``NetworkSpec`` that get other values than by default, such as
+            more: fields of the returned ``NetworkSpec`` whose values differ from the defaults, such as
                 ``output="tanh"``.
 
         """

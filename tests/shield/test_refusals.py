@@ -83,8 +83,8 @@ STEP_SHIELD: dict[str, Callable[[], object]] = {
     "shield: policy has a policy for the vehicle indices [1]; must have one for each shielded vehicle, [1,": lambda: (
         StepShield(PAIR, (1, 2)).begin(PAIR.sample(1, 0).worlds, np.arange(1), COAST)
     ),
-    "shield: assumed has 2 worlds, but the environment has a row 4; assumed must have one world for every row": lambda: (
-        drive(WORLDS, ShieldedDriver(COAST, PAPER, assumed=WORLDS.take([0, 1])), PAPER, 1)
+    "shield: assumed has 2 worlds, but the environment has a row 4; assumed must have one world for": lambda: drive(
+        WORLDS, ShieldedDriver(COAST, PAPER, assumed=WORLDS.take([0, 1])), PAPER, 1
     ),
     "review: the shield has no log; make the shield with logging=True, and run episodes": lambda: review(
         drive(WORLDS, ShieldedDriver(COAST, PAPER), PAPER, 1).guarded.shield, COAST, WORLDS

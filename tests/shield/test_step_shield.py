@@ -248,7 +248,7 @@ def test_agent__a_worlds_outcome_depends_on_no_other_world_and_on_nothing_driven
         for agent in (used, kind(wavering, PAPER)):
             episodes = drive(WORLDS.take(rows), agent, PAPER, 1)
             assert episodes.ledger.world_harm("first").tolist() == whole[rows].tolist()
-            told = episodes.memories[1] if episodes.guarded is None else episodes.guarded.told
+            told = episodes.memories[1] if episodes.guarded is None else episodes.guarded.results
             assert told["predicted_harm"].shape == told["chosen_policy"].shape == (len(rows),)
 
 

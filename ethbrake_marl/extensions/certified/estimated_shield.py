@@ -69,9 +69,9 @@ class EstimatedShield:
 
     The shield starts at the first decision. The shield restarts when its vehicle learns of a further vehicle, learns
     that another vehicle reacts, or sees a vehicle move otherwise than predicted. After a restart, the shield keeps the
-    rest of the previous plan if this rest is at least as good as the new plan. From the first decision on,
-    ``predicted_harm`` [n] contains the bound on harm at the first decision. ``predicted_harm`` is infinite if the
-    vehicle had an impact before the first decision, because the harm of that impact is unknown.
+    rest of the previous plan if this rest is at least as good as the new plan. At the first decision,
+    ``predicted_harm`` [n] is set to the present bound on harm; later decisions do not change it. ``predicted_harm`` is
+    infinite if the vehicle had an impact before the first decision, because the harm of that impact is unknown.
 
     Args:
         scenario: the scenario of the worlds; a mixture of scenarios raises ``InvalidInput``.

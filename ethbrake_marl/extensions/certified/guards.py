@@ -72,7 +72,7 @@ class EstimatedGuard(ShieldGuard):
         return Ruling(proposed, applied, stepped_in, ~running.ended, after.decision, Guarded(after, memories))
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos of a step (a mapping) whose actions are certified in the estimated worlds.
+        """Return the infos of one step as a mapping; the shield has certified the actions in estimated worlds.
 
         The info ``trusted`` is true in mode ``robust`` and false in mode ``step``, because only in mode ``robust`` may
         the bound also hold in the true world. ``memory`` contains the shield as it is after the step. ``ruling`` is the

@@ -332,7 +332,7 @@ class _Run:
         return self.alert.running(self.time_s, gaps, speeds, command_mps2=in_force, pair_hit=self.ledger.count > 0)
 
     def _end(self) -> None:
-        """Mark the episodes that ended with the last step, and let the learners of these episodes brake fully."""
+        """Mark the episodes that ended in the most recent step, and let the learners of these episodes brake fully."""
         first = self.grids[0]
         if not (stepped := ~self.ended & first.is_due(self.time_s) & (first.made > 0)).any():
             return

@@ -249,8 +249,8 @@ def obstacle_harm(at: Floats, late: float, closing: float) -> float:
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        late: latest time of the push, s.
-        closing: smallest closing speed of the push, m/s.
+        late: latest time at which the follower pushes the front vehicle, s.
+        closing: smallest closing speed at which the follower meets the front vehicle, m/s.
 
     """
     if not STRUCK_M < at[LINE.OBSTACLE] - at[LINE.V_L] * at[LINE.V_L] / (2.0 * at[LINE.A_L]) < math.inf:

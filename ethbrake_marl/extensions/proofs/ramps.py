@@ -1,10 +1,11 @@
 """Simulate two vehicles whose accelerations change at finite rates: their first contact and its closing speed.
 
 Here *force* means force per mass, which is an acceleration (m/s2). A *plan* is the motion of one vehicle, an array [3,
-LEGS]. A *leg* is a time interval of constant jerk. Row ENDS has the end of each leg (in s from now; the last leg never
-ends). Row FORCES has the force at the start of each leg (m/s2). Row JERKS has the rate at which the force changes in
-each leg (m/s3). A vehicle at rest stays there until its force is above 0. A vehicle at its speed limit keeps that speed
-until its force is below 0. No time steps are needed, because the gap is piecewise a cubic polynomial of time.
+LEGS]. A *leg* is a time interval of constant jerk. Row ENDS of the plan has the time at which each leg ends, in s from
+now (infinite for the last leg). Row FORCES has the force at the start of each leg (m/s2). Row JERKS has the rate at
+which the force changes in each leg (m/s3). A vehicle at rest stays there until its force is above 0. A vehicle at its
+speed limit keeps that speed until its force is below 0. No time steps are needed, because the gap is piecewise a cubic
+polynomial of time.
 docs/internals/proofs/lower-bound-cases.md has the proof, under "Brakes that build up".
 """
 

@@ -359,7 +359,7 @@ def starting_profiles(
 
 
 def startable(profiles: Profiles) -> Profiles:
-    """Shorten profiles to at most ``MOST_PHASES`` phases (intervals of constant command), as a search needs them.
+    """Return the profiles with at most ``MOST_PHASES`` phases (intervals of constant command), the most for a search.
 
     A profile with more than ``MOST_PHASES`` phases is replaced by its first command for the whole episode.
     """

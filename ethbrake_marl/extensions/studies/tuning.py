@@ -403,8 +403,8 @@ class TuningPlan:
     def example(self) -> str:
         """Return a command line ``ethbrake train ...`` that does the same training run as one trial.
 
-        In the command line, the searched keys have the recipe's own values. If the search excludes any of the recipe's
-        own values, all searched keys have random values instead.
+        In the command line, the searched keys have the recipe's own values. If any of these values is outside
+        the range that is searched, all searched keys have random values from their ranges instead.
         """
         values = self.own_values() or next(self.file.points(1))
         measured = {"evaluation": self.training(values).recipe.evaluation.model_dump(mode="json")}

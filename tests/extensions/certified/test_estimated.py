@@ -23,7 +23,7 @@ PERIODIC = BASE.replace(v2x={"preset": "blocked", "persistence": "periodic"})
 def driven(agent: object, scenario: eb.Scenario, n: int, seed: int = 7, vehicle: int = 1) -> tuple[Floats, Floats]:
     """Harm realised, and the first bound, [n] each."""
     episodes = drive(scenario.sample(n, seed).worlds, agent, scenario, vehicle)
-    told = episodes.memories[vehicle] if episodes.guarded is None else episodes.guarded.told
+    told = episodes.memories[vehicle] if episodes.guarded is None else episodes.guarded.results
     return episodes.ledger.world_harm("first"), told["predicted_harm"]
 
 

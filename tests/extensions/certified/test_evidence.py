@@ -42,7 +42,7 @@ def test_log__holds_every_intervention_and_forensics_says_what_it_was_good_for()
 def test_review__tells_the_harm_of_the_engine_also_where_the_bound_is_not_it(mode):
     worlds = WORLDS.take(np.arange(40))
     other = parse_uncertainty("braking_capacity_mps2=20%").draw(worlds, np.random.default_rng(0))
-    settings = {"told": other} if mode == "distrusted" else {"uncertainty": "gaps_m=0.5"}
+    settings = {"assumed": other} if mode == "distrusted" else {"uncertainty": "gaps_m=0.5"}
     episodes = logged(wavering, worlds, **settings)
     harm, shield = episodes.ledger.world_harm("first"), episodes.guarded.shield
     assert abs(shield.bound - harm).max() > 1.0
