@@ -225,7 +225,7 @@ def read_result(path: Path) -> Result:
     """Read and check a JSON results file of ``ethbrake evaluate``, ``ethbrake shield`` or ``ethbrake run``.
 
     Raises ``InvalidInput`` if ``path`` is not a results file of these commands, if results of this kind cannot be
-    compared, or if the file does not contain the hash of its worlds.
+    compared, or if the hash of the worlds or of the scenario is missing.
     """
     try:
         content = parse_strict_json(read_plain(path, _LIMIT_BYTES))
