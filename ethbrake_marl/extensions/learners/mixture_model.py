@@ -118,9 +118,9 @@ class ExpertsModel(VineModel):
         self._own = own_worlds(engine, self.plan, explored, pupil.act, gamma)
         if len(shown.action) == 0 or len(self._own.motion) == 0:
             raise NoBetterTemplate(
-                f"experts: expert {stage.network + 1} has nothing to learn: in each of {self.plan.worlds:,} worlds,"
-                f" the best of {self.plan.templates} templates (random braking profiles) exceeds the return of the"
-                f" earlier experts by at most {self.plan.gain:g}; set fewer networks, or leave out experts"
+                f"experts: expert {stage.network + 1} has nothing to learn: in none of {self.plan.worlds:,} worlds"
+                f" does one of {self.plan.templates} random braking profiles (templates) improve the return of the"
+                f" earlier experts by more than {self.plan.gain:g}; set fewer networks, or remove the key experts"
             )
         if number == stage.first:
             self.policy.actors[stage.network].load_state_dict(pupil.state_dict())

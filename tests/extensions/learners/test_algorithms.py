@@ -295,7 +295,7 @@ def test_imitation__draws_from_the_stream_of_its_own_seed() -> None:
 
 def test_training__says_that_no_template_does_better(tmp_path: Path) -> None:
     with pytest.raises(
-        NoBetterTemplate, match=r"expert 2 has nothing to learn: in each of 64 worlds, the best of 20 templates"
+        NoBetterTemplate, match=r"expert 2 has nothing to learn: in none of 64 worlds does one of 20 random"
     ):
         train(TINY_EXPERTS.replace(experts={**EXPERTS, "gain": 1e6}), SCENARIO, tmp_path / "run", measure=None)
     assert eb.load_policy(tmp_path / "run" / "policy-last").manifest.network.networks == 2
