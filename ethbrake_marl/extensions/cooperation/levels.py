@@ -123,7 +123,7 @@ def sweep_levels(name: str, sweep: str, settings: Sequence[Override], recipes: S
     Args:
         name: name or path of the scenario.
         sweep: key of the scenario and the values that it takes, ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``.
-        settings: settings ``KEY=VALUE`` of other keys of the scenario.
+        settings: settings ``KEY=VALUE`` for keys of the scenario other than the key of the sweep.
         recipes: training recipes of the ablation.
 
     Raises ``InvalidInput`` if the key of the sweep is not a key of a scenario; if ``settings`` or a recipe also set

@@ -61,8 +61,8 @@ class Measure:
     def __call__(self, sample: Sample) -> Measured:
         """Return the agent's score and harm in each world of ``sample``, and the harm or bound to compare with.
 
-        If the physics fails in any world, the scores of all worlds are minus infinity. Raises ``InvalidInput`` for the
-        measure ``bound`` if the agent has no shield.
+        If the physics cannot simulate a world, the score of this world is minus infinity, and its harm is NaN. Raises
+        ``InvalidInput`` for the measure ``bound`` if the agent has no shield.
         """
         n = sample.worlds.n
         score, harm, reference = np.full(n, -np.inf), np.full(n, np.nan), np.full(n, np.nan)
