@@ -109,7 +109,7 @@ def with_intervals(
 
     Args:
         axes: axes to draw on.
-        at: position of each mark on the x axis (``upright``) or on the y axis.
+        at: position of each mark on the x axis if ``upright`` is true, else on the y axis.
         estimates: value and confidence interval of each mark.
         upright: if True, the y axis shows the values; if False, the x axis shows the values.
         style: further arguments of matplotlib's ``errorbar``.

@@ -89,7 +89,7 @@ class _Game(NamedTuple):
         return problem.values(self.together(own))[self.task.harm_count]
 
     def response(self, c: int, own: list[Profiles], effort: Mapping[str, int]) -> Profiles:
-        """Search for the best profile of learner ``c`` (from 0) if the other learners follow the profiles ``own``.
+        """Search for the profile with the lowest objective of learner ``c`` (from 0) if the others follow ``own``.
 
         ``effort`` contains keyword arguments of ``search_profiles``, such as ``budget``. For the same commands, the
         search for one learner and the search for all learners (``joint``) may compute slightly different harms, because
@@ -106,7 +106,7 @@ class _Game(NamedTuple):
         return search_profiles(problem, joined(starts, problem.n), **effort)[0]
 
     def _following(self, c: int, own: list[Profiles]) -> Vehicles:
-        """Return vehicle parameters with which all learners but number ``c`` (from 0) follow the profiles ``own``."""
+        """Return vehicle parameters that make all learners except ``c`` (from 0) follow their profiles in ``own``."""
         vehicles, clock, old = self.worlds.vehicles, self.joint.clock, self.worlds.vehicles.pieces
         count = old.shape[2] // 2
         pieces = np.full((*old.shape[:2], 2, max(count, MOST_PHASES)), np.inf)

@@ -164,7 +164,7 @@ def _harms(own: LevelOptimum, other: LevelOptimum, rows: Ints) -> Iterator[dict[
 
 @dataclass(frozen=True, slots=True)
 class Harms:
-    """Harm in the same worlds with the policies of each training run (seed) of one level.
+    """Harm in the worlds of one level under the trained policies of each training run (seed).
 
     A level without learners counts as one training run.
     """

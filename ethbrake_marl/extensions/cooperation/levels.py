@@ -324,8 +324,8 @@ def plan_ablation(
         tell: function that is called with a note if ``gamma`` and ``reward.shaping_discount`` of a recipe differ.
         given: further fields of ``Plan``, such as ``seeds``; a field that is None gets its default.
 
-    Raises ``InvalidInput`` if two recipes have the same name, if a number is below 1, if the shield is unknown, if no
-    level has a learner, or if levels cannot be trained or compared.
+    Raises ``InvalidInput`` if two recipes have the same name, if a number such as ``seeds`` is below 1, if the shield
+    is unknown, if no level has a learner, or if levels cannot be trained or compared.
 
     """
     usual_names: tuple[str, ...] = (LADDER if quick else STANDARD) if sweep is None else (SWEPT,)

@@ -127,8 +127,8 @@ def _train_alone(experiment: Experiment, tell: OnProgress) -> dict[str, Team]:
 def _without_messages(experiment: Experiment, tell: OnProgress) -> tuple[list[Compared], str]:
     """Train a team with sensors instead of messages; return comparisons with this team, and a sentence about this team.
 
-    If the scenario has no messages or is a mixture, or if a team with sensors cannot be trained, the list of
-    comparisons is empty, and the sentence says why there are no comparisons.
+    No comparison is made if the scenario has no messages, if the scenario is a mixture of scenarios, or if a team with
+    sensors cannot be trained. In this case, the sentence says why the list of comparisons is empty.
     """
     evaluation, scenario = experiment.evaluation, experiment.evaluation.scenario
     if scenario.members or scenario.v2x.channel.hears == "none":

@@ -81,8 +81,8 @@ class LearningCurves(NamedTuple):
     ) -> bool:
         """Train every recipe with every seed. Finished training runs are not repeated; unfinished runs continue.
 
-        Returns False if Ctrl-C stopped a training run. Raises the exceptions of ``train_all``; in particular, before
-        any run begins, ``InvalidInput`` if a folder contains a training run with other settings.
+        Returns False if Ctrl-C stopped a training run. Raises the exceptions of ``train_all``, for instance
+        ``InvalidInput`` (before any run begins) if a folder contains a training run with other settings.
 
         Args:
             steps: number of steps of each training run; None: the number in the recipe.

@@ -243,12 +243,12 @@ def falsify_command(
 ) -> None:
     """Search a scenario for the worlds in which an agent does worst.
 
-    --measure sets the score of a world; a larger score is worse. With harm, the score is the agent's harm. With regret,
-    the score is the agent's harm minus the harm of --against (by default the best known commands). With difference, the
-    score is the absolute difference between the harms of the agent and of --against. With bound, the score is the
-    agent's harm minus the bound of its shield, so a score above 0 means that the bound is broken. With --again FILE,
-    the agent that FILE names (or --agent) drives the worlds of FILE again. If the new score of at least one world is
-    larger than its score in FILE, the exit status is 1.
+    --measure selects how a world is scored; the worst worlds have the largest scores. With harm, the score is the
+    agent's harm. With regret, the score is the agent's harm minus the harm of --against (by default the best known
+    commands). With difference, the score is the absolute difference between the harms of the agent and of --against.
+    With bound, the score is the agent's harm minus the bound of its shield, so a score above 0 means that the bound is
+    broken. With --again FILE, the agent that FILE names (or --agent) drives the worlds of FILE again. If the new score
+    of at least one world is larger than its score in FILE, the exit status is 1.
     """
     with Out(as_json=as_json, force=force) as out:
         import numpy as np

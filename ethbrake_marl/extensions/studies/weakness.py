@@ -59,7 +59,7 @@ class Measure:
     harm_count: HarmCount  # harm count: the first impact of each pair (``first``) or all impacts (``total``)
 
     def __call__(self, sample: Sample) -> Measured:
-        """Return the agent's score and harm in each world of ``sample``, and the harm or bound to compare with.
+        """Return for each world the agent's score, the agent's harm, and the harm or bound to compare this harm with.
 
         If the physics cannot simulate a world, the score of this world is minus infinity, and its harm is NaN. Raises
         ``InvalidInput`` for the measure ``bound`` if the agent has no shield.
