@@ -36,7 +36,7 @@ def choose_worlds(measured: Sequence[Measured]) -> list[Played]:
 
     In some of the chosen worlds the harm decreases most, in some by about the median, and in some least. The decrease
     of harm is computed with the policies of the first seed. If a level differs from an earlier level only by a worse
-    V2X channel, it is not used.
+    V2X channel, this level is not used.
     """
     ladder = [one for one in measured if one.level.clear is None]
     first, last = ladder[0], ladder[-1]

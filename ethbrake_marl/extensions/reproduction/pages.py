@@ -32,7 +32,7 @@ def _account(results: Sequence[Result]) -> tuple[str, str, str, list[str]]:
 
     The second result is the command line with which a reader can reproduce the results. The origin of the results
     states dates, machines and processor time. If the results use fewer worlds than the paper, the list of remarks has
-    one entry. If not, the list of remarks is empty.
+    one entry. If the results use as many worlds as the paper, the list is empty.
     """
     every = len(results) == len(ITEMS)
     most = max((result.episodes for result in results), default=MOST_EPISODES)

@@ -75,7 +75,7 @@ def lineup(scenario: Scenario, *specs: str) -> dict[str, Agent]:
     """Return the agents that ``specs`` describe, as a dictionary by name.
 
     Each of ``specs`` is a text that describes an agent, such as ``"full_brake"``. If ``NAMES`` contains a name for this
-    text, the agent has this name in the result. If not, the text is the name of the agent.
+    text, the agent has this name in the result. If ``NAMES`` contains no name for the text, the text is the name.
     """
     return {NAMES.get(spec, spec): agent for spec, agent in make_agents(specs, scenario).items()}
 
