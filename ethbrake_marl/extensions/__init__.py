@@ -1,4 +1,5 @@
 """Extensions: optional parts of the package, one folder each.
 
-The other modules work without this folder, because every extension registers itself by an entry point.
+The rest of the package works without the folder ``extensions``, because every extension registers itself by an entry
+point.
 """

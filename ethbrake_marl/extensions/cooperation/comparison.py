@@ -123,8 +123,8 @@ def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: 
 
     Args:
         one: results of the level without a shield.
-        shielded: results of the same policies in the same worlds, with a shield that bounds the harm ``harm_count``.
-        harm_count: impacts that count as harm: the first impact of each pair (``first``), or all (``total``).
+        shielded: results of the same policies in the same worlds, with a shield.
+        harm_count: harm that the shield bounds: first-impact harm (``first``) or total harm (``total``).
         searched: number of worlds in which the joint optimum was searched; the result also contains the mean harm over
             the first ``searched`` worlds.
 

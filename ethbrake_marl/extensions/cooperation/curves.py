@@ -109,7 +109,7 @@ def with_intervals(
 
     Args:
         axes: axes to draw on.
-        at: position of each mark on the axis that does not show the values.
+        at: position of each mark on the x axis if ``upright`` is true, else on the y axis.
         estimates: value and confidence interval of each mark.
         upright: if True, the y axis shows the values; if False, the x axis shows the values.
         style: further arguments of matplotlib's ``errorbar``.
@@ -136,7 +136,7 @@ def _curve(
     shade: bool = False,
     **style: Any,
 ) -> None:
-    """Draw an estimate for each swept value, with its confidence interval as whiskers, or as a band if ``shade``."""
+    """Draw an estimate for each swept value, with its confidence interval as a band (``shade``) or as whiskers."""
     at = _places(levels, beside)
     if not shade:
         with_intervals(axes, at, estimates, **style)
@@ -147,9 +147,9 @@ def _curve(
 
 
 def _places(levels: Sequence[Json], beside: int) -> list[float]:
-    """Return the x position of each level's mark: the varied key's value, moved right by ``beside`` small distances.
+    """Return the x position of each level's mark: the varied key's value, moved to the right.
 
-    The small distance is ``_BESIDE`` times the length of the axis.
+    The mark is moved by ``beside`` times ``_BESIDE`` times the length of the axis.
     """
     low, high = _span(levels)
     return [level["swept_number"] + beside * _BESIDE * (high - low) for level in levels]

@@ -77,7 +77,7 @@ class _Game(NamedTuple):
     def together(self, own: list[Profiles]) -> Profiles:
         """Join the profiles ``own``, one for each learner, into one profile with the commands of all learners.
 
-        A phase of the result is the time from one decision to the next.
+        Each phase of the joined profile lasts from one decision to the next.
         """
         steps = np.arange(int(self.joint.last_step.max()))
         at = [np.concatenate([each.at(np.full(self.joint.n, step)) for each in own], axis=1) for step in steps]
@@ -89,11 +89,11 @@ class _Game(NamedTuple):
         return problem.values(self.together(own))[self.task.harm_count]
 
     def response(self, c: int, own: list[Profiles], effort: Mapping[str, int]) -> Profiles:
-        """Search for the best profile of learner ``c`` (from 0) if the other learners follow the profiles ``own``.
+        """Search for the profile with the lowest objective of learner ``c`` (from 0) if the others follow ``own``.
 
-        ``effort`` contains keyword arguments of ``search_profiles``, such as ``budget``. Because of rounding, the
-        search for one learner may compute a slightly different harm of a profile than ``joint``, the search problem of
-        all learners.
+        ``effort`` contains keyword arguments of ``search_profiles``, such as ``budget``. For the same commands, the
+        search for one learner and the search for all learners (``joint``) may compute slightly different harms, because
+        of rounding.
         """
         task, others = replace(self.task, vehicles=self.task.vehicles[c : c + 1]), self.others
         problem = profile_problem(
@@ -106,7 +106,7 @@ class _Game(NamedTuple):
         return search_profiles(problem, joined(starts, problem.n), **effort)[0]
 
     def _following(self, c: int, own: list[Profiles]) -> Vehicles:
-        """Return vehicle parameters with which all learners but number ``c`` (from 0) follow the profiles ``own``."""
+        """Return vehicle parameters that make all learners except ``c`` (from 0) follow their profiles in ``own``."""
         vehicles, clock, old = self.worlds.vehicles, self.joint.clock, self.worlds.vehicles.pieces
         count = old.shape[2] // 2
         pieces = np.full((*old.shape[:2], 2, max(count, MOST_PHASES)), np.inf)
@@ -136,10 +136,11 @@ def find_equilibria(
 ) -> dict[str, Equilibrium]:
     """Search equilibria of the scenario's learners by alternating best responses, once from each start in ``STARTS``.
 
-    In every round, each learner searches for a better profile, and changes its profile if the gain is larger than
-    ``tolerance``. If no learner changes its profile in a round, the result is an approximate equilibrium of
-    open-loop profiles. The equilibrium is only approximate because a search tries only ``budget`` candidate profiles.
-    A world may have further equilibria. The result for a world does not depend on the other worlds or on ``threads``.
+    In every round, each learner searches for a profile that lowers its own objective, and adopts this profile if the
+    objective falls by more than ``tolerance``. If no learner changes its profile in a round, the result is an
+    approximate equilibrium of open-loop profiles. The equilibrium is only approximate because a search tries only
+    ``budget`` profiles. A world may have further equilibria. The result for a world does not depend on the other worlds
+    or on ``threads``.
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.extensions.cooperation import compare_starts, find_equilibria
@@ -192,7 +193,7 @@ def find_equilibria(
 
 
 def _settle(game: _Game, own: list[Profiles], rounds: int, tolerance: float, effort: Mapping[str, int]) -> Equilibrium:
-    """Let the learners improve the profiles ``own`` in turn, until no learner gains more than ``tolerance`` (m2/s2)."""
+    """Let the learners in turn improve the profiles ``own``, until no objective falls by more than ``tolerance``."""
     active, taken = np.arange(game.joint.n), np.zeros(game.joint.n, np.int64)
     for turn in range(rounds):
         part, mine = game.take(active), [each.take(active) for each in own]
@@ -249,7 +250,7 @@ def best_joint_harm(
     Args:
         scenario: scenario of the worlds.
         worlds: the n worlds at the alert.
-        ends: equilibria of the scenario's learners in ``worlds``; the learners may have had any objectives.
+        ends: equilibria of the scenario's learners in ``worlds``, for any objectives of the learners.
         harm_count: impacts that count as harm in the search: ``first`` (first impact of each pair), or ``total`` (all).
         budget: number of candidate profiles that ``best_harm`` tries per world.
         seed: seed of the random numbers in ``best_harm``.
@@ -269,8 +270,9 @@ def best_joint_harm(
 def price_of_anarchy(borne: Floats, optimum: Floats) -> Estimate | None:
     """Return (line's mean harm in equilibrium) / (line's mean harm in the joint optimum) and its confidence interval.
 
-    If ``borne`` is ``Spread.worst``, this ratio is called the price of anarchy; if ``borne`` is ``Spread.best``, the
-    price of stability. The function returns None if the harm of the joint optimum is 0 in every world.
+    For the worst equilibria (``Spread.worst``), the ratio is called the price of anarchy. For the best equilibria
+    (``Spread.best``), the ratio is called the price of stability. The function returns None if the harm of the joint
+    optimum is 0 in every world.
 
     Args:
         borne: [n, N] harm of each vehicle in equilibrium, m2/s2. Worlds with NaN (no equilibrium) are left out.

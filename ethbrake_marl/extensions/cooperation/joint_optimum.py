@@ -56,8 +56,8 @@ class LevelOptimum:
 def questions(plan: Plan, samples: Sequence[Sample]) -> list[tuple[Level, Sample, list[Level]]]:
     """Return the searches for joint optima that an ablation needs, each as (level, worlds to search, list of levels).
 
-    Levels with the same search problem share one search: the list contains all of them, and ``level`` is the first of
-    them. Levels without learners need no search.
+    Levels with the same search problem share one search. The list of levels contains all levels that share the search,
+    and ``level`` is the first level in this list. Levels without learners need no search.
 
     Args:
         plan: settings of the ablation.
@@ -82,7 +82,7 @@ def search_all(plan: Plan, samples: Sequence[Sample], jobs: int, tell: OnProgres
     Args:
         plan: settings of the ablation.
         samples: worlds of each level, in the order of ``plan.levels``.
-        jobs: number of threads of the search.
+        jobs: number of threads in the search for joint optima.
         tell: function that is called with each progress report.
 
     """
@@ -108,9 +108,9 @@ def best_known(own: LevelOptimum, answers: Sequence[LevelOptimum]) -> dict[HarmC
     """Return the least known harm in each world of a level, as a mapping: count of harm -> [n] harm (m2/s2).
 
     Args:
-        own: the level, with the result of its search and its trained teams.
-        answers: all levels, including ``own``, with their search results and teams. The function uses the results of
-            another level in the worlds in which the learners of ``own`` can give the commands of that level's learners.
+        own: level whose least known harm is returned, with its search result and its trained teams.
+        answers: all levels, including ``own``, with their search results and teams. In a world, the function uses the
+            commands of another level if the learners of ``own`` can give the same commands.
 
     """
     best = {harm_count: np.full(own.worlds.n, np.inf) for harm_count in HARM_COUNTS}
@@ -164,7 +164,7 @@ def _harms(own: LevelOptimum, other: LevelOptimum, rows: Ints) -> Iterator[dict[
 
 @dataclass(frozen=True, slots=True)
 class Harms:
-    """Harm in the same worlds with the policies of each training run (seed) of one level.
+    """Harm in the worlds of one level under the trained policies of each training run (seed).
 
     A level without learners counts as one training run.
     """
@@ -209,7 +209,7 @@ class Goal(NamedTuple):
 
     @property
     def missed(self) -> bool:
-        """Whether the mean of the quantity is larger, so worse, with the trained policies than with full braking."""
+        """Whether the mean of the minimised quantity is larger with the trained policies than with full braking."""
         return self.reached > self.full_brake + TOLERANCE
 
 
@@ -238,7 +238,7 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
 
     Args:
         plan: settings of the ablation. All training runs of the ablation must be finished.
-        jobs: number of threads of the search.
+        jobs: number of threads in the search for joint optima.
         tell: function that is called with each progress report; None: progress is not reported.
 
     Returns one result for each level and algorithm: levels in the order of ``plan.levels``, and for each level the

@@ -123,7 +123,7 @@ def sweep_levels(name: str, sweep: str, settings: Sequence[Override], recipes: S
     Args:
         name: name or path of the scenario.
         sweep: key of the scenario and the values that it takes, ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``.
-        settings: settings ``KEY=VALUE`` of other keys of the scenario.
+        settings: settings ``KEY=VALUE`` for keys of the scenario other than the key of the sweep.
         recipes: training recipes of the ablation.
 
     Raises ``InvalidInput`` if the key of the sweep is not a key of a scenario; if ``settings`` or a recipe also set
@@ -324,8 +324,8 @@ def plan_ablation(
         tell: function that is called with a note if ``gamma`` and ``reward.shaping_discount`` of a recipe differ.
         given: further fields of ``Plan``, such as ``seeds``; a field that is None gets its default.
 
-    Raises ``InvalidInput`` if two recipes have the same name, if a number is below 1, if the shield is unknown, if no
-    level has a learner, or if levels cannot be trained or compared.
+    Raises ``InvalidInput`` if two recipes have the same name, if a number such as ``seeds`` is below 1, if the shield
+    is unknown, if no level has a learner, or if levels cannot be trained or compared.
 
     """
     usual_names: tuple[str, ...] = (LADDER if quick else STANDARD) if sweep is None else (SWEPT,)

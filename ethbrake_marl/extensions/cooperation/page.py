@@ -34,9 +34,9 @@ _MOST, _USUAL, _LEAST = 3, 2, 2  # number of example worlds with the largest, a 
 def choose_worlds(measured: Sequence[Measured]) -> list[Played]:
     """Choose worlds for the page by the decrease of total harm from the first to the last level.
 
-    Some of the chosen worlds have the largest decrease, some a median decrease, and some the least decrease. The
-    decrease is computed with the policies of the first seed. Levels that are copies of an earlier level with a worse
-    V2X channel are ignored.
+    In some of the chosen worlds the harm decreases most, in some by about the median, and in some least. The decrease
+    of harm is computed with the policies of the first seed. If a level differs from an earlier level only by a worse
+    V2X channel, this level is not used.
     """
     ladder = [one for one in measured if one.level.clear is None]
     first, last = ladder[0], ladder[-1]

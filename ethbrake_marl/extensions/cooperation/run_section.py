@@ -65,8 +65,8 @@ class Compared(NamedTuple):
 def make_section(experiment: Experiment, tell: OnProgress) -> RunSection | None:
     """Compare a run's trained team with learners trained alone, a team without messages, and the joint optimum.
 
-    The function trains each learner alone, trains a team without messages, and searches the joint optimum. In each of
-    these training runs, a learner makes as many decisions as in the original run. The training runs are stored in
+    The function trains each learner alone, trains a team without messages, and searches the joint optimum. In each
+    new training run, a learner makes as many decisions as in the original run. The new training runs are stored in
     ``alone/`` and ``without-messages/`` in the folder of the run, and the results of the comparison in
     ``cooperation.json``. If a training run is interrupted or fails, the function omits the remaining training runs and
     the search.
@@ -127,8 +127,8 @@ def _train_alone(experiment: Experiment, tell: OnProgress) -> dict[str, Team]:
 def _without_messages(experiment: Experiment, tell: OnProgress) -> tuple[list[Compared], str]:
     """Train a team with sensors instead of messages; return comparisons with this team, and a sentence about this team.
 
-    If the scenario has no messages or is a mixture, or if a team with sensors cannot be trained, the list of
-    comparisons is empty, and the sentence says why there are no comparisons.
+    No comparison is made if the scenario has no messages, if the scenario is a mixture of scenarios, or if a team with
+    sensors cannot be trained. In this case, the sentence says why the list of comparisons is empty.
     """
     evaluation, scenario = experiment.evaluation, experiment.evaluation.scenario
     if scenario.members or scenario.v2x.channel.hears == "none":
@@ -206,7 +206,7 @@ def _train(experiment: Experiment, scenario: Scenario, folder: str, share: int, 
         experiment: the finished run, whose recipe is used.
         scenario: scenario to train in.
         folder: name of the folder for this training run, inside the folder of the finished run.
-        share: divisor: this training run makes (number of decisions of the finished run) / ``share`` decisions.
+        share: the new training run makes (number of decisions of the finished run) / ``share`` decisions.
         tell: function that is called with each progress report.
 
     """

@@ -85,7 +85,7 @@ class Swept(NamedTuple):
 
     @property
     def label(self) -> str:
-        """End of the name of the level that has this value, such as ``social-15`` or ``v2x.lost-0.1``."""
+        """Text that the name of the level ends with, such as ``social-15`` or ``v2x.lost-0.1``."""
         return f"{self.word.rstrip(':') or self.key}-{self.text}"
 
     @property

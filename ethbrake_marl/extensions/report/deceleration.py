@@ -32,7 +32,7 @@ _LONG_S = 1e4  # s; two vehicles that have not met until then never meet
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Constant deceleration that a method chooses in one world, and the harm that the method computes for it."""
+    """Constant deceleration that E-V2X-BM chooses in one world, and the harm that E-V2X-BM computes for it."""
 
     deceleration_mps2: float  # chosen deceleration, m/s2
     harm: float  # predicted or simulated harm at the chosen deceleration, m2/s2

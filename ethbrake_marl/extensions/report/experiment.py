@@ -152,8 +152,8 @@ def write_figures(
         course: evaluations during the training, each with ``steps``, ``first_impact_harm``, ``total_harm`` and
             ``collision_rate``.
         course_caption: caption of the learning curve.
-        agents: evaluated agents, by name. The trained policy and two baselines drive a typical world again for the
-            third figure.
+        agents: evaluated agents, by name. The trained policy and two baselines drive a typical world again, and the
+            third figure shows these episodes.
         learned: name of the trained policy or team in ``agents``.
         harm_count: harm count by which the typical world is chosen, ``first`` or ``total``.
 
@@ -190,7 +190,7 @@ def telling_world(evaluation: Evaluation, harm_count: HarmCount = "first", learn
 
     The reduction of the harm is the harm of full braking minus the harm of ``learned``, the trained policy or team. The
     median is taken over the worlds in which full braking does harm. If full braking does no harm in any world, the
-    index is 0. ``harm_count`` is the harm count for the reduction: ``first`` or ``total``.
+    function returns 0. ``harm_count`` is the harm count for the reduction: ``first`` or ``total``.
     """
     before = evaluation.outcome(BESIDE[0]).world_harm(harm_count)
     rows = np.flatnonzero(before > 0.0)

@@ -83,7 +83,7 @@ class _Strip:
         return (float(place_m) - self._left) * self._scale
 
     def drawn(self) -> Iterator[str]:
-        """Yield the SVG elements that draw the strip."""
+        """Yield the SVG elements that draw this strip: the road, its vehicles and the title of one film."""
         yield f'<text x="12" y="22" font-weight="bold">{escape(self.title)}</text>'
         texts = [
             f"harm {scene.first_harm:.1f} by first impacts, {scene.total_harm:.1f} in total" for scene in self._film
@@ -152,7 +152,7 @@ class _Strip:
         """Return the impacts to show, each as (start, stop, impact): scenes ``start`` to ``stop - 1`` show the impact.
 
         Only one impact is shown at a time. If the next impact is at least as strong as the shown impact, the next
-        impact replaces the shown impact. A weaker impact is not shown.
+        impact replaces the shown impact. If the next impact is weaker, it is never shown.
         """
         known: set[tuple[int, float]] = set()
         events: list[tuple[int, int, Struck]] = []

@@ -152,8 +152,8 @@ class Part:
             figure: figure of matplotlib, or the bytes of an SVG file with a figure of this package.
             title: title above the figure.
             description: description of what the figure shows.
-            alone: whether the figure keeps its own colours on a white background (for instance a map), instead of the
-                light or dark colours of the page.
+            alone: True: the figure, for instance a map, keeps its own colours on a white background; False: the figure
+                gets the light or dark colours of the page.
             known: text that is omitted from the caption, because the page shows it elsewhere.
             where: path of the SVG file, for error messages.
 

@@ -120,9 +120,10 @@ _SPLIT: tuple[Column | str, ...] = (
 def shield_section(rows: ShieldModes, conditions: str) -> Section:
     """Return the section that compares the modes of the shield.
 
-    The section also counts the interventions of the mode ``step`` that were needed (the harm is higher without the
-    intervention), harmless (equal) and costly (lower). ``rows`` are the results, one row for each agent and mode of its
-    shield. ``conditions`` is a sentence about the worlds and the harm count. The section is empty if ``rows`` is empty.
+    The section also counts the needed, harmless and costly interventions of the mode ``step``. Without an intervention,
+    the harm is higher (needed), equal (harmless) or lower (costly). ``rows`` are the results, one row for each agent
+    and mode of its shield. ``conditions`` is a sentence about the worlds and the harm count. The section is empty if
+    ``rows`` is empty.
     """
     if not rows:
         return Section("Shield", ())
@@ -180,8 +181,8 @@ class Report:
 
         Args:
             agents: evaluated agents, by name; they are not changed.
-            on_agent: function that is called with the name of an agent, once this agent has driven the worlds for the
-                episodes to watch.
+            on_agent: function that is called with the name of each agent after the agent has driven all worlds that
+                the page shows as episodes.
 
         """
         evaluation, focus, harm_count = self.evaluation, self.about, self.harm_count
@@ -285,9 +286,9 @@ class Report:
         """Return the end of ``first_sentence``, which names tests or worlds in which the agent does badly, if any.
 
         The text names the tests in ``self.tests`` in which the agent's harm is not clearly less than the harm of full
-        braking (see ``_change``). If the agent's harm is clearly less in all tests, the text says in how many worlds of
-        the evaluation the agent does more harm than full braking. ``harm`` is the name of the compared measure, for
-        instance ``total_harm``.
+        braking (see ``_change``). If the agent does clearly less harm than full braking in all these tests, the text
+        says in how many worlds of the evaluation the agent does more harm than full braking. ``harm`` is the name of
+        the compared measure, for instance ``total_harm``.
         """
         reasons = []
         for title, _, others in self.tests:
@@ -393,7 +394,7 @@ def _remarks(rows: SummaryTable) -> list[str]:
 def _measured(rows: SummaryTable, because: str = "") -> list[Part]:
     """Return parts of the page: the conditions under which ``rows`` were measured, and tables of all measures.
 
-    The tables are hidden until the reader clicks on their title.
+    The tables of all measures are hidden until the reader clicks on the title above them.
 
     If ``rows`` also contains results that the paper prints, the first table shows these results. ``because`` is a
     sentence that says why some columns are empty.
@@ -451,7 +452,7 @@ def write_evaluation(
 
     Args:
         path: path of the HTML file.
-        evaluation: evaluation of the agents.
+        evaluation: evaluation that the page describes.
         rows: results of the evaluation, one row for each agent.
         agents: evaluated agents, by name. These agents drive some worlds again for the episode player.
         harm_count: harm count that the agents minimise, ``first`` or ``total``.

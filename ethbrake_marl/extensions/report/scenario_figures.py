@@ -89,7 +89,7 @@ def worlds_figure(scenario: Scenario, sample: Sample, *, seed: int) -> Figure:
 
 
 def _paired(worlds: Worlds, focus: int) -> dict[str, Floats]:
-    """Return the quantities to draw in scatter plots, as a dictionary from label to values [n].
+    """Return the quantities of n worlds to draw in scatter plots, as a dictionary from label to values [n].
 
     Quantities that have the same value in all worlds are omitted. At most ``_MOST_PAIRED`` quantities are returned;
     quantities of vehicles and pairs near the vehicle ``focus`` are chosen first.
@@ -167,8 +167,8 @@ def _pairs(paired: Mapping[str, Floats], kinds: Any, part: Any) -> None:
 def _lines(sample: Sample, shown: Mapping[int, str], part: Any) -> None:
     """Draw the vehicles of some worlds at the alert, to scale, one world below the other.
 
-    ``shown`` maps the index of each drawn world in ``sample`` to a description. ``part`` is the sub-figure of
-    matplotlib to draw in.
+    ``shown`` maps the index of each drawn world in ``sample`` to words for its title, such as ``shortest line``.
+    ``part`` is the sub-figure of matplotlib to draw in.
     """
     worlds, every = sample.worlds, part.subplots(len(shown), 1, squeeze=False, sharex=True).ravel()
     for axes, (row, name) in zip(every, shown.items(), strict=True):

@@ -70,8 +70,8 @@ def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS)
 def worst_rows(evaluation: Evaluation, focus: str) -> Ints:
     """Return the indices of at most ten worlds in which the agent ``focus`` did worst, worst first.
 
-    The worst world is the one with the largest regret in total harm, or with the largest total harm if no best known
-    harm exists. Worlds whose regret (or harm) is 0 are omitted.
+    The worst world has the largest regret in total harm. If the best known harm is not available, the worst world has
+    the largest total harm. Worlds whose regret (or harm) is 0 are omitted.
     """
     outcome, regrets = evaluation.outcome(focus), regrets_of(evaluation)
     value = outcome.total_harm if regrets is None else regrets.regret(outcome, "total")

@@ -51,8 +51,8 @@ class ShownFigure(Figure):
     def draw(self, renderer: RendererBase) -> None:
         """Draw the figure with matplotlib's ``renderer``.
 
-        When matplotlib saves a figure to a file, it calls this method twice and uses only the second picture. Therefore
-        the first of these two calls only computes the layout.
+        When matplotlib saves a figure to a file, it calls ``draw`` twice and uses only the second picture. Therefore
+        the first call of ``draw`` only computes the layout.
         """
         engine = self.get_layout_engine()
         if self.axes and isinstance(engine, ConstrainedLayoutEngine) and self.canvas.is_saving():

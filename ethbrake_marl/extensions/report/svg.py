@@ -143,7 +143,7 @@ def _is_ours(svg: bytes) -> bool:
 
 
 def _restyle(element: ElementTree.Element, recolour: bool) -> None:
-    """Replace the ``style`` attribute of ``element`` by one attribute for each CSS property in it.
+    """Replace the ``style`` attribute of ``element`` by one attribute for each CSS property in ``style``.
 
     If ``recolour`` is true, the colours of the figure are replaced by the colours of the page.
     """

@@ -45,8 +45,8 @@ _KEPT = ("collision_rate", "first_impact_harm", "total_harm")  # columns of the 
 def brief(table: SummaryTable, beside: Mapping[str, SummaryTable]) -> Sheet:
     """Return a short table of each agent's collision rate and harms, and of its harms on the other tests.
 
-    *Harms* are first-impact harm and total harm. The notes about the results are below the table. The table omits all
-    other measures, and results that the paper prints.
+    *Harms* are first-impact harm and total harm. The table contains no other measures, and no results that the paper
+    prints. The notes about the results are below the table.
 
     Args:
         table: summary of the agents' results on the scenario of the run.

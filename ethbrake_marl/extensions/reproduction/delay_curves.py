@@ -62,7 +62,7 @@ _NUMBER, _DECISIONS = Column("Final return", digits=3), Column("Decisions", digi
 def _shipped_ends(settings: Reproduction) -> Made:
     """Evaluate shipped policies at low and high delay; return verdicts, a table and data.
 
-    The policies are evaluated with both assumptions on when Vehicle 2 may act (``READINGS``).
+    The policies are evaluated under both assumptions on when Vehicle 2 may act (``READINGS``).
     """
     episodes = min(2_000, settings.episodes)
     verdicts, rows, data = [], [], []
@@ -134,7 +134,7 @@ class Course:
 
     @property
     def still_rising(self) -> float:
-        """Mean rise of the return in the last quarter of the runs, divided by the absolute value of ``rise``."""
+        """Rise of the return in the last quarter of a run, averaged over the runs, divided by abs(``rise``)."""
         before = self.returns_at(np.array([0.75]))[:, 0]
         return float((self.returns.values[:, -1] - before).mean()) / abs(self.rise)
 

@@ -56,7 +56,7 @@ def estimates_figure(
 
 
 def road_figure(records: Mapping[str, EpisodeRecord], *, caption: str) -> Figure:
-    """Draw the positions of all vehicles on the road, in the way of the paper's figure.
+    """Draw the positions of all vehicles on the road, as in the paper's figure.
 
     Each episode has a panel, and each vehicle has a row in the panel.
 

@@ -255,8 +255,8 @@ def scenario_parameters(scenario: Scenario, **places: str) -> list[Parameter]:
 
     Args:
         scenario: the scenario.
-        places: place where the paper states the value, by key of the scenario. For a key that ``places`` does not
-            contain, the place in ``_QUANTITIES`` is used. An empty place means that the paper does not state the value,
+        places: for some keys of the scenario, the place where the paper states the value of this key. For the other
+            keys, the place in ``_QUANTITIES`` is used. An empty place means that the paper does not state the value,
             and that the value is our default.
 
     """

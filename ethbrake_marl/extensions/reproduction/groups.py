@@ -59,8 +59,8 @@ def by_distance(evaluation: Evaluation) -> tuple[list[float], Groups]:
     """Divide the worlds of an evaluation into groups by the sum of the two gaps.
 
     Return two results. The first result is a list with the mean sum of the two gaps (m) in each group of worlds. The
-    second result is a dictionary ``{"10-12 m": {"PPO": harm, ...}, ...}`` from the group and the strategy to an array
-    ``harm`` with one value for each world of the group. Groups without worlds are omitted.
+    second result is a dictionary ``{"10-12 m": {"PPO": harm, ...}, ...}``. For each group and each strategy, the array
+    ``harm`` contains the harm in each world of the group. Groups without worlds are omitted.
     """
     total, each_harm = evaluation.worlds.gaps_m.sum(axis=1), harms(evaluation)
     inner, at, groups = np.digitize(total, _ENDS_M[1:-1]), [], {}

@@ -67,9 +67,9 @@ def _drive_hybrid(name: str, settings: Reproduction, reading: Reading) -> Evalua
 def _driven_hybrid(name: str, settings: Reproduction, reading: Reading, about: str) -> Evaluation:
     """Return the evaluation that ``_drive_hybrid`` describes; a repeated call returns the result from the cache.
 
-    ``about`` is the description of the policy that has not converged, and is part of the cache key. If the training run
-    of this policy ends after the first call, the trained policy replaces a shipped policy, the description changes, and
-    the strategies are evaluated again.
+    ``about`` is the description of the policy that has not converged, and is part of the cache key. Until this policy
+    is trained, a shipped policy is used instead. When the trained policy replaces the shipped policy, the description
+    changes, so the strategies are evaluated again.
     """
     scenario, (policy, _) = reading.scenario(name), unconverged_policy(settings)
     agents: dict[str, Agent] = {

@@ -81,13 +81,13 @@ class LearningCurves(NamedTuple):
     ) -> bool:
         """Train every recipe with every seed. Finished training runs are not repeated; unfinished runs continue.
 
-        Returns False if Ctrl-C stopped a training run. Raises the exceptions of ``train_all``; in particular, before
-        any run begins, ``InvalidInput`` if a folder contains a training run with other settings.
+        Returns False if Ctrl-C stopped a training run. Raises the exceptions of ``train_all``, for instance
+        ``InvalidInput`` (before any run begins) if a folder contains a training run with other settings.
 
         Args:
             steps: number of steps of each training run; None: the number in the recipe.
-            settings: texts ``KEY=VALUE`` of the changes that scenario and recipes already contain. These texts are only
-                written into the file ``config.json`` of each training run.
+            settings: changes that the scenario and the recipes already contain, as texts ``KEY=VALUE``. The changes are
+                not made again, but only noted in the file ``config.json`` of each training run.
             jobs: number of training runs at the same time.
             tell: function that is called with the progress; None: the progress is not reported.
 
@@ -110,9 +110,9 @@ class LearningCurves(NamedTuple):
     def write(self) -> dict[str, Any]:
         """Draw the curves of the training runs, write figure, table and summary to the folder, and return the summary.
 
-        For each recipe, the summary contains the harm of the best policy and of the last policy of a training run. Each
-        of these harms is an interquartile mean over the seeds, with a bootstrap interval. The summary also contains
-        hashes of the best policies and of the worlds on which the policies were evaluated.
+        For each recipe, the summary contains the harm of the best policy and the harm of the last policy of a training
+        run, as interquartile means over the seeds with bootstrap intervals. The summary also contains hashes of the
+        best policies and of the worlds on which the policies were evaluated.
 
         Raises ``InvalidInput`` if the runs of a recipe have no step in common at which each of them was evaluated.
         """
@@ -163,8 +163,8 @@ class LearningCurves(NamedTuple):
     def curves(self) -> dict[str, dict[str, SeedCurve]]:
         """Return the learning curves: metric -> name of the recipe -> curve with all seeds of the recipe.
 
-        A metric is the return, or a count of harm that the reward of some recipe uses. A metric without values is
-        omitted. If ``self.against`` is ``cpu``, the x values of a curve are processor times (s), averaged over the
+        A metric is the return, or a count of harm that the reward of at least one recipe uses. A metric without values
+        is omitted. If ``self.against`` is ``cpu``, the x values of a curve are processor times (s), averaged over the
         seeds, instead of training steps.
         """
         counts = {recipe.reward.harm_count for recipe, _ in self.plan}

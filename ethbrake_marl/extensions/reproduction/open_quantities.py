@@ -44,7 +44,7 @@ from ethbrake_marl.training.run_folder import RunDirectory
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alternative:
-    """Other value of a quantity that the paper leaves open, and how to repeat the random test with this value."""
+    """Alternative value of a quantity that the paper leaves open, and how to repeat the random test with this value."""
 
     value: str  # the value in words
     changes: Mapping[str, Any] = field(default_factory=dict)  # keys of the scenario with their new values
@@ -132,7 +132,7 @@ class Headline:
     def change(self, base: Headline, strategy: str) -> Estimate:
         """Return the mean harm of ``strategy`` in this object minus its mean harm in the results ``base``, m2/s2.
 
-        If both results are for the same worlds, the difference is computed world by world (paired).
+        If this object and ``base`` contain results for the same worlds, the difference is computed world by world.
         """
         own, other = self.harm[strategy], base.harm[strategy]
         if np.array_equal(self.gaps_m, base.gaps_m):
@@ -243,14 +243,14 @@ def reproduce_gaps(settings: Reproduction) -> Made:
 
 
 def _measure(scenario: Scenario, alternative: Alternative, episodes: int) -> Headline:
-    """Evaluate the strategies in the random test with another value of a quantity that the paper leaves open.
+    """Evaluate the strategies in the random test with an alternative value of a quantity that the paper leaves open.
 
     Returns the harm and the collisions of each strategy in each world. If ``alternative.harm`` is ``predicted``, only
     the pairwise E-V2X-BM has predicted harm; for the other strategies, first-impact harm is returned.
 
     Args:
         scenario: scenario of the random test, before ``alternative.changes`` are applied.
-        alternative: the other value, and how to repeat the random test with this value.
+        alternative: alternative value of the quantity, and how to repeat the random test with this value.
         episodes: number of worlds.
 
     """

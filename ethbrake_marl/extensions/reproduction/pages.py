@@ -30,9 +30,9 @@ _NUMERAL = re.compile(r"[-+−]?\d[\d,.]*( ?%)?|–|")
 def _account(results: Sequence[Result]) -> tuple[str, str, str, list[str]]:
     """Return four results: the page's first sentence, the command, the origin of the results, and remarks.
 
-    The command is the command line that makes the results. The origin of the results states dates, machines and
-    processor time. The list of remarks has one entry if the results use fewer worlds than the paper, and is empty
-    otherwise.
+    The second result is the command line with which a reader can reproduce the results. The origin of the results
+    states dates, machines and processor time. If the results use fewer worlds than the paper, the list of remarks has
+    one entry. If the results use as many worlds as the paper, the list is empty.
     """
     every = len(results) == len(ITEMS)
     most = max((result.episodes for result in results), default=MOST_EPISODES)

@@ -56,9 +56,10 @@ class Reading:
     acts_s: float | None = None  # time at which Vehicle 2 may act (s); None: the latency of the scenario
 
     def scenario(self, name: str, **changes: object) -> Scenario:
-        """Load the shipped scenario ``name``, and return it with Vehicle 2's latency under this assumption.
+        """Load the shipped scenario ``name``, set Vehicle 2's latency to ``acts_s``, and return the scenario.
 
-        ``changes`` contains new values for further keys of the scenario.
+        If ``acts_s`` is None, the latency stays unchanged. ``changes`` contains new values for other keys of the
+        scenario.
         """
         scenario = load_scenario(name).replace(**changes) if changes else load_scenario(name)
         if self.acts_s is None:
@@ -73,8 +74,8 @@ READINGS = (Reading("as stated"), Reading("Vehicle 2 acts at 0.2 s", 0.2))
 def lineup(scenario: Scenario, *specs: str) -> dict[str, Agent]:
     """Return the agents that ``specs`` describe, as a dictionary by name.
 
-    Each of ``specs`` is a text that describes an agent, such as ``"full_brake"``. The name of the agent in the result
-    is the entry of the text in ``NAMES``, or the text itself if ``NAMES`` has no such entry.
+    Each of ``specs`` is a text that describes an agent, such as ``"full_brake"``. If ``NAMES`` contains a name for this
+    text, the agent has this name in the result. If ``NAMES`` contains no name for the text, the text is the name.
     """
     return {NAMES.get(spec, spec): agent for spec, agent in make_agents(specs, scenario).items()}
 
@@ -116,9 +117,9 @@ _STAND_IN = "ppo-obstacle"  # shipped policy that is used if no policy stopped e
 def unconverged_policy(settings: Reproduction) -> tuple[Policy, str]:
     """Return a policy that has not converged, and its description.
 
-    The paper uses a "PPO model obtained from training before convergence occurred". This function returns the policy of
-    a training run that ``--full`` stops early. If this training run has not been done, the function returns a shipped
-    policy instead.
+    The paper uses a "PPO model obtained from training before convergence occurred". With the option ``--full``, the
+    command ``ethbrake reproduce`` trains such a policy, and this function returns it. If the policy has not been
+    trained, this function returns a shipped policy instead.
     """
     for (path,) in settings.trained([STOPPED]).values():
         about = f"PPO stopped early: the last policy of {EARLY.decisions:,} decisions on paper-random"

@@ -148,7 +148,7 @@ def decrease_verdict(row: PaperRow, baseline: PaperRow) -> Verdict:
 
     Args:
         row: row of the paper's table in which the decrease is printed.
-        baseline: row of the strategy with whose harm the harm in ``row`` is compared.
+        baseline: row of the paper's table for the strategy relative to whose harm the decrease is printed.
 
     """
     follows = 1.0 - row.average_harm / baseline.average_harm

@@ -36,8 +36,8 @@ class TrainedRecipe:
     def load(self, name: str, **changes: Any) -> TrainingRecipe:
         """Load the recipe of this object, and return the recipe with the new name ``name``.
 
-        The returned recipe has the length of training and the number of updates between two evaluations that this
-        object contains. ``changes`` contains new values for further keys of the recipe.
+        The returned recipe trains for ``decisions`` decisions, with ``every_updates`` updates between two evaluations.
+        ``changes`` contains new values for other keys of the recipe.
         """
         recipe = load_recipe(self.recipe)
         evaluation = {**recipe.evaluation.model_dump(), "every_updates": self.every_updates}

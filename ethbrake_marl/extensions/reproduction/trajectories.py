@@ -1,6 +1,6 @@
 """Reproduce the paper's figures of its Scenarios 1 and 2.
 
-These figures show trajectories (``Fig:pic5sim``) and acceleration profiles (``Fig:pic5act``).
+For both scenarios, the paper shows trajectories (figure ``Fig:pic5sim``) and accelerations (figure ``Fig:pic5act``).
 """
 
 from __future__ import annotations
@@ -177,8 +177,8 @@ def _parameters() -> list[Parameter]:
 def _both(records: Records, reading: Reading, number: int, what: str, column: int) -> tuple[Floats, Floats]:
     """Return the values over time of one recorded quantity: under PPO, and under SAC at the same times.
 
-    The last time is the end of the longer of the two episodes. After the end of the shorter episode, its last value is
-    repeated.
+    Both results end with the longer of the two episodes. After the end of the shorter episode, the last value of the
+    shorter episode is repeated.
 
     Args:
         records: recorded episodes.
@@ -197,8 +197,8 @@ def _both(records: Records, reading: Reading, number: int, what: str, column: in
 def _apart(records: Records, reading: Reading, what: str) -> list[float]:
     """Return how far a quantity of Vehicle 2 differs between PPO and SAC, in Scenario 1 and in Scenario 2.
 
-    Each result is the root mean square, over the times of an episode, of the difference of this quantity between PPO
-    and SAC.
+    The result for each scenario is the root mean square, over the times of the episode, of the difference between the
+    value of the quantity under PPO and its value under SAC.
 
     Args:
         records: recorded episodes.
@@ -229,8 +229,9 @@ def _judge_one_world(claims: Mapping[str, tuple[str, float, float]], reading: Re
 def _asked_of_vehicle_2(record: EpisodeRecord) -> tuple[float, float, float]:
     """Return three numbers that describe the commands of Vehicle 2 in one episode.
 
-    The numbers are the first command (m/s2), the sum of the absolute changes of the command (m/s2), and the share (0 to
-    1) of the time in motion during which Vehicle 2 brakes.
+    The first number is the first command after the latency of Vehicle 2 (m/s2). The second number is the sum of the
+    absolute changes of the command (m/s2). The third number is the time in which Vehicle 2 brakes while it moves,
+    divided by the time in which it moves.
     """
     acting = record.time_s >= float(record.initial.vehicles.latency_s[0, 1])
     command, moving = record.command_mps2[acting, 1], record.speeds_mps[acting, 1] > 0.0

@@ -13,8 +13,8 @@ worlds.
 - A printed number *differs* in all other cases.
 
 A statement of the paper says that some quantities are smaller than others. A statement *agrees* if every difference
-(smaller minus larger quantity) has a 95 % interval below 0. A statement that does not agree is *undecided* if each of
-the intervals that are not below 0 contains 0.
+(smaller minus larger quantity) has a 95 % interval below 0. A statement is *undecided* if at least one interval
+contains 0 and every other interval is below 0.
 """
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ def compare_number(
         show: format in which the verdict writes our number and the printed number.
         least: description and value of a proven lower bound for all strategies in our worlds; None: no bound.
         others: our results for the same quantity under other assumptions, by the description of the assumption. If
-            ``ours`` differs from the printed number, the verdict names the assumption whose value is nearest to the
-            printed number.
+            ``ours`` differs from the printed number, the verdict names the assumption under which our result is nearest
+            to the printed number.
 
     """
     text = f"ours {show.show(ours).in_words}, printed {show.scale * printed:.{show.digits + 1}f}{show.unit}"

@@ -243,12 +243,12 @@ def falsify_command(
 ) -> None:
     """Search a scenario for the worlds in which an agent does worst.
 
-    --measure sets the score of a world; a larger score is worse. With harm, the score is the agent's harm. With regret,
-    the score is the agent's harm minus the harm of --against (by default the best known commands). With difference, the
-    score is the absolute difference between the harms of the agent and of --against. With bound, the score is the
-    agent's harm minus the bound of its shield, so a score above 0 means that the bound is broken. With --again FILE,
-    the agent that FILE names (or --agent) drives the worlds of FILE again. If the score of any of these worlds is
-    larger than in FILE, the exit status is 1.
+    --measure selects how a world is scored; the worst worlds have the largest scores. With harm, the score is the
+    agent's harm. With regret, the score is the agent's harm minus the harm of --against (by default the best known
+    commands). With difference, the score is the absolute difference between the harms of the agent and of --against.
+    With bound, the score is the agent's harm minus the bound of its shield, so a score above 0 means that the bound is
+    broken. With --again FILE, the agent that FILE names (or --agent) drives the worlds of FILE again. If the new score
+    of at least one world is larger than its score in FILE, the exit status is 1.
     """
     with Out(as_json=as_json, force=force) as out:
         import numpy as np
@@ -332,7 +332,8 @@ def falsify_command(
 def _spelled(**options: Any) -> str:
     """Return the command line ``ethbrake study falsify`` with these options.
 
-    Options with the value None are omitted. An option whose value is a tuple is given once for each element.
+    Options with the value None are omitted. If the value of an option is a tuple, the command line repeats the option
+    for each element of the tuple.
     """
     words = ["ethbrake", "study", "falsify"]
     for option, value in options.items():
@@ -345,8 +346,8 @@ def _spelled(**options: Any) -> str:
 def _drive_again(out: Out, file: Path, agent: str | None) -> None:
     """Let an agent drive the worlds in a file of ``study falsify``, and compare the scores with those in the file.
 
-    ``agent`` is the agent that drives the worlds; None: the agent that the file names. The exit status is 1 if the
-    score of a world is larger than in the file, or if the agent cannot drive a world.
+    ``agent`` is the agent that drives the worlds; None: the agent that the file names. The exit status is 1 if the new
+    score of at least one world is larger than its score in the file, or if the agent cannot drive at least one world.
     """
     import numpy as np
 

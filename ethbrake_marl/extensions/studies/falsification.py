@@ -45,7 +45,7 @@ def search(
 
     The points are tried in rounds of at most 256 points (``ROUND``). Half of the points of a round are spread evenly
     over the cube (scrambled Sobol points). Each other point of the round is one step away from a *parent*. The parents
-    are the points with the highest scores so far that are far apart from each other. A step is a normally distributed
+    are points with the highest scores so far; no two parents are close to each other. A step is a normally distributed
     random step in some coordinates, or half the difference between two random parents (differential evolution). In the
     first round, and later while no score is above the median score, all points are spread evenly. The same seed gives
     the same points.

@@ -89,8 +89,8 @@ def evaluations_of(job: TrainingJob) -> list[dict[str, float]]:
 def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     """Return the values for the table's row of ``job``, by column, computed from the ``evaluations`` so far.
 
-    The columns are ``harm`` (the least harm in an evaluation, by which the best policy is chosen) and all ``FIGURES``
-    except ``policy_sha256``. Example: ``{"harm": 7.1, "steps": 400000, "total_harm": 9.8, ...}``.
+    The columns are ``harm`` (the least harm in any of the evaluations) and all ``FIGURES`` except ``policy_sha256``.
+    Example: ``{"harm": 7.1, "steps": 400000, "total_harm": 9.8, ...}``.
     """
     harm = RunDirectory.chosen_by(evaluations, job.training.recipe.reward.harm_count)
     lowest, last = min(evaluations, key=lambda each: each[harm]), evaluations[-1]

@@ -30,9 +30,9 @@ class StudyFolder:
         record: name of the file in the folder that stores ``question``.
         more: additional entries for the file ``record``; they are stored, but never compared.
         advice: last words of an error message about the folder, which say what the user can do.
-        beside: names of the files that an existing folder without the file ``record`` may contain; if it contains any
-            other file, ``check`` raises an error. If ``beside`` is None, every file is allowed.
-        writes: names of files in the folder that the study replaces; these files must be writable.
+        beside: names of the files that an existing folder without the file ``record`` may contain. If the folder
+            contains any other file, ``check`` raises an error. If ``beside`` is None, every file is allowed.
+        writes: names of those files in the folder that the study will overwrite; these files must be writable.
 
     """
 

@@ -97,7 +97,7 @@ class NamedWorlds(FileModel):
         Raises ``InvalidInput`` if the content of ``scenario`` has changed since the search found the worlds.
 
         Args:
-            scenario: scenario from which the worlds were drawn, as it is now.
+            scenario: scenario from which the worlds were drawn, with its present content.
             where: path of the file, for error messages.
 
         """

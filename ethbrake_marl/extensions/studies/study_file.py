@@ -61,7 +61,7 @@ def load_parts(scenario: str, recipe: str, settings: Sequence[str]) -> tuple[Sce
 def refused_part(scenario: str, recipe: str, settings: Sequence[str]) -> str:
     """Find the argument that makes ``load_parts`` fail, and return ``recipe``, ``scenario`` or the key of a setting.
 
-    Returns an empty text if every argument is valid by itself, and only the combination of the arguments is not.
+    Returns an empty text if every argument is valid by itself, but the arguments do not fit together.
     """
     tried: dict[str, Callable[[], object]] = {
         "recipe": partial(load_recipe, recipe),

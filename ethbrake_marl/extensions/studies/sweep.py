@@ -1,7 +1,7 @@
 """A sweep: read a list of training runs from a YAML file, do these runs on Ray Tune, and write one table of results.
 
-The table is computed only from the folders of the training runs. The table is the same, byte for byte, whatever the
-order of the runs, on whatever computers they ran, and however often they were interrupted.
+The table of results is computed only from the folders of the training runs. The table is the same, byte for byte, in
+whatever order and on whatever computers the training runs are done, and however often they are interrupted.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ _GRID: YamlPath = ("grid",)
 class _OneOrMore:
     """Annotation of a field that accepts a list or, instead of a list with one entry, this entry itself.
 
-    This annotation changes only the JSON Schema. The validator ``Grid._one_is_a_list_of_one`` turns a single entry into
-    a list.
+    The annotation ``_OneOrMore`` changes only the JSON Schema. The validator ``Grid._one_is_a_list_of_one`` turns a
+    single entry into a list.
     """
 
     @classmethod

@@ -167,7 +167,7 @@ class Timed(NamedTuple):
 
     @staticmethod
     def each_s(worlds: Worlds, work: Callable[[Worlds], object], most: int = 50) -> float:
-        """Return the CPU time per world in s that ``work`` needs for the first ``most`` of the ``worlds``.
+        """Return the CPU time per world (s) that ``work`` needs, measured in the first ``most`` of ``worlds``.
 
         ``work`` first runs once with one world, so the measured time does not include compilation.
         """

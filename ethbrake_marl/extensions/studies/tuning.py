@@ -104,7 +104,8 @@ class Range(FileModel):
     def ends(self) -> tuple[Any, ...]:
         """The smallest and the largest value of the range.
 
-        Before the search starts, the recipe is checked with the smallest and with the largest value.
+        Before the search starts, the recipe is checked once with the smallest value and once with the largest value of
+        each range.
         """
         return self.low, self.high
 
@@ -219,7 +220,7 @@ class Pruning(FileModel):
     )
 
     def rule(self) -> TrialScheduler:
-        """Return Ray Tune's scheduler that applies this rule."""
+        """Return Ray Tune's scheduler that applies the median stopping rule."""
         from ray.tune.schedulers import MedianStoppingRule
 
         return MedianStoppingRule(
@@ -395,7 +396,7 @@ class TuningPlan:
         return -(-recipe.total_steps // (recipe.n_envs * len(self.scenario.learners) * recipe.rounds))
 
     def own_values(self) -> dict[str, Any] | None:
-        """Return the recipe's own value of each searched key; None if the search excludes any of these values."""
+        """Return the recipe's own value of each searched key; None if any of them is not among the values to search."""
         content = self.recipe.model_dump(mode="json")
         own = {key: dimension.own(_value_at(content, key)) for key, dimension in self.file.search.items()}
         return None if None in own.values() else own
@@ -403,8 +404,8 @@ class TuningPlan:
     def example(self) -> str:
         """Return a command line ``ethbrake train ...`` that does the same training run as one trial.
 
-        In the command line, the searched keys have the recipe's own values. If any of these values is outside
-        the range that is searched, all searched keys have random values from their ranges instead.
+        The command line gives every searched key the recipe's own value. If the recipe's own value of at least one
+        searched key is not among the values to search, every searched key gets a random value to search instead.
         """
         values = self.own_values() or next(self.file.points(1))
         measured = {"evaluation": self.training(values).recipe.evaluation.model_dump(mode="json")}

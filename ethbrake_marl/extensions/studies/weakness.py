@@ -59,10 +59,10 @@ class Measure:
     harm_count: HarmCount  # harm count: the first impact of each pair (``first``) or all impacts (``total``)
 
     def __call__(self, sample: Sample) -> Measured:
-        """Return the agent's score and harm in each world of ``sample``, and the harm or bound to compare with.
+        """Return for each world the agent's score, the agent's harm, and the harm or bound to compare this harm with.
 
-        If the physics fails in any world, the scores of all worlds are minus infinity. Raises ``InvalidInput`` for the
-        measure ``bound`` if the agent has no shield.
+        If the physics cannot simulate a world, the score of this world is minus infinity, and its harm is NaN. Raises
+        ``InvalidInput`` for the measure ``bound`` if the agent has no shield.
         """
         n = sample.worlds.n
         score, harm, reference = np.full(n, -np.inf), np.full(n, np.nan), np.full(n, np.nan)
