@@ -53,8 +53,8 @@ class ShovedFront:
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
         """Add the distance that Vehicle 1 drives in one step.
 
-        This distance is computed as the decrease of Vehicle 1's gap to an obstacle. For this computation, an obstacle
-        is put into worlds without an obstacle, so far ahead that Vehicle 1 cannot reach it in this step.
+        The distance that Vehicle 1 drives is computed as the decrease of its gap to an obstacle. For this computation,
+        an obstacle is put into worlds without an obstacle, so far ahead that Vehicle 1 cannot reach it in this step.
 
         Args:
             before: the worlds at the beginning of the step.
@@ -106,7 +106,7 @@ class SampledHarm:
         The time samples of sampled harm are the times of Vehicle 2's decisions. Sampled harm is therefore defined only
         if Vehicle 2 is the only controlled vehicle and no script reacts to the state of the world. With an obstacle, or
         with brake force that builds up gradually, sampled harm is not defined, because the paper's equations describe
-        neither of these two.
+        neither obstacles nor such brakes.
         """
         obstacle = task.scenario.has_obstacle or worlds.obstacle_ahead.any()
         if task.vehicles != (VEHICLE_2,) or obstacle or worlds.vehicles.build_up.any():

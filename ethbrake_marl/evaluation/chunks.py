@@ -51,13 +51,13 @@ class Lineup:
         agents: names of the agents as on the command line, such as ``full_brake`` and ``ppo+step``.
         scenario: scenario whose learners the agents drive.
         harm_count: count of harm that agents minimise, each pair's first impact (``first``) or all impacts (``total``).
-        uncertainty: how far gaps, speeds and so on may differ from their stated values, for shields that need to know
-            this, as a text such as ``gaps_m=0.5``; None: no shield needs to know.
+        uncertainty: how far quantities such as gaps and speeds may differ from their stated values, as a text such as
+            ``gaps_m=0.5``; only some shields need this argument; None: no agent has such a shield.
         measures: names of the user's measures that every process loads (``load_measures``), some as ``FILE:NAME``.
         reported: names of all measures of the user whose values the evaluation reports.
         sets: names of the sets of measures that the main process has. Every worker process must also have these sets.
-        same: hash of the policies, measures and software versions, which must be equal in every process
-            (``Lineup.of``).
+        same: hash of the policies, measures and software versions (``Lineup.of``). The hash must be equal in every
+            process.
         packages: version of each extension package that the main process uses, by the package's name. Every worker
             process must have these versions.
 
@@ -180,7 +180,7 @@ def _drive(lineup: Lineup, part: Sample, seed: int | None, first: int) -> Evalua
 
 
 def _only(outcome: Outcome, names: Sequence[str]) -> Outcome:
-    """Return the outcome with only those of the user's measures (``Outcome.metrics``) that ``names`` lists."""
+    """Return a copy of the outcome in which ``metrics`` contains only the columns of the user's measures ``names``."""
     metrics = {c: each for c, each in outcome.metrics.items() if c in names or c.rpartition("_")[0] in names}
     return replace(outcome, metrics=metrics)
 

@@ -45,13 +45,13 @@ class Conditions(dict[str, Any]):
 
         The value of a quantity of vehicles or pairs is a list with one entry per vehicle or pair, front to rear. A
         quantity of the whole world has a single entry. An entry is a number if the quantity is equal in all worlds. If
-        not, the entry is ``[smallest, largest]``.
+        the quantity differs between worlds, the entry is ``[smallest, largest]``.
         """
         return cls.of_ranges({key: rule.of(worlds).T for key, rule in QUANTITY.of(worlds).items()})
 
     @classmethod
     def of_ranges(cls, ranges: Mapping[str, Iterable[Any]]) -> Conditions:
-        """Return the same dictionary as ``of``, computed from arrays of the quantities' values.
+        """Return the same dictionary as ``Conditions.of``, computed from arrays of the quantities' values.
 
         Args:
             ranges: key of a quantity -> arrays of its values: one array per vehicle or pair, or a single array for a

@@ -86,7 +86,8 @@ def _arrays_sha256(arrays: dict[str, np.ndarray]) -> str:
 
 
 def _arrays(value: Any) -> dict[str, np.ndarray]:
-    """Return the arrays that are fields of the dataclass ``value`` or of dataclasses inside it, by the field's name.
+    """Return the arrays in the fields of the dataclass ``value`` and of the dataclasses inside ``value``, by the
+    field's name.
 
     Some arrays are omitted if they have no effect: messages and braking profiles if the worlds have none, build-up
     rates of brakes if all are infinite, and weights of harm if all are 1.

@@ -34,7 +34,7 @@ def write_per_world(
     """Write a table with one row per agent and world as CSV or Parquet.
 
     docs/evaluate.md lists the columns. The row of a world that was left out contains only the agent, the world's number
-    and, in the column ``ended``, the reason. If writing fails, there is no incomplete file.
+    and, in the column ``ended``, the reason. If writing fails, no incomplete file remains.
 
     Args:
         path: file to write, with the ending ``.csv`` or ``.parquet``.

@@ -66,7 +66,8 @@ def evaluate(
         worlds: worlds at the alert, or a sample from ``scenario.sample``; None: draw ``episodes`` worlds from ``seed``.
         agents: agents to evaluate: specs as on the command line (``"full_brake,ppo"``, or a list of specs), or a
             mapping from name to agent or ``Team``. Each controlled vehicle gets a copy of its agent; the objects that
-            you pass do not change. Optimising agents that are built from specs minimise first-impact harm.
+            you pass do not change. Optimising agents that this function builds from specs (texts such as
+            ``full_brake``) minimise first-impact harm.
         scenario: scenario of the worlds, or its name or path.
         vehicle: the controlled vehicle, by name (``vehicle_2``) or index (0 = front); None: the scenario's learners.
         episodes: number of worlds to draw; None: 10,000.
@@ -108,7 +109,9 @@ def evaluate(
 
 
 def chunks_of(sample: Sample, size: int = CHUNK) -> Iterator[tuple[int, Sample]]:
-    """Split a sample into chunks of at most ``size`` worlds; yield pairs (row of the chunk's first world, chunk)."""
+    """Split a sample into chunks of at most ``size`` worlds; yield pairs (index in the sample of the chunk's first
+    world, chunk).
+    """
     for first in range(0, sample.worlds.n, size):
         yield first, sample.take(np.arange(first, min(first + size, sample.worlds.n)))
 
@@ -160,7 +163,7 @@ def drive_chunk(
 
 
 def _check_request(worlds: object, agents: object, chunk: object) -> None:
-    """Raise ``InvalidInput`` if one of the three arguments, which are passed to ``evaluate``, is wrong."""
+    """Raise ``InvalidInput`` if the argument ``worlds``, ``agents`` or ``chunk`` of ``evaluate`` is invalid."""
     if not isinstance(worlds, Worlds | Sample):
         raise InvalidInput(
             f"evaluate: worlds = {worlds!r}: must be a Worlds or Sample object, for instance scenario.sample(100,"

@@ -89,7 +89,7 @@ def mean_over_seeds(
         clusters: name of the cluster (recording) of each world, [worlds]; None: all worlds are independent.
         seed: seed of the bootstrap's random numbers.
 
-    Raises ``InvalidInput`` if the numbers of worlds differ, or if a value is not finite.
+    Raises ``InvalidInput`` if the arrays do not all have the same number of worlds, or if a value is not finite.
 
     """
     array = np.atleast_2d(np.asarray(values))
@@ -112,12 +112,13 @@ def mean_over_seeds(
 def share_over_seeds(
     values: ArrayLike, worst: ArrayLike, best: ArrayLike, *, clusters: Texts | None = None, seed: int = 0
 ) -> Estimate | None:
-    """Return the share of the possible reduction: 0 if the mean harm is that of ``worst``, 1 if it is that of ``best``.
+    """Return the share of the possible reduction: 0 if ``values`` has the same mean as ``worst``, 1 if ``values`` has
+    the same mean as ``best``.
 
     The share is ``(mean(worst) - mean(values)) / (mean(worst) - mean(best))``, with a bootstrap interval as in
-    ``mean_over_seeds``. The result is None if ``mean(best) >= mean(worst)``. The result is also None if too many
-    bootstrap resamples have almost no possible reduction: if, in 5 % of the resamples or more,
-    ``mean(worst) - mean(best)`` is at most 0.1 % of its value in the original data.
+    ``mean_over_seeds``. The result is None if ``mean(best) >= mean(worst)``. The result is also None if almost no
+    reduction is possible in 5 % of the bootstrap resamples or more. *Almost no reduction* means that ``mean(worst) -
+    mean(best)`` in the resample is at most 0.1 % of ``mean(worst) - mean(best)`` in the original data.
 
     Args:
         values: harms of the training runs to judge, [seeds, worlds] (m2/s2).
@@ -145,8 +146,8 @@ def share_over_seeds(
 def _pair_sides(who: str, *sides: ArrayLike) -> tuple[Floats, ...]:
     """Return each of ``sides`` (the results to compare) as an array [seeds, worlds].
 
-    Raises ``InvalidInput`` if the numbers of worlds differ, or if a value is not finite. ``who`` is the name of the
-    calling function, for error messages.
+    Raises ``InvalidInput`` if the arrays do not all have the same number of worlds, or if a value is not finite.
+    ``who`` is the name of the calling function, for error messages.
     """
     arrays = tuple(np.atleast_2d(np.asarray(side, np.float64)) for side in sides)
     if any(side.ndim != 2 or not side.size or side.shape[1] != arrays[0].shape[-1] for side in arrays):
@@ -168,7 +169,8 @@ def _resampled(
         value: the estimate, computed from the original data.
         sides: results to resample: arrays [seeds, worlds], all for the same worlds.
         of: function that computes a statistic, one value per resample, from the mean of each of ``sides`` in each
-            resample, [resamples, number of sides]. The ends of the interval are percentiles of this statistic.
+            resample, [resamples, number of sides]. The ends of the interval are percentiles of these values over all
+            resamples.
         clusters: name of the cluster (recording) of each world, [worlds]; None: all worlds are independent.
         seed: seed of the bootstrap's random numbers.
 

@@ -31,9 +31,10 @@ Texts = NDArray[np.str_]
 def exact_sum(values: Floats, others: Floats | None = None) -> Fraction:
     """Return the exact sum of ``values`` [n], or of the products ``values * others``, without rounding.
 
-    Each float64 is a whole number of 53 bits times a power of two. Whole numbers that belong to the same power of two
-    are added as Python integers, which never overflow. The result therefore does not depend on the order of the values,
-    and sums over chunks of worlds can be added without error. Raises ``InvalidInput`` unless all numbers are finite.
+    Each float64 is a whole number of at most 53 bits times a power of two. Whole numbers that belong to the same power
+    of two are added as Python integers, which never overflow. The result therefore does not depend on the order of the
+    values, and sums over chunks of worlds can be added without error. Raises ``InvalidInput`` unless all numbers are
+    finite.
     """
     wholes, powers = _in_wholes(values)
     if others is not None:
@@ -82,7 +83,8 @@ _UPPER = 0.5 + 0.5 * CONFIDENCE  # quantile at the upper end of an interval
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """Number of values, their exact sum, and the exact sum of their squares. Two ``Moments`` can be added.
+    """Number of values, their exact sum, and the exact sum of their squares. The sum of two ``Moments`` describes the
+    values of both together.
 
     >>> import numpy as np
     >>> from ethbrake_marl.evaluation.statistics import Moments
@@ -168,12 +170,13 @@ class Moments:
     def share(self) -> Estimate:
         """Mean p of values that are all 0 or 1, with Wilson's interval (``rate``).
 
-        With G clusters, Wilson's interval is computed for an effective number of independent draws, which would have
-        the same standard error: ``1 + p (1 - p) / error ** 2``, but at most the number of values. If all values are
-        equal, this effective number is G. The effective number is multiplied by ``(z / t) ** 2``, where z and t are the
-        quantiles of the normal and the t distribution, because the standard error has G - 1 degrees of freedom (Korn
-        and Graubard 1998, "Confidence intervals for proportions with small expected number of positive counts estimated
-        from survey data", Survey Methodology 24). If there is only one cluster, there is no interval.
+        With G clusters, Wilson's interval is computed as for ``1 + p (1 - p) / error ** 2`` independent draws, which
+        would have the same standard error ``error``; this effective number of draws is limited to the number of values.
+        If all values are equal, this effective number is G. The effective number is multiplied by ``(z / t) ** 2``,
+        where z and t are the quantiles of the normal and the t distribution, because the standard error has G - 1
+        degrees of freedom (Korn and Graubard 1998, "Confidence intervals for proportions with small expected number of
+        positive counts estimated from survey data", Survey Methodology 24). If there is only one cluster, there is no
+        interval.
         """
         if not self.clusters:
             return rate(int(self.total), self.count)
@@ -239,8 +242,8 @@ def of_amounts(estimate: Estimate, *, nothing: bool) -> Estimate:
 
     Args:
         estimate: mean with an interval that may extend below 0.
-        nothing: whether all averaged values are 0. If all are 0, the result has no interval, because zeros show that
-            larger values are rare, but not how large such values can be.
+        nothing: whether all averaged values are 0. If all averaged values are 0, the result has no interval, because
+            zeros show that larger values are rare, but not how large such values can be.
 
     """
     if nothing or estimate.interval is None:

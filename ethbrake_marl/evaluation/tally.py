@@ -1,6 +1,6 @@
 """For each agent, the sums of its measures over some of the worlds.
 
-Sums over different worlds can be added in any order.
+Sums over different worlds can be added in any order, with the same result.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ Range = tuple[float, float]  # smallest and largest value
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """For each agent, the sums of its measures over some worlds. ``tally + other`` covers the worlds of both."""
+    """For each agent, the sums of its measures over some worlds. ``tally + other`` contains the sums over the worlds of
+    both.
+    """
 
     worlds: int = 0  # number of worlds, without left-out worlds
     hidden: int = 0  # number of worlds in which the V2X channel hides something from a controlled vehicle

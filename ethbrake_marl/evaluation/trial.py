@@ -1,4 +1,6 @@
-"""Try a scenario before use: check that its scripts can drive, and count worlds in which something unusual happens."""
+"""Try a scenario before use: check that its scripts run without errors, and count worlds in which something unusual
+happens.
+"""
 
 from __future__ import annotations
 
@@ -131,9 +133,10 @@ def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
 
 
 def _refusals(scenario: Scenario, worlds: Worlds) -> dict[str, str]:
-    """Try agents, shields and a setting on ``worlds``, and return the error message of each that refuses the scenario.
+    """Try agents, shields and the setting ``early_impacts: reject`` on ``worlds``; for each one that refuses the
+    scenario, return the error message.
 
-    A key of the result is the spec of an agent, ``+`` and the name of a shield, or ``early_impacts: reject``.
+    The keys of the result are specs of agents, names of shields (written after ``+``), and ``early_impacts: reject``.
     """
 
     def drive_by(spec: str, needs: Mapping[str, Any]) -> None:

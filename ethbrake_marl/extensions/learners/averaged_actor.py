@@ -59,7 +59,8 @@ class Deterministic(BasePolicy):
 
 
 class AveragedActor(Deterministic):
-    """Actor whose network exists twice: ``learning`` is trained; ``average`` has running averages of its weights.
+    """Actor whose network exists twice: ``learning`` is trained; ``average`` has running averages of the weights of
+    ``learning``.
 
     A trained policy uses the averaged weights. The averaged weights have the same names as in PPO of
     Stable-Baselines3.

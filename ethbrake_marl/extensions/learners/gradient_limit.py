@@ -40,7 +40,8 @@ def smallest_offset(measured: Floats, least: float, most: float) -> float:
 
     Args:
         measured: [n, 2] absolute gradient, and the offset with which this gradient was measured (0: not measured yet).
-            The gradients with the smaller half of the offsets are compared with the gradients with the larger half.
+            The gradients measured with the smaller half of the offsets are compared with the gradients measured with
+            the larger half.
         least: smallest offset that the recipe allows.
         most: largest offset that the recipe allows.
 

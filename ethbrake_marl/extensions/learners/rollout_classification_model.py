@@ -31,7 +31,8 @@ LEAST_USUAL = 0.1  # m2/s2; least divisor of relative costs, for scenarios with 
 
 
 class RolloutClassificationModel(VineModel):
-    """Model that drives with an actor, tries several actions at some of its decisions, and learns from their costs.
+    """Model that drives with an actor, tries several actions at some decisions, and learns from the costs of these
+    actions.
 
     Args:
         environment: environment in which the model is trained.
@@ -151,10 +152,10 @@ class RolloutClassificationModel(VineModel):
         return observed[rows], tried, costs
 
     def _usual(self, rows: Ints, least: Floats) -> Floats:
-        """Update the mean cost of the cheapest choice in each scenario of a mixture of scenarios; return, for each of B
-        decisions, the mean cost in its scenario, [B].
+        """For each scenario of a mixture of scenarios, update the running mean of the cost of the cheapest choice;
+        return, for each of B decisions, the running mean of the decision's scenario, [B].
 
-        A mean cost below ``LEAST_USUAL`` is returned as ``LEAST_USUAL``, because costs are divided by the result.
+        A running mean below ``LEAST_USUAL`` is returned as ``LEAST_USUAL``, because costs are divided by the result.
 
         Args:
             rows: [B] for each of the B decisions, the index of the visited state in which the decision was made.

@@ -47,12 +47,12 @@ PolicyName = Annotated[str, Field(pattern=r"^[a-z-]+(@.+)?$", max_length=4096)]
 
 
 class RolloutClassificationRecipe(TrainingRecipe):
-    """Recipe of rollout classification: at some decisions several actions are tried; after each of them, the episode is
-    simulated to its end.
+    """Recipe of rollout classification: at some decisions several actions are tried, and after each tried action the
+    episode is simulated to its end.
 
     At each decision the policy chooses one of ``network.choices`` actions, evenly spaced from -1 to 1, or one of the
-    trained ``policies``. A round consists of ``n_envs x n_steps`` decisions and an update. At ``tried`` decisions of a
-    round, the following choices are tried:
+    trained ``policies``. A round of the training run consists of ``n_envs x n_steps`` decisions and an update of the
+    network. At ``tried`` decisions of a round, the following choices are tried:
 
     - the choice of the policy itself;
     - for each range of ``near``, one action below and one action above the action of the policy;
