@@ -1,4 +1,4 @@
-"""Two measurements that are made while episodes run: how far Vehicle 1 is shoved, and the paper's sampled harm."""
+"""Two measures that are computed while episodes run: how far Vehicle 1 is shoved, and the paper's sampled harm."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class ShovedFront:
         return cls(worlds, way[:, 0])
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Add the distance that Vehicle 1 drives in one step.
+        """Add the distance that Vehicle 1 drives in one step to the distance that it has driven so far.
 
         The distance that Vehicle 1 drives is computed as the decrease of its gap to an obstacle. For this computation,
         an obstacle is put into worlds without an obstacle, so far ahead that Vehicle 1 cannot reach it in this step.
@@ -132,7 +132,7 @@ class SampledHarm:
         self._move()
 
     def _move(self) -> None:
-        """Advance every world to its next time sample, or to the horizon if the horizon comes first."""
+        """Advance every world to its next time sample or, if the horizon comes earlier, to the horizon."""
         self._samples += 1
         next_s = np.minimum(Decisions(self._start_s, self._step_s).at(self._samples), self._horizon_s)
         until_s = np.maximum(next_s, self._worlds.time_s)

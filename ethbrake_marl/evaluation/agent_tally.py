@@ -80,8 +80,8 @@ def tally_agents(
         baseline: name of the agent with which the other agents are compared, unless a set of measures names its own
             baseline.
         objectives: objectives such as ``"social:45"`` (docs/cooperation.md). If ``objectives`` is a list, even an empty
-            list, the result also has the sums of the harm that each vehicle bears, and of the value of each objective
-            for each vehicle.
+            list, the result also contains two kinds of sums for each vehicle: the sum of the harm that the vehicle
+            bears, and the sum of the value of each objective.
         clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
 
     """

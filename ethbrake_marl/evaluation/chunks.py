@@ -197,15 +197,16 @@ def tally_list(
 ) -> Tally:
     """Let the agents of ``lineup`` drive an evaluation list of any length, and return sums of their measures.
 
-    The worlds are drawn and driven chunk by chunk, so memory does not grow with the length of the list. Sets of
-    measures whose computation takes longer than the simulation of the episodes are omitted.
+    The worlds are drawn and driven chunk by chunk, so memory does not grow with the length of the list. The result
+    omits sets of measures whose computation takes longer than the simulation of the episodes.
 
     Args:
         lineup: the agents to evaluate.
         episodes: number of worlds in the list, 1 to 10^12.
         seed: seed from which the worlds are drawn.
         objectives: objectives such as ``"social:45"`` (docs/cooperation.md). If objectives are passed, the result also
-            has the sums of the harm that each vehicle bears, and of the value of each objective for each vehicle.
+            contains two kinds of sums for each vehicle: the sum of the harm that the vehicle bears, and the sum of the
+            value of each objective.
         jobs: number of processes; None: one process, or with Ray one per core of the cluster.
         ray: address of a Ray cluster, or ``local`` for this machine; None: Ray is not used.
         on_done: function that is called after each chunk of worlds with the number of worlds evaluated so far.

@@ -167,7 +167,7 @@ class Evaluation:
     def per_world(self, objectives: Sequence[Declared] = ()) -> Columns:
         """Return a table with one row per agent and world, as a dictionary: name of a column -> its values.
 
-        docs/evaluate.md lists the columns. Columns of initial quantities have names such as ``gap_1_m``,
+        docs/evaluate.md lists the columns of the table. Columns of initial quantities have names such as ``gap_1_m``,
         ``speed_1_mps``, ``latency_2_s`` and ``restitution``. A missing value is None.
 
         Args:
@@ -217,8 +217,8 @@ class Evaluation:
     def to_pandas(self) -> Any:
         """Return a pandas ``DataFrame`` with one row per agent and world.
 
-        docs/evaluate.md lists the columns. A missing number is NaN. ``arrays`` returns the same columns without pandas.
-        Raises ``MissingExtra`` if pandas is not installed.
+        docs/evaluate.md lists the columns of the table. A missing number is NaN. ``arrays`` returns the same columns
+        without pandas. Raises ``MissingExtra`` if pandas is not installed.
         """
         with naming_extras():
             from pandas import DataFrame

@@ -146,8 +146,8 @@ def result_identity(
         scenario: scenario of the worlds.
         sample: the worlds of the result; None if the file contains results of several samples of worlds. If ``sample``
             is None, the result has no ``worlds_sha256``.
-        left_out: row numbers of the worlds in ``sample`` that were left out because of errors. ``worlds_sha256`` does
-            not cover the worlds that were left out.
+        left_out: row numbers of the worlds in ``sample`` that were left out because of errors. The hash
+            ``worlds_sha256`` is computed without the worlds that were left out.
 
     """
     identity: dict[str, Any] = {

@@ -259,8 +259,8 @@ MEASURE_SETS: Registry[MeasureSet] = Registry("set of measures", "measure_sets",
 def contexts_of(evaluation: Any, *, long_list: bool = False) -> dict[str, Any]:
     """Return the context (information about the worlds) of each installed set of measures, by the set's name.
 
-    A context is the result of ``MeasureSet.prepare``, which is called once per evaluation. If the set does not apply to
-    the evaluation, the context is ``Silent``, with the reason.
+    A context is the result of ``MeasureSet.prepare``, which is called once per evaluation. If a set does not apply to
+    the evaluation, its context is ``Silent``, with the reason.
 
     Args:
         evaluation: the evaluation.

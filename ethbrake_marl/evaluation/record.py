@@ -1,4 +1,4 @@
-"""Record of one episode at fine time resolution, for figures and viewers.
+"""Record of one episode with closely spaced time samples, for figures and viewers.
 
 The agent first drives the episode as in an evaluation. After the episode, the state at each sample time is computed
 from the state and the commands at the beginning of the time step that contains the sample time.

@@ -1,7 +1,7 @@
 """Evaluate agents: draw a fixed list of worlds, let every agent drive each world once, and measure the results.
 
-The worlds are fixed in advance. If instead the episodes that finish first were evaluated, short episodes would be
-over-represented, and many short episodes are crashes.
+The worlds of an evaluation are fixed in advance. If instead the episodes that finish first were evaluated, short
+episodes would be over-represented, and many short episodes are crashes.
 """
 
 from __future__ import annotations
@@ -186,8 +186,8 @@ def controlled_vehicles(scenario: Scenario, vehicle: int | str | None, agents: M
     """Return the indices (0 = front) of the vehicles that the agents are to control.
 
     The result contains ``vehicle`` (name or index) or, if ``vehicle`` is None, all learners of the scenario. If the
-    scenario has no learners and ``vehicle`` is None, all agents must be teams, and the result is empty. If some agent
-    is not a team, ``InvalidInput`` is raised.
+    scenario has no learners and ``vehicle`` is None, the result is empty if all agents are teams; otherwise
+    ``InvalidInput`` is raised.
     """
     if vehicle is not None or (not scenario.learners and any(not isinstance(a, Team) for a in agents.values())):
         return (controlled_vehicle(scenario, vehicle),)

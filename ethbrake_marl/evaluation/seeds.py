@@ -1,4 +1,5 @@
-"""Statistics over training runs with different seeds; the intervals say what to expect of another seed.
+"""Statistics over training runs with different seeds. The intervals also include the randomness of the seeds, so they
+say what result to expect from a training run with another seed.
 
 There are usually few training runs, and a single bad run changes their mean a lot. The interquartile mean therefore
 omits the best and the worst quarter of the runs' results. The error of the interquartile mean is estimated with a
@@ -77,8 +78,8 @@ def mean_over_seeds(
     """Return the mean over seeds and worlds of ``values``, or of ``values - baseline``, with a bootstrap interval.
 
     The bootstrap resamples the seeds of ``values``, the seeds of ``baseline``, and the worlds (or clusters of worlds).
-    The interval therefore says what to expect of other seeds and other worlds. There is no interval if there is only
-    one world or cluster, or if no baseline is given and all values are 0. Without a baseline, the interval of
+    The interval therefore says what mean to expect with other seeds and other worlds. There is no interval if there is
+    only one world or cluster, or if no baseline is given and all values are 0. Without a baseline, the interval of
     true/false values is widened so that it contains Wilson's interval, because bootstrap intervals of nearly constant
     values are too narrow.
 
@@ -168,9 +169,9 @@ def _resampled(
     Args:
         value: the estimate, computed from the original data.
         sides: results to resample: arrays [seeds, worlds], all for the same worlds.
-        of: function that computes a statistic, one value per resample, from the mean of each of ``sides`` in each
-            resample, [resamples, number of sides]. The ends of the interval are percentiles of these values over all
-            resamples.
+        of: function that returns a statistic for each resample, [resamples]. Its argument is the mean of each of
+            ``sides`` in each resample, [resamples, number of sides]. The ends of the interval are percentiles of the
+            returned array.
         clusters: name of the cluster (recording) of each world, [worlds]; None: all worlds are independent.
         seed: seed of the bootstrap's random numbers.
 

@@ -83,7 +83,7 @@ class ModeRow:
 
 
 class ShieldModes(list[ModeRow]):
-    """Result of ``compare_modes``: a list with one row for each agent and mode of the shield."""
+    """Result of ``compare_modes``: a list with one row for each pair of an agent and a mode of the shield."""
 
     @property
     def of_teams(self) -> bool:

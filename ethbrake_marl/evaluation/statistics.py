@@ -217,7 +217,7 @@ class Moments:
 
         Args:
             baseline: moments of the baseline agent's values, which belong to the same worlds as ``values``.
-            products: exact sum over all worlds of ``value * baseline``.
+            products: exact sum over all worlds of the product ``value * baseline``.
 
         """
         if baseline.total == 0:
@@ -226,7 +226,7 @@ class Moments:
         return self._around(1.0 - float(self.total / baseline.total), error)
 
     def _around(self, value: float, error: float) -> Estimate:
-        """Return ``value`` with the interval ``value -+ t error``, or without an interval if there is only one draw.
+        """Return ``value`` with the interval ``value -+ t * error``, or without an interval if there is only one draw.
 
         ``error`` is the standard error of ``value``. The degrees of freedom of t are the number of independent draws
         minus 1.
@@ -260,8 +260,8 @@ def root(number: Fraction) -> float:
 def rate(successes: int, count: int) -> Estimate:
     """Return the share ``p = successes / count`` with Wilson's score interval, which lies within [0, 1].
 
-    The interval has the centre ``(p + z^2/2n) / (1 + z^2/n)`` and the half-width
-    ``z / (1 + z^2/n) sqrt(p (1 - p) / n + z^2/4n^2)``, where n is ``count``, and z the quantile of the normal
+    The interval has the centre ``(p + z^2 / (2 n)) / (1 + z^2 / n)`` and the half-width
+    ``z * sqrt(p (1 - p) / n + z^2 / (4 n^2)) / (1 + z^2 / n)``, where n is ``count``, and z the quantile of the normal
     distribution. Raises ``InvalidInput`` unless 0 <= successes <= count and count >= 1.
     """
     if not (count >= 1 and 0 <= successes <= count):
@@ -289,7 +289,7 @@ def wilson(p: float, count: float) -> tuple[float, float]:
 
 
 def mean(values: Floats, clusters: Texts | None = None) -> Estimate:
-    """Return the mean of n values with its 95 % t interval, ``mean -+ t s / sqrt(n)``.
+    """Return the mean of n values with its 95 % t interval, ``mean -+ t * s / sqrt(n)``.
 
     In the formula, s is the standard deviation, and t the quantile of the t distribution with n - 1 degrees of freedom.
     The interval assumes that the mean is normally distributed, which is nearly true for thousands of worlds. If no
@@ -384,7 +384,7 @@ def check(values: ArrayLike, who: str = "statistics", each: str = "world") -> Fl
     Args:
         values: the numbers to check.
         who: name of the calling function, for error messages.
-        each: what each number belongs to (``world`` or ``seed``), for error messages.
+        each: word for what one number belongs to, ``world`` or ``seed``, for error messages.
 
     Raises ``InvalidInput`` if ``values`` is not one-dimensional, is empty, or contains a number that is not finite.
 

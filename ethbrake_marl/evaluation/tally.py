@@ -47,8 +47,8 @@ class Tally:
         Args:
             part: evaluation of the agents in some consecutive worlds of the evaluation list.
             objectives: objectives such as ``"social:45"`` (docs/cooperation.md). If ``objectives`` is a list, even an
-                empty list, the result also has the sums of the harm that each vehicle bears, and of the value of each
-                objective for each vehicle.
+                empty list, the result also contains two kinds of sums for each vehicle: the sum of the harm that the
+                vehicle bears, and the sum of the value of each objective.
             long_list: whether to omit the sets of measures that do not apply to more than 100,000 worlds.
 
         """

@@ -147,9 +147,9 @@ def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, sta
     """Write into ``stands`` [m], for each of m worlds, whether all its vehicles are at rest and will stay at rest.
 
     Args:
-        state: packed state of all worlds of an engine.
+        state: packed state of all worlds of an engine: one row of numbers per world.
         before: [m, columns] packed state of the m worlds one time step earlier.
-        params: packed constants (such as masses and latencies) of all worlds of the engine.
+        params: packed constants of all worlds of the engine: one row per world, with masses, latencies and so on.
         rows: [m] indices of the worlds to check, in ``state`` and ``params``.
         stands: [m] bool array into which the result is written (True: all vehicles stay at rest).
 
@@ -175,9 +175,9 @@ def counted_harm(engine: Engine, count: HarmCount) -> Floats:
     """Return, for each of the L learners of an engine, the harm (up to the present time) that this learner should make
     small, [n, L] m2/s2.
 
-    If the reward has objectives, this harm is the value of the learner's objective. If the reward has no objectives,
-    this harm is the harm of the whole line. ``count`` is the count of harm: ``first`` (each pair's first impact) or
-    ``total`` (all impacts).
+    If the reward has objectives, each learner should make the value of its own objective small. If the reward has no
+    objectives, each learner should make the harm of the whole line small. ``count`` is the count of harm: ``first``
+    (each pair's first impact) or ``total`` (all impacts).
     """
     declared, shape = engine.reward.objective, (engine.n, len(engine.learners))
     if declared is None:

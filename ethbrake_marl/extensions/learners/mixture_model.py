@@ -34,7 +34,8 @@ from ethbrake_marl.policies.network_spec import Float32s
 
 
 class ExpertsModel(VineModel):
-    """Model that trains a mixture of experts: several networks, and a gating network that chooses which of them acts.
+    """Model that trains a mixture of experts: several networks, and a gating network that chooses which of these
+    networks acts.
 
     The training run has four stages. The first stage trains the first expert in all worlds. The second stage trains the
     other experts, each in worlds that are selected for this expert. The third stage trains the gating network, and the
@@ -141,7 +142,7 @@ class ExpertsModel(VineModel):
 
     def _compare(self, seen: Float32s, moments: State) -> tuple[Float32s, Floats, Float32s]:
         """Compare the K experts: let each expert drive from B visited decisions to the end of the episode, and return
-        its costs.
+        the cost of each expert at each decision.
 
         The cost of an expert is minus its return, plus ``tie_break`` times its harm. The harm in this cost is the total
         harm if the reward counts first-impact harm, and the first-impact harm if the reward counts total harm. The B

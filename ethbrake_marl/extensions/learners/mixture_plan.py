@@ -31,7 +31,8 @@ class Shares(FileModel):
 
 
 class ExpertsPlan(FileModel):
-    """Settings of a mixture of experts: several networks, and a gating network that chooses which of them acts.
+    """Settings of a mixture of experts: several networks, and a gating network that chooses which of these networks
+    acts.
 
     Each expert after the first one is pre-trained in two steps. In the first step, the new expert imitates templates
     (random braking profiles) in worlds in which a template has a higher return than all earlier experts. In the second

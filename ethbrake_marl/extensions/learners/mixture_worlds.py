@@ -91,9 +91,9 @@ def show_templates(engine: Engine, plan: ExpertsPlan, explored: Explored, gamma:
     """Draw templates (random braking profiles); return the decisions of templates that have a higher return than all
     earlier experts.
 
-    In each world ``plan.templates`` templates are drawn, and the template with the least harm is simulated. If the
-    return of this template exceeds the return of the best earlier expert by more than ``plan.gain``, the observations
-    and actions of the template are returned.
+    In each world ``plan.templates`` templates are drawn. If the template with the least harm does less harm than every
+    earlier expert, this template is simulated. If the return of this template exceeds the return of the best earlier
+    expert by more than ``plan.gain``, the observations and actions of the template are returned.
 
     Args:
         engine: engine of the training run; it is not changed.
@@ -162,5 +162,5 @@ def own_worlds(engine: Engine, plan: ExpertsPlan, explored: Explored, act: Act, 
 class NoBetterTemplate(EthBrakeError, ValueError):
     """Raised if no template (random braking profile) has a higher return than the earlier experts.
 
-    If this error is raised, a further expert would be useless.
+    This error means that a further expert would have nothing to learn.
     """

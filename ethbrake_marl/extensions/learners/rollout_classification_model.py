@@ -1,5 +1,5 @@
-"""Model of rollout classification: it tries several actions at a decision, and learns which of these actions costs
-least.
+"""Model of rollout classification: it tries several actions at a decision, and learns which of these actions has the
+least cost.
 """
 
 from __future__ import annotations
@@ -85,7 +85,8 @@ class RolloutClassificationModel(VineModel):
         self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
 
     def _try_actions(self, seen: Float32s, moments: State) -> tuple[Float32s, Ints, Floats]:
-        """Try C choices (actions, or trained policies that act) at each of B visited decisions, and return their costs.
+        """Try C choices (actions, or trained policies that act) at each of B visited decisions; return the cost of each
+        choice.
 
         After each tried choice the model simulates the episode to its end.
 

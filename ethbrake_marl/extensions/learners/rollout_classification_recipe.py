@@ -141,7 +141,7 @@ class RolloutClassificationRecipe(TrainingRecipe):
 
     @property
     def others(self) -> int:
-        """Number of choices that are tried at a decision besides the policy's own choice."""
+        """Number of choices, other than the policy's own choice, that are tried at a decision."""
         return 2 * len(self.near) + len(self.fixed) + self.drawn
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
@@ -161,7 +161,7 @@ class RolloutClassificationRecipe(TrainingRecipe):
 
         If a named policy itself chooses among several policies, these policies take the place of the named policy.
 
-        If a policy cannot be used, an ``InvalidInput`` that names this policy is raised.
+        Raises ``InvalidInput`` if a policy cannot be used; the message names this policy.
         """
         loaded: list[Policy] = []
         for name in self.policies:

@@ -1,5 +1,5 @@
-"""Scout: a small network that predicts at which decisions the action matters. More branches start at decisions at which
-the action matters.
+"""Scout: a small network that predicts at which decisions the action matters. More branches start at these decisions
+than at other decisions.
 
 A branch is a copy of the episode with another action. Simulating a branch from a decision at which the action has no
 effect is a waste of time. Therefore decisions at which the action matters are drawn with a higher probability, and get
