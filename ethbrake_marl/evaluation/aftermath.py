@@ -1,4 +1,4 @@
-"""Two measurements that are made while episodes run: how far Vehicle 1 is shoved, and the paper's sampled harm."""
+"""Two measures that are computed while episodes run: how far Vehicle 1 is shoved, and the paper's sampled harm."""
 
 from __future__ import annotations
 
@@ -51,10 +51,10 @@ class ShovedFront:
         return cls(worlds, way[:, 0])
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Add the distance that Vehicle 1 drives in one step.
+        """Add the distance that Vehicle 1 drives in one step to the distance that it has driven so far.
 
-        This distance is computed as the decrease of Vehicle 1's gap to an obstacle. For this computation, an obstacle
-        is put into worlds without an obstacle, so far ahead that Vehicle 1 cannot reach it in this step.
+        The distance that Vehicle 1 drives is computed as the decrease of its gap to an obstacle. For this computation,
+        an obstacle is put into worlds without an obstacle, so far ahead that Vehicle 1 cannot reach it in this step.
 
         Args:
             before: the worlds at the beginning of the step.
@@ -106,7 +106,7 @@ class SampledHarm:
         The time samples of sampled harm are the times of Vehicle 2's decisions. Sampled harm is therefore defined only
         if Vehicle 2 is the only controlled vehicle and no script reacts to the state of the world. With an obstacle, or
         with brake force that builds up gradually, sampled harm is not defined, because the paper's equations describe
-        neither of these two.
+        neither obstacles nor such brakes.
         """
         obstacle = task.scenario.has_obstacle or worlds.obstacle_ahead.any()
         if task.vehicles != (VEHICLE_2,) or obstacle or worlds.vehicles.build_up.any():
@@ -132,7 +132,7 @@ class SampledHarm:
         self._move()
 
     def _move(self) -> None:
-        """Advance every world to its next time sample, or to the horizon if the horizon comes first."""
+        """Advance every world to its next time sample or, if the horizon comes earlier, to the horizon."""
         self._samples += 1
         next_s = np.minimum(Decisions(self._start_s, self._step_s).at(self._samples), self._horizon_s)
         until_s = np.maximum(next_s, self._worlds.time_s)

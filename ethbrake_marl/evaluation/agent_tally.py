@@ -49,7 +49,7 @@ class AgentTally:
         """Return the fraction (0 to 1) of the worlds in which the true/false measure ``name`` is true.
 
         ``worlds`` is the number of worlds in the evaluation. The result is None if the measure lacks a value in at
-        least one of these worlds.
+        least one world of the evaluation.
         """
         so, of = self.counts.get(name, (0, 0))
         return so / worlds if of == worlds else None
@@ -58,7 +58,7 @@ class AgentTally:
         """Return the sum and the sum of squares of the numeric measure ``name``, and the number of its values.
 
         ``worlds`` is the number of worlds in the evaluation. The result is None if the measure lacks a value in at
-        least one of these worlds.
+        least one world of the evaluation.
         """
         moments = self.moments.get(name)
         return moments if moments is not None and moments.count == worlds else None
@@ -80,8 +80,8 @@ def tally_agents(
         baseline: name of the agent with which the other agents are compared, unless a set of measures names its own
             baseline.
         objectives: objectives such as ``"social:45"`` (docs/cooperation.md). If ``objectives`` is a list, even an empty
-            list, the result also has the sums of the harm that each vehicle bears, and of the value of each objective
-            for each vehicle.
+            list, the result also contains two kinds of sums for each vehicle: the sum of the harm that the vehicle
+            bears, and the sum of the value of each objective.
         clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
 
     """
@@ -124,7 +124,7 @@ def estimate_all(
         tallies: sums of the measures of every agent, by the agent's name.
         agent: name of the agent whose measures are estimated.
         worlds: number of worlds in the evaluation. The estimate of a measure is None if the measure lacks a value in at
-            least one of these worlds.
+            least one world of the evaluation.
         baseline: name of the agent with which ``agent`` is compared. If the baseline was not evaluated, all comparisons
             with it are None.
 
@@ -150,12 +150,12 @@ def _estimate(
     Args:
         measure: the measure.
         own: sums of the measures of the agent whose measure is estimated.
-        baseline: sums of the measures of the agent to compare with; None if the agent to compare with was not
-            evaluated, so that comparisons have no estimate.
-        worlds: number of worlds in the evaluation. The result is None if the measure lacks a value in at least one of
-            these worlds.
-        whole: name of a true/false measure (``MeasureSet.whole``) that must be true in all worlds for a comparison with
-            the baseline; None if there is no such condition.
+        baseline: sums of the measures of the baseline agent; None if the baseline agent was not evaluated. Without
+            these sums, comparisons have no estimate.
+        worlds: number of worlds in the evaluation. The result is None if the measure lacks a value in at least one
+            world of the evaluation.
+        whole: name of a true/false measure (``MeasureSet.whole``). A comparison with the baseline has an estimate only
+            if this measure is true in all worlds. None: there is no such condition.
 
     """
     name = measure.name if callable(measure.of) else measure.of

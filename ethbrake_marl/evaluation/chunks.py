@@ -51,13 +51,13 @@ class Lineup:
         agents: names of the agents as on the command line, such as ``full_brake`` and ``ppo+step``.
         scenario: scenario whose learners the agents drive.
         harm_count: count of harm that agents minimise, each pair's first impact (``first``) or all impacts (``total``).
-        uncertainty: how far gaps, speeds and so on may differ from their stated values, for shields that need to know
-            this, as a text such as ``gaps_m=0.5``; None: no shield needs to know.
+        uncertainty: how far quantities such as gaps and speeds may differ from their stated values, as a text such as
+            ``gaps_m=0.5``; only some shields need this argument; None: no agent has such a shield.
         measures: names of the user's measures that every process loads (``load_measures``), some as ``FILE:NAME``.
         reported: names of all measures of the user whose values the evaluation reports.
         sets: names of the sets of measures that the main process has. Every worker process must also have these sets.
-        same: hash of the policies, measures and software versions, which must be equal in every process
-            (``Lineup.of``).
+        same: hash of the policies, measures and software versions (``Lineup.of``). The hash must be equal in every
+            process.
         packages: version of each extension package that the main process uses, by the package's name. Every worker
             process must have these versions.
 
@@ -180,7 +180,7 @@ def _drive(lineup: Lineup, part: Sample, seed: int | None, first: int) -> Evalua
 
 
 def _only(outcome: Outcome, names: Sequence[str]) -> Outcome:
-    """Return the outcome with only those of the user's measures (``Outcome.metrics``) that ``names`` lists."""
+    """Return a copy of the outcome in which ``metrics`` contains only the columns of the user's measures ``names``."""
     metrics = {c: each for c, each in outcome.metrics.items() if c in names or c.rpartition("_")[0] in names}
     return replace(outcome, metrics=metrics)
 
@@ -197,15 +197,16 @@ def tally_list(
 ) -> Tally:
     """Let the agents of ``lineup`` drive an evaluation list of any length, and return sums of their measures.
 
-    The worlds are drawn and driven chunk by chunk, so memory does not grow with the length of the list. Sets of
-    measures whose computation takes longer than the simulation of the episodes are omitted.
+    The worlds are drawn and driven chunk by chunk, so memory does not grow with the length of the list. The result
+    omits sets of measures whose computation takes longer than the simulation of the episodes.
 
     Args:
         lineup: the agents to evaluate.
         episodes: number of worlds in the list, 1 to 10^12.
         seed: seed from which the worlds are drawn.
         objectives: objectives such as ``"social:45"`` (docs/cooperation.md). If objectives are passed, the result also
-            has the sums of the harm that each vehicle bears, and of the value of each objective for each vehicle.
+            contains two kinds of sums for each vehicle: the sum of the harm that the vehicle bears, and the sum of the
+            value of each objective.
         jobs: number of processes; None: one process, or with Ray one per core of the cluster.
         ray: address of a Ray cluster, or ``local`` for this machine; None: Ray is not used.
         on_done: function that is called after each chunk of worlds with the number of worlds evaluated so far.

@@ -45,18 +45,18 @@ class Conditions(dict[str, Any]):
 
         The value of a quantity of vehicles or pairs is a list with one entry per vehicle or pair, front to rear. A
         quantity of the whole world has a single entry. An entry is a number if the quantity is equal in all worlds. If
-        not, the entry is ``[smallest, largest]``.
+        the quantity differs between worlds, the entry is ``[smallest, largest]``.
         """
         return cls.of_ranges({key: rule.of(worlds).T for key, rule in QUANTITY.of(worlds).items()})
 
     @classmethod
     def of_ranges(cls, ranges: Mapping[str, Iterable[Any]]) -> Conditions:
-        """Return the same dictionary as ``of``, computed from arrays of the quantities' values.
+        """Return the same dictionary as ``Conditions.of``, computed from arrays of the quantities' values.
 
         Args:
             ranges: key of a quantity -> arrays of its values: one array per vehicle or pair, or a single array for a
-                quantity of the whole world. An array contains the values in all worlds, or only the smallest and the
-                largest of these values.
+                quantity of the whole world. Each array contains the values of a quantity in all worlds, or only the
+                smallest and the largest value.
 
         """
         ends_of = {
@@ -89,8 +89,8 @@ class Conditions(dict[str, Any]):
             quantities: quantities of the worlds: the result of ``of`` or ``of_ranges``.
             recordings: number of recordings that the worlds come from; 0 if the worlds come from no recordings.
             rejected: number of drawn worlds that were rejected because of an early impact. The returned dictionary
-                contains this number (as ``rejected_draws``) only if it is above 0 and the scenario takes its worlds
-                from a table.
+                contains the number of rejected worlds (as ``rejected_draws``) only if this number is above 0 and the
+                scenario takes its worlds from a table.
 
         """
         scenario = task.scenario
@@ -122,7 +122,8 @@ class Conditions(dict[str, Any]):
 
     @property
     def by_recording(self) -> str:
-        """Part of a caption that says how many recordings the worlds come from; "" if they do not come from recordings.
+        """Part of a caption that says how many recordings the worlds come from; "" if the worlds come from no
+        recordings.
 
         An example is ``; 95 % intervals by 55 recordings``. If all worlds come from one recording, the text says that
         there are no intervals.

@@ -42,7 +42,7 @@ T = TypeVar("T")
 class Evaluation:
     """Outcomes of several agents that drove the same vehicles in the same worlds.
 
-    In all arrays, entry k belongs to the same world.
+    In ``worlds``, in ``index`` and in every array of the outcomes, entry k belongs to the same world.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -121,7 +121,8 @@ class Evaluation:
         )
 
     def take(self, rows: Ints | Bools) -> Evaluation:
-        """Return the evaluation restricted to some of its worlds; ``left_out`` becomes empty, and ``rejected`` 0.
+        """Return the evaluation restricted to some of its worlds. In the result, ``left_out`` is empty and ``rejected``
+        is 0.
 
         Args:
             rows: row numbers of the worlds to keep, or a mask [n] that is true for the worlds to keep.
@@ -166,7 +167,7 @@ class Evaluation:
     def per_world(self, objectives: Sequence[Declared] = ()) -> Columns:
         """Return a table with one row per agent and world, as a dictionary: name of a column -> its values.
 
-        docs/evaluate.md lists the columns. Columns of initial quantities have names such as ``gap_1_m``,
+        docs/evaluate.md lists the columns of the table. Columns of initial quantities have names such as ``gap_1_m``,
         ``speed_1_mps``, ``latency_2_s`` and ``restitution``. A missing value is None.
 
         Args:
@@ -216,8 +217,8 @@ class Evaluation:
     def to_pandas(self) -> Any:
         """Return a pandas ``DataFrame`` with one row per agent and world.
 
-        docs/evaluate.md lists the columns. A missing number is NaN. ``arrays`` returns the same columns without pandas.
-        Raises ``MissingExtra`` if pandas is not installed.
+        docs/evaluate.md lists the columns of the table. A missing number is NaN. ``arrays`` returns the same columns
+        without pandas. Raises ``MissingExtra`` if pandas is not installed.
         """
         with naming_extras():
             from pandas import DataFrame
@@ -254,7 +255,9 @@ class Evaluation:
         return Sheet(repr(self), ("Agent", share, Column("First-impact harm"), Column("Total harm")), rows, note).html()
 
     def complete(self) -> Evaluation:
-        """Return this evaluation if no world was left out. If not, raise ``PhysicsError`` with the left-out worlds."""
+        """Return this evaluation if no world was left out. If a world was left out, raise ``PhysicsError``, which lists
+        the left-out worlds.
+        """
         if self.left_out:
             raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in self.left_out})
         return self

@@ -24,8 +24,8 @@ def warn_unfamiliar(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scen
     """Warn (``Unfamiliar``) about each trained policy that is to drive in worlds unlike its training worlds.
 
     A policy's manifest contains its training scenario; ``worlds`` are compared with worlds drawn from this scenario. If
-    no worlds of the training scenario can be drawn on this machine, there is no warning. Of the V2X channel, only the
-    latencies and the contents of messages are compared.
+    no worlds of the training scenario can be drawn on this machine, there is no warning. The comparison considers only
+    two features of the V2X channel: the latencies and the contents of messages.
 
     Args:
         agents: agents by name; agents without a trained policy are ignored.

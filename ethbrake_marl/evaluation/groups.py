@@ -16,7 +16,7 @@ def summarise_by(evaluation: Evaluation, by: str, *, baseline: str = BASELINE) -
     """Return one results table (``summarise``) for each group of worlds, by the group's name, in alphabetical order.
 
     Args:
-        evaluation: evaluation in the worlds of a mixture of scenarios, or of a scenario with vehicle types.
+        evaluation: outcomes of the agents in worlds of a mixture of scenarios, or of a scenario with vehicle types.
         by: what the worlds are grouped by: ``scenario`` (one of the mixture's scenarios), or the type of a vehicle,
             such as ``vehicle_2_type``.
         baseline: name of the agent with which the other agents are compared.

@@ -86,7 +86,8 @@ def _arrays_sha256(arrays: dict[str, np.ndarray]) -> str:
 
 
 def _arrays(value: Any) -> dict[str, np.ndarray]:
-    """Return the arrays that are fields of the dataclass ``value`` or of dataclasses inside it, by the field's name.
+    """Return the arrays in the fields of the dataclass ``value`` and of the dataclasses inside ``value``, by the
+    field's name.
 
     Some arrays are omitted if they have no effect: messages and braking profiles if the worlds have none, build-up
     rates of brakes if all are infinite, and weights of harm if all are 1.
@@ -145,8 +146,8 @@ def result_identity(
         scenario: scenario of the worlds.
         sample: the worlds of the result; None if the file contains results of several samples of worlds. If ``sample``
             is None, the result has no ``worlds_sha256``.
-        left_out: row numbers of the worlds in ``sample`` that were left out because of errors. ``worlds_sha256`` does
-            not cover the worlds that were left out.
+        left_out: row numbers of the worlds in ``sample`` that were left out because of errors. The hash
+            ``worlds_sha256`` is computed without the worlds that were left out.
 
     """
     identity: dict[str, Any] = {

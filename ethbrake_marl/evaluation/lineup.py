@@ -62,11 +62,11 @@ def make_lineup(
             the specs. The name of a group of agents, such as ``ladder``, is replaced by all agents of the group.
         scenario: scenario whose learners the agents drive.
         harm_count: count of harm that optimising agents minimise, ``first`` or ``total``.
-        uncertainty: how far gaps, speeds and so on may differ from their stated values, for shields that need to know
-            this (such as ``gaps_m=0.5``; see ``make_agent``).
+        uncertainty: how far quantities such as gaps and speeds may differ from their stated values, for instance
+            ``gaps_m=0.5``; only some shields need this argument (see ``make_agent``).
         alone: whether to refuse teams, because the caller needs agents that drive a single vehicle.
-        bare: whether to refuse agents with a shield, because the caller adds a shield. If ``bare`` is true and the
-            scenario has one learner, teams are also refused.
+        bare: whether to refuse agents that already have a shield, because the caller will add one. If ``bare`` is true
+            and the scenario has one learner, teams are also refused.
 
     Raises ``InvalidInput`` for a repeated spec, for an uncertainty that is missing or unused, and for a team or shield
     that is refused. Also raises the errors of ``make_agent``.

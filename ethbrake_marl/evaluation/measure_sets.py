@@ -27,12 +27,13 @@ BASELINE = "full_brake"
 
 @dataclass(frozen=True, slots=True)
 class Measure:
-    """One measure of an agent. Tables show the mean of a measure, or how often a true/false measure is true.
+    """One measure of an agent. Tables show the mean of the measure over the worlds or, for a true/false measure, the
+    share of worlds in which the measure is true.
 
     The field ``of`` is a function of the agent's outcome and of the context that ``MeasureSet.prepare`` returned. The
     function returns one value per world, [n], or None if the measure is not defined for this outcome. If the measure
-    compares the agent with the baseline, ``of`` is instead the name of the measure to compare, and ``against`` says
-    how.
+    compares the agent with the baseline, ``of`` is instead the name of the measure to compare, and ``against`` says how
+    to compare.
     """
 
     name: str  # key in JSON results, different for all measures
@@ -64,14 +65,16 @@ class Measure:
 
 @dataclass(frozen=True, slots=True)
 class Silent:
-    """Context of a set of measures that does not apply to an evaluation, and whose measures thus have no values."""
+    """Context of a set of measures that does not apply to an evaluation. The measures of such a set have no values."""
 
     because: str  # why the set does not apply: a clause for users, without capital and full stop
 
 
 @dataclass(frozen=True, slots=True)
 class GroupColumn:
-    """Column that a set of measures adds to the table that ``ethbrake evaluate`` prints for a group of scenarios."""
+    """Column of the table that ``ethbrake evaluate`` prints for a group of scenarios. A set of measures adds this
+    column.
+    """
 
     column: Column  # heading and number format of the column
     measures: Mapping[HarmCount, str]  # count of harm that the agents minimise -> name of the measure to show
@@ -111,7 +114,7 @@ class MeasureSet:
         return None
 
     def row(self, tally: Any, worlds: int, context: Any) -> dict[str, Any]:
-        """Return fields that this set adds to an agent's object in the JSON results; by default none.
+        """Return fields that this set adds to an agent's object in the JSON results (in the base class: none).
 
         The returned dictionary must have the same keys in every evaluation, even if the set does not apply to the
         evaluation.
@@ -126,14 +129,15 @@ class MeasureSet:
         return {}
 
     def warnings(self, rows: Sequence[Any]) -> Sequence[str]:
-        """Return warnings about a results table, each a clause without capital letter and full stop; by default none.
+        """Return warnings about a results table (in the base class: none). A warning is a clause that has no capital
+        letter at the beginning and no full stop at the end.
 
         ``rows`` are the table's rows (``SummaryRow``, one per agent).
         """
         return ()
 
     def notes(self, rows: Sequence[Any]) -> Sequence[str]:
-        """Return notes to print below a results table, each a whole sentence; by default none.
+        """Return notes to print below a results table (in the base class: none). A note is a whole sentence.
 
         ``rows`` are the table's rows (``SummaryRow``, one per agent).
         """
@@ -255,8 +259,8 @@ MEASURE_SETS: Registry[MeasureSet] = Registry("set of measures", "measure_sets",
 def contexts_of(evaluation: Any, *, long_list: bool = False) -> dict[str, Any]:
     """Return the context (information about the worlds) of each installed set of measures, by the set's name.
 
-    A context is the result of ``MeasureSet.prepare``, which is called once per evaluation. If the set does not apply to
-    the evaluation, the context is ``Silent``, with the reason.
+    A context is the result of ``MeasureSet.prepare``, which is called once per evaluation. If a set does not apply to
+    the evaluation, its context is ``Silent``, with the reason.
 
     Args:
         evaluation: the evaluation.

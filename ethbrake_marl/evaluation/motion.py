@@ -100,7 +100,9 @@ class _Follower(Tape):
             self._ruling = ruling
 
     def motions(self, episodes: Episodes) -> list[EpisodeMotion]:
-        """Return the recorded motion of each world. ``episodes`` is the result of the finished episodes."""
+        """Return the recorded motion of each world. ``episodes`` contains the harm, the final states and the agents'
+        memories of all worlds.
+        """
         n, N = self.worlds.n, self.worlds.N
         impacts, pieces = self.episodes(), self._pieces()
         motions = []

@@ -99,9 +99,9 @@ def _no_impact(rows: Sequence[SummaryRow]) -> str:
 
 
 def _knowledge(rows: Sequence[SummaryRow]) -> str:
-    """Return the note about what the V2X channel hides, and about what the agents know nevertheless.
+    """Return the note that says what the V2X channel hides, and which hidden values agents know nevertheless.
 
-    The note is empty if the channel hides nothing in these worlds.
+    The note is empty if the V2X channel hides nothing in the evaluated worlds.
     """
     hidden = rows[0].hidden_share
     if not hidden:

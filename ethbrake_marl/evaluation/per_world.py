@@ -33,8 +33,8 @@ def write_per_world(
 ) -> None:
     """Write a table with one row per agent and world as CSV or Parquet.
 
-    docs/evaluate.md lists the columns. The row of a world that was left out contains only the agent, the world's number
-    and, in the column ``ended``, the reason. If writing fails, there is no incomplete file.
+    docs/evaluate.md lists the columns of the table. The row of a world that was left out contains only the agent, the
+    world's number and, in the column ``ended``, the reason. If writing fails, no incomplete file remains.
 
     Args:
         path: file to write, with the ending ``.csv`` or ``.parquet``.
@@ -71,8 +71,8 @@ Harms = dict[str, dict[int, tuple[float, ...]]]  # agent -> world -> (first-impa
 def read_harms(path: Path, data: bytes) -> tuple[Harms, dict[int, str]]:
     """Read a file that ``write_per_world`` wrote: the harms of each agent in each world, and each world's recording.
 
-    Returns two dictionaries: agent -> world -> harms, and world -> recording. The dictionary of recordings is empty if
-    the file has no column ``recording``. Both dictionaries omit the worlds that were left out.
+    Returns two dictionaries: agent -> (world -> harms), and world -> recording. The dictionary of recordings is empty
+    if the file has no column ``recording``. Both dictionaries omit the worlds that were left out.
 
     Args:
         path: name of the file, whose ending decides the format. The file is not read, because ``data`` is its content.

@@ -1,7 +1,7 @@
-"""Record of one episode at fine time resolution, for figures and viewers.
+"""Record of one episode with closely spaced time samples, for figures and viewers.
 
-The agent first drives the episode as in an evaluation. The state at each sample time is computed afterwards, from the
-state and the commands at the beginning of the time step that contains the sample time.
+The agent first drives the episode as in an evaluation. After the episode, the state at each sample time is computed
+from the state and the commands at the beginning of the time step that contains the sample time.
 """
 
 from __future__ import annotations
@@ -106,10 +106,10 @@ def record_episode(
 def _samples(segments: Sequence[tuple[Worlds, Floats, Floats]], sample_s: float) -> Iterator[tuple[Floats, ...]]:
     """Yield the samples of each step: time [k], gaps [k, P], speeds [k, N], positions [k, N], commands [k, N].
 
-    Consecutive samples are at most ``sample_s`` seconds apart. The state at the end of a step is returned only once, as
-    the first sample of the next step or, after the last step, as its last sample. A world does not contain positions,
-    so Vehicle 1's position is computed from its gap to an obstacle. For this computation, an obstacle is put into a
-    world without an obstacle, so far ahead that Vehicle 1 cannot reach it.
+    Consecutive samples are at most ``sample_s`` seconds apart. The state at the end of a step is returned only once: as
+    the first sample of the next step or, for the last step, as the last sample of the episode. A world does not contain
+    positions, so Vehicle 1's position is computed from its gap to an obstacle. For this computation, an obstacle is put
+    into a world without an obstacle, so far ahead that Vehicle 1 cannot reach it.
 
     Args:
         segments: time steps of one episode, each as (world at the beginning of the step, commands [1, N] (m/s2), time

@@ -13,7 +13,7 @@ from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 
 @dataclass(frozen=True, slots=True)
 class Rescored:
-    """For each vehicle, the mean value of one objective over the worlds of one agent. Smaller values are better."""
+    """For each vehicle, the mean value of one objective over the worlds of one agent. A smaller mean is better."""
 
     agent: str  # name of the agent
     objective: str  # objective as in scenarios: ``total``, ``own``, ``social:45``

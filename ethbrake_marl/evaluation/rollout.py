@@ -1,7 +1,7 @@
 """Evaluate agents: draw a fixed list of worlds, let every agent drive each world once, and measure the results.
 
-The worlds are fixed in advance. If instead the episodes that finish first were evaluated, short episodes would be
-over-represented, and many short episodes are crashes.
+The worlds of an evaluation are fixed in advance. If instead the episodes that finish first were evaluated, short
+episodes would be over-represented, and many short episodes are crashes.
 """
 
 from __future__ import annotations
@@ -66,7 +66,8 @@ def evaluate(
         worlds: worlds at the alert, or a sample from ``scenario.sample``; None: draw ``episodes`` worlds from ``seed``.
         agents: agents to evaluate: specs as on the command line (``"full_brake,ppo"``, or a list of specs), or a
             mapping from name to agent or ``Team``. Each controlled vehicle gets a copy of its agent; the objects that
-            you pass do not change. Optimising agents that are built from specs minimise first-impact harm.
+            you pass do not change. Optimising agents that this function builds from specs (texts such as
+            ``full_brake``) minimise first-impact harm.
         scenario: scenario of the worlds, or its name or path.
         vehicle: the controlled vehicle, by name (``vehicle_2``) or index (0 = front); None: the scenario's learners.
         episodes: number of worlds to draw; None: 10,000.
@@ -108,7 +109,9 @@ def evaluate(
 
 
 def chunks_of(sample: Sample, size: int = CHUNK) -> Iterator[tuple[int, Sample]]:
-    """Split a sample into chunks of at most ``size`` worlds; yield pairs (row of the chunk's first world, chunk)."""
+    """Split a sample into chunks of at most ``size`` worlds; yield pairs (index in the sample of the chunk's first
+    world, chunk).
+    """
     for first in range(0, sample.worlds.n, size):
         yield first, sample.take(np.arange(first, min(first + size, sample.worlds.n)))
 
@@ -160,7 +163,7 @@ def drive_chunk(
 
 
 def _check_request(worlds: object, agents: object, chunk: object) -> None:
-    """Raise ``InvalidInput`` if one of the three arguments, which are passed to ``evaluate``, is wrong."""
+    """Raise ``InvalidInput`` if the argument ``worlds``, ``agents`` or ``chunk`` of ``evaluate`` is invalid."""
     if not isinstance(worlds, Worlds | Sample):
         raise InvalidInput(
             f"evaluate: worlds = {worlds!r}: must be a Worlds or Sample object, for instance scenario.sample(100,"
@@ -183,8 +186,8 @@ def controlled_vehicles(scenario: Scenario, vehicle: int | str | None, agents: M
     """Return the indices (0 = front) of the vehicles that the agents are to control.
 
     The result contains ``vehicle`` (name or index) or, if ``vehicle`` is None, all learners of the scenario. If the
-    scenario has no learners and ``vehicle`` is None, all agents must be teams, and the result is empty. If some agent
-    is not a team, ``InvalidInput`` is raised.
+    scenario has no learners and ``vehicle`` is None, the result is empty if all agents are teams; otherwise
+    ``InvalidInput`` is raised.
     """
     if vehicle is not None or (not scenario.learners and any(not isinstance(a, Team) for a in agents.values())):
         return (controlled_vehicle(scenario, vehicle),)

@@ -1,4 +1,5 @@
-"""Statistics over training runs with different seeds; the intervals say what to expect of another seed.
+"""Statistics over training runs with different seeds. The intervals also include the randomness of the seeds, so they
+say what result to expect from a training run with another seed.
 
 There are usually few training runs, and a single bad run changes their mean a lot. The interquartile mean therefore
 omits the best and the worst quarter of the runs' results. The error of the interquartile mean is estimated with a
@@ -77,8 +78,8 @@ def mean_over_seeds(
     """Return the mean over seeds and worlds of ``values``, or of ``values - baseline``, with a bootstrap interval.
 
     The bootstrap resamples the seeds of ``values``, the seeds of ``baseline``, and the worlds (or clusters of worlds).
-    The interval therefore says what to expect of other seeds and other worlds. There is no interval if there is only
-    one world or cluster, or if no baseline is given and all values are 0. Without a baseline, the interval of
+    The interval therefore says what mean to expect with other seeds and other worlds. There is no interval if there is
+    only one world or cluster, or if no baseline is given and all values are 0. Without a baseline, the interval of
     true/false values is widened so that it contains Wilson's interval, because bootstrap intervals of nearly constant
     values are too narrow.
 
@@ -89,7 +90,7 @@ def mean_over_seeds(
         clusters: name of the cluster (recording) of each world, [worlds]; None: all worlds are independent.
         seed: seed of the bootstrap's random numbers.
 
-    Raises ``InvalidInput`` if the numbers of worlds differ, or if a value is not finite.
+    Raises ``InvalidInput`` if the arrays do not all have the same number of worlds, or if a value is not finite.
 
     """
     array = np.atleast_2d(np.asarray(values))
@@ -112,12 +113,13 @@ def mean_over_seeds(
 def share_over_seeds(
     values: ArrayLike, worst: ArrayLike, best: ArrayLike, *, clusters: Texts | None = None, seed: int = 0
 ) -> Estimate | None:
-    """Return the share of the possible reduction: 0 if the mean harm is that of ``worst``, 1 if it is that of ``best``.
+    """Return the share of the possible reduction: 0 if ``values`` has the same mean as ``worst``, 1 if ``values`` has
+    the same mean as ``best``.
 
     The share is ``(mean(worst) - mean(values)) / (mean(worst) - mean(best))``, with a bootstrap interval as in
-    ``mean_over_seeds``. The result is None if ``mean(best) >= mean(worst)``. The result is also None if too many
-    bootstrap resamples have almost no possible reduction: if, in 5 % of the resamples or more,
-    ``mean(worst) - mean(best)`` is at most 0.1 % of its value in the original data.
+    ``mean_over_seeds``. The result is None if ``mean(best) >= mean(worst)``. The result is also None if almost no
+    reduction is possible in 5 % of the bootstrap resamples or more. *Almost no reduction* means that ``mean(worst) -
+    mean(best)`` in the resample is at most 0.1 % of ``mean(worst) - mean(best)`` in the original data.
 
     Args:
         values: harms of the training runs to judge, [seeds, worlds] (m2/s2).
@@ -145,8 +147,8 @@ def share_over_seeds(
 def _pair_sides(who: str, *sides: ArrayLike) -> tuple[Floats, ...]:
     """Return each of ``sides`` (the results to compare) as an array [seeds, worlds].
 
-    Raises ``InvalidInput`` if the numbers of worlds differ, or if a value is not finite. ``who`` is the name of the
-    calling function, for error messages.
+    Raises ``InvalidInput`` if the arrays do not all have the same number of worlds, or if a value is not finite.
+    ``who`` is the name of the calling function, for error messages.
     """
     arrays = tuple(np.atleast_2d(np.asarray(side, np.float64)) for side in sides)
     if any(side.ndim != 2 or not side.size or side.shape[1] != arrays[0].shape[-1] for side in arrays):
@@ -167,8 +169,9 @@ def _resampled(
     Args:
         value: the estimate, computed from the original data.
         sides: results to resample: arrays [seeds, worlds], all for the same worlds.
-        of: function that computes a statistic, one value per resample, from the mean of each of ``sides`` in each
-            resample, [resamples, number of sides]. The ends of the interval are percentiles of this statistic.
+        of: function that returns a statistic for each resample, [resamples]. Its argument is the mean of each of
+            ``sides`` in each resample, [resamples, number of sides]. The ends of the interval are percentiles of the
+            returned array.
         clusters: name of the cluster (recording) of each world, [worlds]; None: all worlds are independent.
         seed: seed of the bootstrap's random numbers.
 

@@ -83,7 +83,7 @@ class ModeRow:
 
 
 class ShieldModes(list[ModeRow]):
-    """Result of ``compare_modes``: a list with one row for each agent and mode of the shield."""
+    """Result of ``compare_modes``: a list with one row for each pair of an agent and a mode of the shield."""
 
     @property
     def of_teams(self) -> bool:
@@ -142,7 +142,7 @@ def compare_modes(
     alert. In ``step-cap`` the shield limits each vehicle's harm (``cap="baseline"``). ``step-cap`` is compared for
     teams only; episode mode is not available for teams. To judge each decision in which step mode replaced the policy's
     action, the episode is simulated again, and from this decision on the policy drives without a shield. If the
-    simulation of a world fails with one agent, the world is left out for all agents, and every row lists it in
+    simulation of a world fails with one agent, the world is left out for all agents, and every row lists this world in
     ``left_out``.
 
     Args:
@@ -181,8 +181,8 @@ def compare_modes(
 
 
 class _Part(NamedTuple):
-    """Results of an agent in some worlds in one mode; only step mode and its variants have ``shielded`` and
-    ``verdicts``.
+    """Results of an agent in some worlds, without a shield or in one mode of the shield. The fields ``shielded`` and
+    ``verdicts`` are None except in step mode and its variants.
     """
 
     harm: Floats  # [n] harm of the line in each world (m2/s2)
@@ -247,8 +247,8 @@ def _row(
         agent: name of the agent.
         mode: the shield's mode.
         parts: results of the agent in ``mode``, one entry for each chunk of worlds.
-        harm: mode of the shield -> harm of the agent in every world (m2/s2), [n]. The returned row also contains the
-            harm in ``mode`` minus the harm in episode mode, and minus the harm without a shield.
+        harm: mode of the shield -> harm of the agent in every world (m2/s2), [n]. The returned row also contains two
+            differences: (harm in ``mode``) - (harm in episode mode), and (harm in ``mode``) - (harm without a shield).
         task: the scenario, the controlled vehicles, and the count of harm that the shield bounds.
         clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
 

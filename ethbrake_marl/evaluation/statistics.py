@@ -31,9 +31,10 @@ Texts = NDArray[np.str_]
 def exact_sum(values: Floats, others: Floats | None = None) -> Fraction:
     """Return the exact sum of ``values`` [n], or of the products ``values * others``, without rounding.
 
-    Each float64 is a whole number of 53 bits times a power of two. Whole numbers that belong to the same power of two
-    are added as Python integers, which never overflow. The result therefore does not depend on the order of the values,
-    and sums over chunks of worlds can be added without error. Raises ``InvalidInput`` unless all numbers are finite.
+    Each float64 is a whole number of at most 53 bits times a power of two. Whole numbers that belong to the same power
+    of two are added as Python integers, which never overflow. The result therefore does not depend on the order of the
+    values, and sums over chunks of worlds can be added without error. Raises ``InvalidInput`` unless all numbers are
+    finite.
     """
     wholes, powers = _in_wholes(values)
     if others is not None:
@@ -82,7 +83,8 @@ _UPPER = 0.5 + 0.5 * CONFIDENCE  # quantile at the upper end of an interval
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """Number of values, their exact sum, and the exact sum of their squares. Two ``Moments`` can be added.
+    """Number of values, their exact sum, and the exact sum of their squares. The sum of two ``Moments`` describes the
+    values of both together.
 
     >>> import numpy as np
     >>> from ethbrake_marl.evaluation.statistics import Moments
@@ -168,12 +170,13 @@ class Moments:
     def share(self) -> Estimate:
         """Mean p of values that are all 0 or 1, with Wilson's interval (``rate``).
 
-        With G clusters, Wilson's interval is computed for an effective number of independent draws, which would have
-        the same standard error: ``1 + p (1 - p) / error ** 2``, but at most the number of values. If all values are
-        equal, this effective number is G. The effective number is multiplied by ``(z / t) ** 2``, where z and t are the
-        quantiles of the normal and the t distribution, because the standard error has G - 1 degrees of freedom (Korn
-        and Graubard 1998, "Confidence intervals for proportions with small expected number of positive counts estimated
-        from survey data", Survey Methodology 24). If there is only one cluster, there is no interval.
+        With G clusters, Wilson's interval is computed as for ``1 + p (1 - p) / error ** 2`` independent draws, which
+        would have the same standard error ``error``; this effective number of draws is limited to the number of values.
+        If all values are equal, this effective number is G. The effective number is multiplied by ``(z / t) ** 2``,
+        where z and t are the quantiles of the normal and the t distribution, because the standard error has G - 1
+        degrees of freedom (Korn and Graubard 1998, "Confidence intervals for proportions with small expected number of
+        positive counts estimated from survey data", Survey Methodology 24). If there is only one cluster, there is no
+        interval.
         """
         if not self.clusters:
             return rate(int(self.total), self.count)
@@ -214,7 +217,7 @@ class Moments:
 
         Args:
             baseline: moments of the baseline agent's values, which belong to the same worlds as ``values``.
-            products: exact sum over all worlds of ``value * baseline``.
+            products: exact sum over all worlds of the product ``value * baseline``.
 
         """
         if baseline.total == 0:
@@ -223,7 +226,7 @@ class Moments:
         return self._around(1.0 - float(self.total / baseline.total), error)
 
     def _around(self, value: float, error: float) -> Estimate:
-        """Return ``value`` with the interval ``value -+ t error``, or without an interval if there is only one draw.
+        """Return ``value`` with the interval ``value -+ t * error``, or without an interval if there is only one draw.
 
         ``error`` is the standard error of ``value``. The degrees of freedom of t are the number of independent draws
         minus 1.
@@ -239,8 +242,8 @@ def of_amounts(estimate: Estimate, *, nothing: bool) -> Estimate:
 
     Args:
         estimate: mean with an interval that may extend below 0.
-        nothing: whether all averaged values are 0. If all are 0, the result has no interval, because zeros show that
-            larger values are rare, but not how large such values can be.
+        nothing: whether all averaged values are 0. If all averaged values are 0, the result has no interval, because
+            zeros show that larger values are rare, but not how large such values can be.
 
     """
     if nothing or estimate.interval is None:
@@ -257,8 +260,8 @@ def root(number: Fraction) -> float:
 def rate(successes: int, count: int) -> Estimate:
     """Return the share ``p = successes / count`` with Wilson's score interval, which lies within [0, 1].
 
-    The interval has the centre ``(p + z^2/2n) / (1 + z^2/n)`` and the half-width
-    ``z / (1 + z^2/n) sqrt(p (1 - p) / n + z^2/4n^2)``, where n is ``count``, and z the quantile of the normal
+    The interval has the centre ``(p + z^2 / (2 n)) / (1 + z^2 / n)`` and the half-width
+    ``z * sqrt(p (1 - p) / n + z^2 / (4 n^2)) / (1 + z^2 / n)``, where n is ``count``, and z the quantile of the normal
     distribution. Raises ``InvalidInput`` unless 0 <= successes <= count and count >= 1.
     """
     if not (count >= 1 and 0 <= successes <= count):
@@ -286,7 +289,7 @@ def wilson(p: float, count: float) -> tuple[float, float]:
 
 
 def mean(values: Floats, clusters: Texts | None = None) -> Estimate:
-    """Return the mean of n values with its 95 % t interval, ``mean -+ t s / sqrt(n)``.
+    """Return the mean of n values with its 95 % t interval, ``mean -+ t * s / sqrt(n)``.
 
     In the formula, s is the standard deviation, and t the quantile of the t distribution with n - 1 degrees of freedom.
     The interval assumes that the mean is normally distributed, which is nearly true for thousands of worlds. If no
@@ -381,7 +384,7 @@ def check(values: ArrayLike, who: str = "statistics", each: str = "world") -> Fl
     Args:
         values: the numbers to check.
         who: name of the calling function, for error messages.
-        each: what each number belongs to (``world`` or ``seed``), for error messages.
+        each: word for what one number belongs to, ``world`` or ``seed``, for error messages.
 
     Raises ``InvalidInput`` if ``values`` is not one-dimensional, is empty, or contains a number that is not finite.
 

@@ -50,7 +50,7 @@ class SummaryTable(list[SummaryRow]):
 
     Args:
         rows: one row of results for each agent.
-        beside: rows from another source, to print below the rows of the agents; None: there are no such rows.
+        beside: rows from another source (such as the paper), printed below the rows of the agents; None: no such rows.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -236,7 +236,7 @@ def summarise_sums(
         conditions: scenario, number and quantities of the worlds (``Conditions.of_test``).
         contexts: name of a set of measures -> information that the set computed once for these worlds
             (``contexts_of``).
-        knows: name of an agent -> what the agent says that it knows about the line.
+        knows: name of an agent -> knowledge about the line that the agent declares.
         policies: name of an agent -> SHA-256 of the policy of each vehicle, by the vehicle's name.
         baseline: name of the agent with which the other agents are compared.
         shared: fields of ``SummaryRow`` that are equal in all rows, such as ``worlds_sha256``.

@@ -20,7 +20,7 @@ class SummaryRow:
     """Results of one agent over all worlds of an evaluation. Harms are means per world, m2/s2.
 
     ``row[name]`` is the estimate of a measure, by the measure's name in JSON, such as ``row["harm_decrease_total"]``.
-    The estimate is None if the measure is not defined in these worlds.
+    The estimate is None if the measure is not defined in the evaluated worlds.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -86,7 +86,9 @@ class SummaryRow:
 
     @property
     def exploits(self) -> Exploits:
-        """The agent's exploits, which harm does not count: shoving Vehicle 1, and still moving at the horizon."""
+        """The agent's exploits: shoving Vehicle 1, and vehicles that still move at the horizon. Neither exploit adds to
+        the harm.
+        """
         shoved = self.estimates["vehicle_1_shoved_m"]
         return Exploits(None if shoved is None else shoved.value, self.horizon_ends / self.episodes)
 

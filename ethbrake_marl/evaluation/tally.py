@@ -1,6 +1,6 @@
 """For each agent, the sums of its measures over some of the worlds.
 
-Sums over different worlds can be added in any order.
+Sums over different worlds can be added in any order, with the same result.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ Range = tuple[float, float]  # smallest and largest value
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """For each agent, the sums of its measures over some worlds. ``tally + other`` covers the worlds of both."""
+    """For each agent, the sums of its measures over some worlds. ``tally + other`` contains the sums over the worlds of
+    both.
+    """
 
     worlds: int = 0  # number of worlds, without left-out worlds
     hidden: int = 0  # number of worlds in which the V2X channel hides something from a controlled vehicle
@@ -45,8 +47,8 @@ class Tally:
         Args:
             part: evaluation of the agents in some consecutive worlds of the evaluation list.
             objectives: objectives such as ``"social:45"`` (docs/cooperation.md). If ``objectives`` is a list, even an
-                empty list, the result also has the sums of the harm that each vehicle bears, and of the value of each
-                objective for each vehicle.
+                empty list, the result also contains two kinds of sums for each vehicle: the sum of the harm that the
+                vehicle bears, and the sum of the value of each objective.
             long_list: whether to omit the sets of measures that do not apply to more than 100,000 worlds.
 
         """

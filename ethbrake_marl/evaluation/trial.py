@@ -1,4 +1,6 @@
-"""Try a scenario before use: check that its scripts can drive, and count worlds in which something unusual happens."""
+"""Try a scenario before use: check that its scripts run without errors, and count worlds in which something unusual
+happens.
+"""
 
 from __future__ import annotations
 
@@ -79,13 +81,13 @@ def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
     - ``early_impacts``: number of worlds with an impact before a learner may act;
     - ``moving_at_horizon``: number of worlds in which a vehicle still moves at the horizon;
     - ``vehicle_1_late``: number of worlds in which Vehicle 1 has a latency;
-    - ``commands_out_of_range``: name of a vehicle -> row number of a world in which its script commanded more than the
-      vehicle's capacity -> error message;
+    - ``commands_out_of_range``: name of a vehicle -> (row number of a world -> error message), for worlds in which the
+      vehicle's script commanded more than the vehicle's capacity;
     - ``not_state_free``: name of a vehicle -> its script, for scripts that react to the state of the world;
     - ``refused_by``: name of an agent, shield or setting that refuses scripts that react to the state of the world ->
       error message.
 
-    Raises ``InvalidInput`` for an error in a script, ``PhysicsError`` for worlds whose simulation fails.
+    Raises ``InvalidInput`` if a script has an error, and ``PhysicsError`` if the simulation of a world fails.
     """
     searches = {
         scenario.vehicle_names[i]: f"{ScriptSpec.parse(script).name}:{TRIED_CANDIDATES}"
@@ -131,9 +133,10 @@ def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
 
 
 def _refusals(scenario: Scenario, worlds: Worlds) -> dict[str, str]:
-    """Try agents, shields and a setting on ``worlds``, and return the error message of each that refuses the scenario.
+    """Try agents, shields and the setting ``early_impacts: reject`` on ``worlds``; for each one that refuses the
+    scenario, return the error message.
 
-    A key of the result is the spec of an agent, ``+`` and the name of a shield, or ``early_impacts: reject``.
+    The keys of the result are specs of agents, names of shields (written after ``+``), and ``early_impacts: reject``.
     """
 
     def drive_by(spec: str, needs: Mapping[str, Any]) -> None:

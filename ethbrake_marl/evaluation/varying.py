@@ -12,8 +12,8 @@ from ethbrake_marl.scenario.schema import Scenario
 def states_of(worlds: Worlds, scenario: Scenario) -> list[dict[str, float | None]]:
     """Return the initial state of each world by column, such as ``{"gap_1_m": 6.6, "speed_1_mps": 19.0}``.
 
-    The columns are all gaps and speeds, and every other quantity that the scenario does not fix. In a world without an
-    obstacle, the distance to the obstacle is None.
+    The columns are all gaps and speeds, and every other quantity that the scenario does not set to one fixed value. In
+    a world without an obstacle, the distance to the obstacle is None.
     """
     fixed = {
         rule.column_of(i)

@@ -25,7 +25,7 @@ from ethbrake_marl.training.networks import ACTIVATIONS, sb3_names, tensors_of
 class Deterministic(BasePolicy):
     """Base class of policies without exploration noise: actions are the network's outputs, clipped to [-1, 1].
 
-    A subclass must define ``forward``, and one of ``means`` and ``act``. If the recipe of ``vine`` has ``focus`` above
+    A subclass must define ``forward``, and either ``means`` or ``act``. If the recipe of ``vine`` has ``focus`` above
     0, the subclass must also define ``expect``. In all methods, ``rows`` is the number of observations, and F is the
     number of features of an observation.
     """
@@ -35,7 +35,7 @@ class Deterministic(BasePolicy):
         raise NotImplementedError
 
     def expect(self, observation: Float32s) -> Floats:
-        """Return the predicted size of the gradient of the return with respect to the action, [rows].
+        """Return the predicted absolute gradient of the return with respect to the action, [rows].
 
         ``observation`` [rows, F] are the observations from which the gradient is predicted.
         """
@@ -59,7 +59,8 @@ class Deterministic(BasePolicy):
 
 
 class AveragedActor(Deterministic):
-    """Actor whose network exists twice: ``learning`` is trained; ``average`` has running averages of its weights.
+    """Actor whose network exists twice: ``learning`` is trained; ``average`` has running averages of the weights of
+    ``learning``.
 
     A trained policy uses the averaged weights. The averaged weights have the same names as in PPO of
     Stable-Baselines3.

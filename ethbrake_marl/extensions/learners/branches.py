@@ -53,8 +53,8 @@ def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) ->
 
     Returns two arrays with one number for each branch, [n]. The first array contains the discounted return of the
     learner with the offset, from the start of the branch on (NaN if the simulation failed). The second array contains
-    the sum over the steps of (action with offset, clipped to [-1, 1], minus action of the policy). If harm is the only
-    term of the reward, a branch ends as soon as all its vehicles are at rest and will stay at rest.
+    the sum, over the steps, of the difference that the offset makes to the action (after clipping to [-1, 1]). If harm
+    is the only term of the reward, a branch ends as soon as all its vehicles are at rest and will stay at rest.
 
     """
     moved, most = np.zeros(engine.n), int(offsets.steps.max(initial=0))
@@ -84,7 +84,7 @@ def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) 
         decide: function that returns the actions of the learners, [m, L]. The three arguments of ``decide`` are the
             observations [m, L, F], the indices of the m worlds, and the number of steps so far.
         gamma: discount factor per time step.
-        at_least: number of steps, from the start, in which no world ends early because its vehicles are at rest.
+        at_least: for this number of steps from the start, no simulation ends early, even if all vehicles are at rest.
 
     If harm is the only term of the reward, the simulation of a world ends as soon as all its vehicles are at rest and
     will stay at rest. If the simulation of a world fails, its return is NaN.
@@ -131,8 +131,9 @@ def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
     """Return, for each of m worlds, whether all its vehicles are at rest and will stay at rest, [m] bool.
 
     ``rows`` [m] are the indices of the worlds in the engine; ``before`` [m, columns] is the packed state of these
-    worlds one time step earlier. The result is True only if nothing has changed in this step and if every latency has
-    elapsed. When a latency elapses, the observation may change, so that a policy may move a vehicle again.
+    worlds one time step earlier. For a world in which a latency has not elapsed, or whose state (apart from the time)
+    has changed in this step, the result is False. When a latency elapses, the observation may change, so that a policy
+    may move a vehicle again.
     """
     if engine.packed.has_messages or engine.in_pieces:
         return np.zeros(len(rows), np.bool_)  # a message may still change the observation, or a profile the command
@@ -146,11 +147,11 @@ def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, sta
     """Write into ``stands`` [m], for each of m worlds, whether all its vehicles are at rest and will stay at rest.
 
     Args:
-        state: packed state of all worlds of an engine.
+        state: packed state of all worlds of an engine: one row of numbers per world.
         before: [m, columns] packed state of the m worlds one time step earlier.
-        params: packed constants (such as masses and latencies) of all worlds of the engine.
+        params: packed constants of all worlds of the engine: one row per world, with masses, latencies and so on.
         rows: [m] indices of the worlds to check, in ``state`` and ``params``.
-        stands: [m] array for the result; it is overwritten.
+        stands: [m] bool array into which the result is written (True: all vehicles stay at rest).
 
     """
     column = columns(state)
@@ -174,9 +175,9 @@ def counted_harm(engine: Engine, count: HarmCount) -> Floats:
     """Return, for each of the L learners of an engine, the harm (up to the present time) that this learner should make
     small, [n, L] m2/s2.
 
-    If the reward has objectives, this harm is the value of the learner's objective. If the reward has no objectives,
-    this harm is the harm of the whole line. ``count`` is the count of harm: ``first`` (each pair's first impact) or
-    ``total`` (all impacts).
+    If the reward has objectives, each learner should make the value of its own objective small. If the reward has no
+    objectives, each learner should make the harm of the whole line small. ``count`` is the count of harm: ``first``
+    (each pair's first impact) or ``total`` (all impacts).
     """
     declared, shape = engine.reward.objective, (engine.n, len(engine.learners))
     if declared is None:

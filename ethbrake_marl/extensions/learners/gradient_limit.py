@@ -17,7 +17,8 @@ NARROWEST = 4.0  # least ratio of the largest offset to the smallest; takes prec
 
 
 def limit_that_cuts(sizes: Floats, share: float) -> float:
-    """Return the limit at which clipping gradients lowers the sum of their absolute values by the fraction ``share``.
+    """Return the limit for absolute gradients; clipping to this limit lowers the sum of the absolute gradients by the
+    fraction ``share``.
 
     ``sizes`` [n] are the absolute gradients. For example, with ``sizes`` = [1, 1, 4] and ``share`` = 1/3 the limit is
     2: clipping at 2 gives [1, 1, 2], and the sum falls from 6 to 4, by one third.
@@ -39,8 +40,9 @@ def smallest_offset(measured: Floats, least: float, most: float) -> float:
     large offsets, the result is ``least``.
 
     Args:
-        measured: [n, 2] absolute gradient, and the offset with which this gradient was measured (0: not measured yet).
-            The gradients with the smaller half of the offsets are compared with the gradients with the larger half.
+        measured: [n, 2] rows of (absolute value of a gradient, offset with which this gradient was measured). An offset
+            of 0 means that the row is still empty. The gradients measured with the smaller half of the offsets are
+            compared with the gradients measured with the larger half.
         least: smallest offset that the recipe allows.
         most: largest offset that the recipe allows.
 

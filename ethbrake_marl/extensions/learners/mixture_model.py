@@ -34,10 +34,11 @@ from ethbrake_marl.policies.network_spec import Float32s
 
 
 class ExpertsModel(VineModel):
-    """Model that trains a mixture of experts: several networks, and a gating network that chooses which of them acts.
+    """Model that trains a mixture of experts: several networks, and a gating network that chooses which of these
+    networks acts.
 
-    The training run has four stages. The first stage trains the first expert in all worlds. The second stage trains
-    each other expert in worlds that are selected for this expert. The third stage trains the gating network, and the
+    The training run has four stages. The first stage trains the first expert in all worlds. The second stage trains the
+    other experts, each in worlds that are selected for this expert. The third stage trains the gating network, and the
     last stage trains all networks together.
 
     Args:
@@ -97,13 +98,14 @@ class ExpertsModel(VineModel):
         the stage begins or is resumed.
 
         If the stage trains a second or later expert, this expert first imitates templates (random braking profiles)
-        that do better than the earlier experts. After the imitation, the worlds for the training of this expert are
-        selected.
+        that have a higher return than the earlier experts. After the imitation, the worlds for the training of this
+        expert are selected.
 
         The preparation of a stage depends only on the earlier experts, so a resumed training run repeats the
         preparation exactly.
 
-        Raises ``NoBetterTemplate`` if no template does better than the earlier experts, or if no world can be selected.
+        Raises ``NoBetterTemplate`` if no template has a higher return than the earlier experts, or if no world can be
+        selected.
         """
         self._stage, self._own = stage, None
         if stage.trains != "other":
@@ -140,7 +142,7 @@ class ExpertsModel(VineModel):
 
     def _compare(self, seen: Float32s, moments: State) -> tuple[Float32s, Floats, Float32s]:
         """Compare the K experts: let each expert drive from B visited decisions to the end of the episode, and return
-        its costs.
+        the cost of each expert at each decision.
 
         The cost of an expert is minus its return, plus ``tie_break`` times its harm. The harm in this cost is the total
         harm if the reward counts first-impact harm, and the first-impact harm if the reward counts total harm. The B

@@ -31,12 +31,13 @@ class Shares(FileModel):
 
 
 class ExpertsPlan(FileModel):
-    """Settings of a mixture of experts: several networks, and a gating network that chooses which of them acts.
+    """Settings of a mixture of experts: several networks, and a gating network that chooses which of these networks
+    acts.
 
     Each expert after the first one is pre-trained in two steps. In the first step, the new expert imitates templates
-    (random braking profiles) in worlds in which a template does better than all earlier experts. In the second step,
-    the new expert is trained in the worlds in which it is better than the best earlier expert, or nearly as good as
-    this expert.
+    (random braking profiles) in worlds in which a template has a higher return than all earlier experts. In the second
+    step, the new expert is trained in the worlds in which it has a higher return than the best earlier expert, or has a
+    return that is only slightly lower.
     """
 
     networks: int = Field(ge=2, le=16, description="number of experts")

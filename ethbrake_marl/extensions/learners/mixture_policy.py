@@ -43,7 +43,7 @@ class ExpertsPolicy(Deterministic):
         """Return one number for each observation [rows, F], computed by the actor that the gating network chooses for
         this observation.
 
-        ``ask`` is the method of the actor that computes the numbers, such as ``AveragedActor.means``.
+        ``ask`` is the method that computes an actor's numbers from observations, such as ``AveragedActor.means``.
         """
         chosen, values = self.gate.choose(observation), np.empty(len(observation))
         for number, actor in enumerate(self.actors):

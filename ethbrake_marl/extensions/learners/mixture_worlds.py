@@ -1,6 +1,7 @@
 """Selection of the worlds and templates with which a new expert of a mixture is trained.
 
-A *template* is a random braking profile. A new expert first imitates templates that do better than all earlier experts.
+A *template* is a random braking profile. A new expert first imitates templates that have a higher return than all
+earlier experts.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ NO_DIFFERENCE = 1e-2  # returns that differ by less than this count as equal
 
 
 class Explored(NamedTuple):
-    """The first n worlds of the training run, and the best result of the earlier experts in each of these worlds."""
+    """The first n worlds of the training run; for each world, the highest return and the least harm of the earlier
+    experts.
+    """
 
     alert: Worlds  # the worlds at the alert
     start: State  # states of the worlds at the first decision
@@ -44,13 +47,13 @@ class Shown(NamedTuple):
 
 
 def explore(engine: Engine, plan: ExpertsPlan, acts: Sequence[Act], gamma: float) -> Explored:
-    """Let every earlier expert drive the first ``plan.worlds`` worlds of the training run; return the best result in
-    each world.
+    """Let every earlier expert drive the first ``plan.worlds`` worlds of the training run; return the highest return
+    and the least harm in each world.
 
     Args:
         engine: engine of the training run; it is not changed.
         plan: settings of the mixture of experts (recipe key ``experts``).
-        acts: earlier experts, each as a function from observations [rows, F] to actions [rows].
+        acts: the earlier experts; each expert is a function from observations [rows, F] to actions [rows].
         gamma: discount factor per time step.
 
     """
@@ -85,17 +88,18 @@ def drive_from(
 
 
 def show_templates(engine: Engine, plan: ExpertsPlan, explored: Explored, gamma: float, seed: int) -> Shown:
-    """Draw templates (random braking profiles); return the decisions of templates that do better than all earlier
-    experts.
+    """Draw templates (random braking profiles); return the decisions of templates that have a higher return than all
+    earlier experts.
 
-    In each world ``plan.templates`` templates are drawn, and the best template is simulated. If the return of this
-    template exceeds the return of the best earlier expert by more than ``plan.gain``, the observations and actions of
-    the template are returned.
+    In each world ``plan.templates`` templates are drawn. If the template with the least harm does less harm than every
+    earlier expert, this template is simulated. If the return of this template exceeds the return of the best earlier
+    expert by more than ``plan.gain``, the observations and actions of the template are returned.
 
     Args:
         engine: engine of the training run; it is not changed.
         plan: settings of the mixture of experts (recipe key ``experts``).
-        explored: worlds, and the best results of the earlier experts in them, as ``explore`` returns them.
+        explored: result of ``explore``: worlds, and the highest return and least harm of the earlier experts in each
+            world.
         gamma: discount factor per time step.
         seed: seed with which the templates are drawn.
 
@@ -143,7 +147,8 @@ def own_worlds(engine: Engine, plan: ExpertsPlan, explored: Explored, act: Act, 
     Args:
         engine: engine of the training run; it is not changed.
         plan: settings of the mixture of experts (recipe key ``experts``).
-        explored: worlds, and the best results of the earlier experts in them, as ``explore`` returns them.
+        explored: result of ``explore``: worlds, and the highest return and least harm of the earlier experts in each
+            world.
         act: the new expert: a function from observations [rows, F] to actions [rows].
         gamma: discount factor per time step.
 
@@ -155,7 +160,7 @@ def own_worlds(engine: Engine, plan: ExpertsPlan, explored: Explored, act: Act, 
 
 
 class NoBetterTemplate(EthBrakeError, ValueError):
-    """Raised if no template (random braking profile) does better than the earlier experts.
+    """Raised if no template (random braking profile) has a higher return than the earlier experts.
 
-    If this error is raised, a further expert would be useless.
+    This error means that a further expert would have nothing to learn.
     """

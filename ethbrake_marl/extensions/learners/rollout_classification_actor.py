@@ -173,7 +173,7 @@ class ChoosingActor(Deterministic):
 
         Args:
             some: for each decision that enters the loss, its index in the memory.
-            importance: weight of each decision in the loss.
+            importance: weight in the loss of each decision in ``some``.
             guide: factor on the convex term; the loss is (expected extra cost) + ``guide`` * (convex term).
 
         """

@@ -1,5 +1,5 @@
-"""Model of rollout classification: it tries several actions at a decision, and learns which of these actions costs
-least.
+"""Model of rollout classification: it tries several actions at a decision, and learns which of these actions has the
+least cost.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ LEAST_USUAL = 0.1  # m2/s2; least divisor of relative costs, for scenarios with 
 
 
 class RolloutClassificationModel(VineModel):
-    """Model that drives with an actor, tries several actions at some of its decisions, and learns from their costs.
+    """Model that drives with an actor, tries several actions at some decisions, and learns from the costs of these
+    actions.
 
     Args:
         environment: environment in which the model is trained.
@@ -84,7 +85,8 @@ class RolloutClassificationModel(VineModel):
         self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
 
     def _try_actions(self, seen: Float32s, moments: State) -> tuple[Float32s, Ints, Floats]:
-        """Try C choices (actions, or trained policies that act) at each of B visited decisions, and return their costs.
+        """Try C choices (actions, or trained policies that act) at each of B visited decisions; return the cost of each
+        choice.
 
         After each tried choice the model simulates the episode to its end.
 
@@ -151,10 +153,10 @@ class RolloutClassificationModel(VineModel):
         return observed[rows], tried, costs
 
     def _usual(self, rows: Ints, least: Floats) -> Floats:
-        """Update the mean cost of the cheapest choice in each scenario of a mixture of scenarios; return, for each of B
-        decisions, the mean cost in its scenario, [B].
+        """For each scenario of a mixture of scenarios, update the running mean of the cost of the cheapest choice;
+        return, for each of B decisions, the running mean of the decision's scenario, [B].
 
-        A mean cost below ``LEAST_USUAL`` is returned as ``LEAST_USUAL``, because costs are divided by the result.
+        A running mean below ``LEAST_USUAL`` is returned as ``LEAST_USUAL``, because costs are divided by the result.
 
         Args:
             rows: [B] for each of the B decisions, the index of the visited state in which the decision was made.

@@ -47,12 +47,12 @@ PolicyName = Annotated[str, Field(pattern=r"^[a-z-]+(@.+)?$", max_length=4096)]
 
 
 class RolloutClassificationRecipe(TrainingRecipe):
-    """Recipe of rollout classification: at some decisions several actions are tried; after each of them, the episode is
-    simulated to its end.
+    """Recipe of rollout classification: at some decisions several actions are tried, and after each tried action the
+    episode is simulated to its end.
 
     At each decision the policy chooses one of ``network.choices`` actions, evenly spaced from -1 to 1, or one of the
-    trained ``policies``. A round consists of ``n_envs x n_steps`` decisions and an update. At ``tried`` decisions of a
-    round, the following choices are tried:
+    trained ``policies``. A round of the training run consists of ``n_envs x n_steps`` decisions and an update of the
+    network. At ``tried`` decisions of a round, the following choices are tried:
 
     - the choice of the policy itself;
     - for each range of ``near``, one action below and one action above the action of the policy;
@@ -141,7 +141,7 @@ class RolloutClassificationRecipe(TrainingRecipe):
 
     @property
     def others(self) -> int:
-        """Number of choices that are tried at a decision besides the policy's own choice."""
+        """Number of choices, other than the policy's own choice, that are tried at a decision."""
         return 2 * len(self.near) + len(self.fixed) + self.drawn
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
@@ -161,7 +161,7 @@ class RolloutClassificationRecipe(TrainingRecipe):
 
         If a named policy itself chooses among several policies, these policies take the place of the named policy.
 
-        If a policy cannot be used, an ``InvalidInput`` that names this policy is raised.
+        Raises ``InvalidInput`` if a policy cannot be used; the message names this policy.
         """
         loaded: list[Policy] = []
         for name in self.policies:

@@ -1,5 +1,5 @@
-"""Scout: a small network that predicts at which decisions the action matters. More branches start at decisions at which
-the action matters.
+"""Scout: a small network that predicts at which decisions the action matters. More branches start at these decisions
+than at other decisions.
 
 A branch is a copy of the episode with another action. Simulating a branch from a decision at which the action has no
 effect is a waste of time. Therefore decisions at which the action matters are drawn with a higher probability, and get
@@ -37,20 +37,23 @@ class Scout(nn.Module):
         nn.init.zeros_(last.bias)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Return the logarithm, at most 20, of each decision's predicted size, [rows], from observations [rows, F]."""
+        """Return the natural logarithm, cut off at 20, of the predicted size of each decision, [rows], for observations
+        [rows, F].
+        """
         logarithm: Tensor = self.layers(observation)[:, 0].clamp(max=20.0)
         return logarithm
 
     def expect(self, observation: Float32s) -> Floats:
-        """Return the predicted size of each decision, above 0, [rows], from observations [rows, F]."""
+        """Return, for observations [rows, F], the predicted size of each decision, [rows]; each size is above 0."""
         with torch.no_grad():
             size: Floats = np.exp(self(torch.from_numpy(observation)).numpy().astype(np.float64))
         return size
 
     def loss(self, observation: Tensor, size: Tensor, importance: Tensor) -> Tensor:
-        """Return a loss that is smallest if the network predicts the mean size of the decisions.
+        """Return a loss that is smallest if, for each observation, the network predicts the mean size of the decisions
+        with this observation.
 
-        Decisions with a large size influence this loss less than they would influence a squared error.
+        Decisions of a large size influence this loss less than they would influence a squared error.
 
         Args:
             observation: [rows, F] observations at the decisions.
@@ -64,12 +67,12 @@ class Scout(nn.Module):
 
 
 def draw_rows(expected: Floats, count: int, focus: float) -> tuple[Ints, Float32s]:
-    """Draw ``count`` of n decisions with replacement; a decision with a larger size is drawn more often.
+    """Draw ``count`` of n decisions with replacement; decisions at which the action matters more are drawn more often.
 
     Args:
         expected: [n] size of each decision (predicted gradient, or difference in cost), above 0.
         count: number of decisions that are drawn.
-        focus: share of the draws in which the probability of a decision is proportional to its size in ``expected``;
+        focus: share of the draws in which the probability of a decision is proportional to its entry in ``expected``;
             the other draws are uniform.
 
     Returns the indices of the drawn decisions [count], and their importance [count], which is their weight in the loss:
@@ -96,8 +99,8 @@ def choose_rows(
         focus: share of the draws in which the probability of a decision is proportional to its predicted size;
             decisions are drawn with replacement (see ``draw_rows``). If ``focus`` is 0, all decisions are drawn
             uniformly and without replacement.
-        expect: function that predicts the size of decisions, [rows], from observations [rows, F]. If ``expect`` is
-            None, decisions are drawn as with ``focus`` = 0.
+        expect: function that returns, for observations [rows, F], how much the action at each decision matters, [rows]
+            (see ``Scout.expect``). If ``expect`` is None, decisions are drawn as with ``focus`` = 0.
 
     Returns the indices of the drawn decisions in ``observed``, and the weight of each drawn decision in the loss
     (*importance*). The weight is 1 if the decisions are drawn uniformly.

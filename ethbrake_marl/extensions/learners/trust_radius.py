@@ -1,4 +1,4 @@
-"""Targets for the actor's outputs, computed from measured gradients.
+"""Targets towards which the actor's outputs are trained, computed from measured gradients of the return.
 
 The distance from an output of the actor to its target is always less than a fixed length, the trust radius.
 """

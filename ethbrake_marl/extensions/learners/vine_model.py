@@ -26,7 +26,8 @@ from ethbrake_marl.policies.network_spec import Float32s
 
 
 class VineModel(BaseAlgorithm):
-    """Model that drives with a deterministic actor, tries two actions at some of its decisions, and learns from them.
+    """Model that drives with a deterministic actor, tries two actions at some decisions, and learns from the difference
+    between the two returns.
 
     One of the two actions is higher than the actor's action, the other is lower. From the difference between the
     returns after these two actions the model computes the gradient of the return with respect to the action.
@@ -116,8 +117,8 @@ class VineModel(BaseAlgorithm):
         return np.stack(seen), State.join(moments)
 
     def _try_out(self, seen: Float32s, moments: State, actor: Deterministic) -> Tried:
-        """At some visited decisions, try a higher and a lower action; after each of them, simulate the episode to its
-        end.
+        """At some visited decisions, try a higher and a lower action; after each tried action, simulate the episode to
+        its end.
 
         Args:
             seen: [steps, rows, F] observations at the visited decisions.
@@ -158,7 +159,7 @@ class VineModel(BaseAlgorithm):
         return Tried(then, actor.means(then), gradient[good].astype(np.float32), importance[good])
 
     def _train(self, actor: AveragedActor, tried: Tried) -> None:
-        """Train the actor: at the decisions in ``tried``, move its outputs towards ``trusted_targets``."""
+        """Train ``actor``: move its outputs at the decisions in ``tried`` towards their ``trusted_targets``."""
         recipe = self.recipe
         self._update_learning_rate(actor.optimizer)
         target, weight = trusted_targets(tried, recipe.trust_radius, recipe.anchor)

@@ -39,7 +39,7 @@ class VineRecipe(TrainingRecipe):
     """Recipe of vine: at some decisions, a higher and a lower action are tried, and each is simulated to the end of the
     episode.
 
-    A round of the training run has ``n_envs x n_steps`` decisions. At ``tried`` of these decisions, a higher and a
+    A round of the training run has ``n_envs x n_steps`` decisions. At ``tried`` decisions of a round, a higher and a
     lower action are tried. The policy learns from the difference between the two returns.
 
     ``start`` names a trained policy, whose weights are the initial weights; without this key, the initial weights are
