@@ -212,7 +212,7 @@ class Out:
             done: number of units of work that are done.
             total: number of all units of work.
             harm: text with the harm in the latest evaluation, shown after the name of the task.
-            note: message to print once, above the bars.
+            note: message to print once, above the progress bars.
 
         """
         label = one_line(f"{name}, {harm}" if harm else name)
@@ -254,7 +254,7 @@ class Out:
 class _PlainConsole(Console):
     """Console of rich that prints texts literally, without interpreting markup, and escapes control characters.
 
-    ``width``: number of columns; None: width of the terminal.
+    ``width``: width of the console in characters; None: width of the terminal.
     """
 
     def __init__(self, file: TextIO, *, width: int | None = None) -> None:

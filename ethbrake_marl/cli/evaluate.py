@@ -367,8 +367,8 @@ def shield_command(
     """Compare agents without and with the shield.
 
     Each agent runs in the same worlds without a shield, with the shield in episode mode, and with the shield in step
-    mode. A team of several learners runs without a shield, with the shield in step mode, and with that shield plus
-    caps. Write the names of the agents without a shield: full_brake, not full_brake+step. The shield bounds
+    mode. A team of several learners runs without a shield, with the shield in step mode, and with the shield in step
+    mode plus caps. Write the names of the agents without a shield: full_brake, not full_brake+step. The shield bounds
     first-impact harm, or total harm with --set harm_count=total. For each action that step mode replaced, the table
     says what harm the replaced action would have caused: more (the replacement was needed), the same (harmless) or less
     (costly).

@@ -223,10 +223,11 @@ def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
 
 
 def _refused(scenario: scenarios.Scenario, sample: scenarios.Sample | None = None) -> str:
-    """Return the number of draws that were rejected for an early impact, as a text ``: 3 of 203 draws (1.5 %)``.
+    """Return the number of draws rejected for an impact before any learner can act: ``: 3 of 203 draws (1.5 %)``.
 
-    The text is empty for a scenario without a table. If the scenario has a table, rejections change how often each row
-    of the table occurs in the worlds. ``sample``: worlds whose rejected draws are counted; None: draw 200 worlds.
+    The returned text is empty for a scenario without a table. If the scenario has a table, rejections change how often
+    each row of the table occurs in the worlds. ``sample``: worlds whose rejected draws are counted; None: draw 200
+    worlds.
     """
     if all(each.table is None for each in scenario.members or (scenario,)):
         return ""

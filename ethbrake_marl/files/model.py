@@ -76,13 +76,14 @@ def require(holds: bool, at: YamlPath, value: Any, right: str) -> None:
 class Wording:
     """Texts for error messages about one kind of file.
 
-    A subclass may override ``needed``, ``instead``, ``owner`` and ``right`` with texts about the keys of this file.
+    A subclass may override ``needed`` (what to write for a missing key), ``instead`` (what to write instead of an
+    unknown key), ``owner`` (the vehicle or pair of a value) and ``right`` (what would be valid instead of a value).
 
     A *path* is a tuple of the keys and indices that lead to a value, for example ``("mixture", 0, "weight")``.
 
     Args:
         model: pydantic model of the file.
-        needed: text that says what must be written for a missing key; the same text for every key.
+        needed: text that says what must be written for a missing key; it is used for every missing key.
 
     """
 
@@ -115,7 +116,7 @@ class Wording:
     def right(self, detail: ErrorDetails) -> str:
         """Return what would be valid instead of the value in ``detail`` (a mistake, as pydantic reports it).
 
-        If the text is empty, the error message uses a general text instead.
+        If the returned text is empty, the error message uses a general text instead.
         """
         return ""
 
@@ -282,7 +283,8 @@ def _right(detail: ErrorDetails) -> str:
 def suggestion(key: str, known: Iterable[str]) -> str:
     """Return a hint for an unknown ``key``: "did you mean ...?" or the key's new name; empty if no key is similar.
 
-    ``known``: the valid keys. A key with a wrong or missing unit is also recognised: ``gaps_km``, ``mass``.
+    ``known``: the valid keys. The function also recognises a valid key with a wrong or missing unit: ``gaps_km``,
+    ``mass``.
     """
     names = sorted(known)
     if new := new_name(key, names):

@@ -32,7 +32,7 @@ def read_plain(
     Args:
         path: path of the file.
         limit_bytes: largest accepted size of the file.
-        refusal: class of the error to raise; see ``open_plain``.
+        refusal: class of the error to raise if the file cannot be read; ``open_plain`` lists the cases.
         follow_links: whether a symbolic link is accepted.
 
     """

@@ -269,7 +269,9 @@ class Sheet:
         return "\n".join([*lines, "</tbody>", "</table></div>", *note])
 
     def json(self) -> list[dict[str, Any]]:
-        """Return one mapping per row: cells by column name, estimates with their intervals. Sections are omitted."""
+        """Return one mapping per row: name of a column -> cell; an estimate also has an entry for its confidence
+        interval. Sections are omitted.
+        """
         columns, rows = self._columns(), []
         for row in self.rows:
             cells = {} if isinstance(row, str) else dict(zip(columns, row, strict=False))

@@ -153,7 +153,9 @@ def remove_folder(path: Path) -> None:
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Delete temporary files that killed processes left in ``folder``, to which no other process may be writing."""
+    """Delete temporary files that killed processes left in ``folder``; no other process may be writing there
+    meanwhile.
+    """
     for left in folder.glob(f"{_HIDDEN}*{_UNFINISHED}"):
         if left.is_dir() and not left.is_symlink():
             shutil.rmtree(left)

@@ -57,8 +57,8 @@ class Actor:
         """Return for each observation the action that belongs to the index in ``number``, [1, rows].
 
         Args:
-            number: index of the chosen policy or action for each observation, [rows]. In ``number``, the first indices
-                (0, 1, ...) choose a policy in ``NetworkSpec.among``; the indices after them choose a fixed action.
+            number: index of the chosen policy or action for each observation, [rows]. The lowest values of ``number``
+                (0, 1, ...) choose a policy in ``NetworkSpec.among``; the values after them choose a fixed action.
             x: observations, [F, rows].
 
         """

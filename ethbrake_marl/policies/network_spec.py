@@ -26,7 +26,9 @@ class TensorRow(NamedTuple):
     shape: tuple[int, ...]  # length of each axis
 
     def inside(self, part: str) -> TensorRow:
-        """Return this row with ``part.`` in front of the tensor's name, for a tensor inside another policy."""
+        """Return this row with ``part.`` in front of the tensor's name, for a tensor of a policy inside another
+        policy.
+        """
         return self._replace(name=f"{part}.{self.name}")
 
 

@@ -181,7 +181,8 @@ Preset = Annotated[str, AfterValidator(_known_preset), _PresetSchema]
 
 
 def _pieces(value: Any) -> Tells | None:
-    """Check the value of the key ``tells`` (what messages contain); return its items in the order of ``PIECES``.
+    """Check the value of the key ``tells`` (what messages contain); return the items of this value in the order of
+    ``PIECES``.
 
     ``value``: list of the items that messages contain (for all vehicles), or a mapping from vehicle names to such
     lists.
@@ -365,7 +366,8 @@ class V2X(FileModel):
         return PER_LINK * vehicles * vehicles
 
     def with_news(self, vehicles: Vehicles, u: Floats, equipped: Equipped) -> Vehicles:
-        """Return ``vehicles`` with the channel's delays in the latencies, and times from which each knows the others.
+        """Return ``vehicles`` with the channel's delays in the latencies, and the times from which each vehicle knows
+        others.
 
         The argument ``vehicles`` must contain latencies without delays of a channel; these latencies become
         ``own_latency_s`` of the result.
@@ -387,7 +389,7 @@ class V2X(FileModel):
         return replace(vehicles, latency_s=latency, known_from_s=known)
 
     def heard_and_seen(self, u: Floats, equipped: Equipped) -> tuple[Floats, Floats]:
-        """Return (heard, seen): the time from which i can use the first message of j, and the delay until i sees j.
+        """Return (heard, seen): time from which vehicle i can use the first message of j, and delay until i sees j.
 
         Here i and j are vehicles; ``heard`` and ``seen`` have the shape [n, N, N] (world, i, j) and the unit s.
         Infinite means never.
@@ -467,7 +469,7 @@ def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
     Args:
         u: uniform numbers in [0, 1).
         loss_begins: probability p per message period that a burst of losses begins.
-        loss_ends: probability r per message period that a burst of losses ends.
+        loss_ends: probability r that an ongoing burst of losses ends in one message period.
 
     """
     bound = loss_begins / (loss_begins + loss_ends)

@@ -41,10 +41,10 @@ def build_members(
     """Build the scenarios listed under the key ``mixture``; return the completed document and these scenarios.
 
     Keys that stand beside ``mixture`` in the file replace the same keys in every listed scenario. Shared settings, such
-    as ``vehicles``, are added to the document if all scenarios have the same value. If the list is invalid, the
-    function returns the unchanged document and no scenarios, and the schema rejects the document later. Raises
-    ``InvalidInput`` naming the invalid scenario, or the key that must have the same value in all scenarios but does
-    not.
+    as ``vehicles``, are added to the document if all scenarios have the same value. If the list under ``mixture`` is
+    invalid, the function returns the unchanged document and no scenarios, and the schema rejects the document later.
+    Raises ``InvalidInput`` naming the invalid scenario, or the key that must have the same value in all scenarios but
+    does not.
 
     Args:
         document: parsed file with a key ``mixture``.

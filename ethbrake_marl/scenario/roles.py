@@ -93,7 +93,7 @@ class ScriptSpec(NamedTuple):
     def is_state_free(self) -> bool:
         """Return whether the script does not need the state: ``full_brake``, ``coast``, ``constant:a`` or a profile.
 
-        Raises ``InvalidInput`` if the argument of such a script is missing, invalid or not allowed.
+        Raises ``InvalidInput`` if one of these four scripts has a missing, invalid or forbidden argument.
         """
         if self.name == _PROFILE:
             return len(self.pieces) > 0

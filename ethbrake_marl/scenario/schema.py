@@ -32,12 +32,12 @@ _DISTRIBUTION = (
 
 
 class ScenarioWording(Wording):
-    """Texts of the error messages about a scenario, or part of one."""
+    """Texts of the error messages about a scenario, or about a part of a scenario such as ``v2x``."""
 
     def instead(self, key: str) -> str:
         """Return a hint for an unknown key that people often try: another word for friction, or the slope of the road.
 
-        For any other key the hint is empty.
+        For any other unknown key the hint is empty.
         """
         if "friction" in key or key == "mu":
             return "declare the friction of the road with the key friction, for instance friction: 0.5"
@@ -81,10 +81,11 @@ class ScenarioWording(Wording):
         return rule.owner(path[1]) if rule is not None and isinstance(path[1], int) else ""
 
     def right(self, detail: ErrorDetails) -> str:
-        """Return a text that says what an invalid quantity, or an invalid scenario of a mixture, must be.
+        """Return a text that says what would be valid instead of an invalid quantity or an invalid scenario of a
+        mixture.
 
-        For a misspelt distribution, the text contains a suggestion. For any other invalid value, the text is empty.
-        ``detail``: one mistake, as pydantic reports it.
+        For a misspelt distribution, the text contains a suggestion. For any other invalid value, the returned text is
+        empty. ``detail``: one mistake, as pydantic reports it.
         """
         if detail["type"] == "quantity":
             return f"must be a number, {_DISTRIBUTION}{_misspelt(detail['input'])}"
@@ -249,7 +250,7 @@ def _reference(key: str) -> dict[str, Any]:
 
 
 def _range(key: str, low: float, high: float, positive: bool = False) -> dict[str, Any]:
-    """Return the JSON schema of a quantity that allows only numbers in its range, also in distributions and lists.
+    """Return the JSON schema of a quantity; it allows only numbers in the given range, also in distributions and lists.
 
     Args:
         key: key of the quantity.

@@ -144,7 +144,7 @@ def _require_all(good: Bools, naming: _Naming, entry: Entry, column: Floats, rig
     Args:
         good: mask [n]: True for each world in which the value is valid.
         naming: whether error messages name a value by column and row, or by key and index.
-        entry: key of the value's quantity, and index of its vehicle or pair.
+        entry: key of the quantity, and index of the vehicle or pair, to which the checked values belong.
         column: the value of one quantity of one vehicle or pair in each world, [n].
         right: what would be valid, for the error message.
 

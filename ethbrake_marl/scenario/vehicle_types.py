@@ -66,7 +66,8 @@ TypeQuantity = Annotated[
 class VehicleType(FileModel):
     """A vehicle type: its weight in the random draw, and its quantities.
 
-    A quantity that the type does not declare has the scenario's general declaration outside ``vehicle_types``.
+    If a type does not declare a quantity, the type has the scenario's declaration of this quantity outside
+    ``vehicle_types``.
     """
 
     weight: Weight = Field(default=1.0, description="how likely this type is, relative to the other types")

@@ -20,9 +20,9 @@ class Algorithm(ABC):
     """Base class of a learning algorithm whose model is a ``BaseAlgorithm`` of Stable-Baselines3.
 
     A subclass must implement ``build``, which returns the model. A subclass may override ``actors`` (the policies
-    inside the model), ``tensors`` (the weights of a policy), ``optimizers`` and ``learned_beside`` (what a checkpoint
-    saves in addition to ``model.policy``), and ``log_noise`` (the exploration noise). The default methods fit a model
-    whose ``policy`` has one ``optimizer``, such as PPO and A2C.
+    inside the model), ``tensors`` (the weights of a policy), ``optimizers`` (the model's optimisers),
+    ``learned_beside`` (what a checkpoint saves in addition to ``model.policy``) and ``log_noise`` (the exploration
+    noise). The default methods fit a model whose ``policy`` has one ``optimizer``, such as PPO and A2C.
     """
 
     @abstractmethod

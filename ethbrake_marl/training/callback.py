@@ -117,8 +117,8 @@ class RunCallback(BaseCallback):
             self._write_checkpoint()
 
     def _take_policies(self) -> None:
-        """Copy the current weights as policies into ``course``, unless ``course`` already has the weights of this
-        update.
+        """Store policies with the current weights in ``course``, unless ``course`` has the weights of this update
+        already.
 
         Raises ``TrainingDiverged`` if a weight is not finite.
         """
@@ -159,7 +159,9 @@ class RunCallback(BaseCallback):
         return sum(float(e["r"]) for e in episodes) / len(episodes) if episodes else None
 
     def tell(self, note: str = "") -> None:
-        """Report the progress of the training to ``on_progress``. ``note`` is a message for the user, shown once."""
+        """Report the progress of the training to ``on_progress``. ``note`` is a message for the user, which is shown
+        only once.
+        """
         if self._watchers.on_progress is None:
             return
         course = self.course

@@ -28,7 +28,8 @@ class CentralCriticPolicy(ActorCriticPolicy):
 
 
 class _OwnPartForTheActor(MlpExtractor):
-    """Hidden layers of an actor, which sees the first entries of an observation row, and of a critic, which sees all.
+    """Hidden layers of an actor, which sees the first entries of an observation row, and a critic, which sees all
+    entries.
 
     Args:
         own: number of entries at the beginning of an observation row that the actor sees.

@@ -135,7 +135,7 @@ def run_experiment(
         directory: the new folder of the run.
         recipe: recipe of the training, which also defines the reward.
         steps: number of decisions of all learners together in the training; None: the recipe's number.
-        seed: seed of the training; None: the recipe's seed.
+        seed: seed of the training run; None: the recipe's seed.
         episodes: number of worlds of the evaluation list.
         list_seed: seed of the evaluation list.
         force: whether to replace an earlier run in ``directory``.

@@ -135,7 +135,7 @@ def _restore_rows(model: Model, arrays: Arrays) -> None:
 
 
 def _captured_log(model: Model) -> dict[str, list[Any]]:
-    """Return what the logger has for the next row: name of a column -> [value, count, formats that omit the column]."""
+    """Return the logger's values for its next row: name of a column -> [value, count, formats that omit the column]."""
     log, pending = model.logger, {}
     for name, value in log.name_to_value.items():
         number = value.item() if isinstance(value, np.generic | torch.Tensor) else value
@@ -174,7 +174,9 @@ def _restore_replay(memory: Any, place: Any, arrays: Arrays) -> None:
 
 
 def _try_step(optimizer: torch.optim.Optimizer) -> None:
-    """Take a step with a copy of ``optimizer``; torch raises an error if the optimiser does not fit the weights."""
+    """Make a trial step with a copy of ``optimizer``; torch raises an error if the optimiser does not fit the
+    weights.
+    """
     tried = copy.deepcopy(optimizer)
     for group in tried.param_groups:
         for weights in group["params"]:

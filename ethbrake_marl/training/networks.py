@@ -29,7 +29,7 @@ def tensors_of(policy: BasePolicy, spec: NetworkSpec) -> dict[str, Float32s]:
 def sb3_names(spec: NetworkSpec) -> dict[str, str]:
     """Return the names of a network's tensors: name in a policy bundle -> name in Stable-Baselines3's policy.
 
-    ``spec`` describes the network. The network belongs to PPO if ``spec.output`` is ``clip``, and to SAC if not.
+    ``spec`` describes the network. The network belongs to PPO if ``spec.output`` is ``clip``, and otherwise to SAC.
     Stable-Baselines3 also numbers the activations, so hidden layer k of a bundle has the number 2 k in
     Stable-Baselines3.
     """

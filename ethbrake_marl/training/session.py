@@ -114,8 +114,8 @@ def train(
 
     Ctrl-C stops the training after the current update (status ``interrupted``); a second Ctrl-C raises
     ``KeyboardInterrupt``. After Ctrl-C or an error, ``policy/`` contains the best policy so far, and ``policy-last/``
-    the last policy with finite weights. ``resume`` continues a stopped training. The same recipe, scenario and seed
-    give exactly the same policy on the same machine.
+    the latest policy whose weights are finite. ``resume`` continues a stopped training. The same recipe, scenario and
+    seed give exactly the same policy on the same machine.
 
     Args:
         recipe: a recipe, its name, or the path of its file.
@@ -123,7 +123,7 @@ def train(
         directory: the new folder of the run.
         scheme: how several learners train together; None: the recipe's scheme.
         turns: number of turns of each independent learner (docs/train.md); None: the recipe's number.
-        seed: seed of the training; None: the recipe's seed.
+        seed: seed of the training run; None: the recipe's seed.
         steps: number of decisions of all learners together; None: the recipe's number. The training ends with a whole
             update, so the learners may make a few more decisions.
         force: whether to replace an earlier run in ``directory``.
@@ -268,7 +268,8 @@ def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[st
 
 
 def save(callback: RunCallback, status: RunStatus, reason: str | None) -> None:
-    """Save the best policy and the last policy with finite weights, and record in ``run.json`` how the run ended.
+    """Save the best policy and the latest policy whose weights are finite, and record in ``run.json`` how the run
+    ended.
 
     The checkpoints of a finished run are deleted.
 

@@ -100,7 +100,7 @@ class Training:
     def config(self, settings: Sequence[str] = ()) -> dict[str, Any]:
         """Return the content of ``config.json``: recipe, scenario, seeds, versions and settings.
 
-        ``settings`` are texts ``KEY=VALUE`` that say how recipe and scenario differ from their files.
+        loss_begins: probability p that a burst of losses begins in one message period.
         """
         recipe = self.recipe
         return {
