@@ -175,7 +175,7 @@ def naming_extras() -> Iterator[None]:
 
 
 def need(package: str) -> None:
-    """Raise ``MissingExtra`` if ``package``, a package of an optional extra, is not installed; import nothing."""
+    """Raise ``MissingExtra`` if ``package``, a package of an optional extra, is not installed; do not import it."""
     if find_spec(package) is None:
         raise _missing(package)
 
@@ -248,7 +248,7 @@ class AgentFailed(InvalidInput):
 
 
 class Unfamiliar(UserWarning):
-    """Warning: a trained policy is used in worlds unlike those it was trained in."""
+    """Warning: a trained policy is used in worlds that differ from the worlds of its training."""
 
 
 @contextmanager
@@ -265,15 +265,13 @@ def renumbered(rows: Sequence[int] | NDArray[np.int64]) -> Iterator[None]:
 
 
 class UncertifiedStep(EthBrakeError):
-    """The engine's time step differs from the time step that the shield certified, so the engine's time step is
-    undone.
-    """
+    """The engine's time step differs from the step that the shield certified, so the engine's step is undone."""
 
 
 def new_name(name: object, known: Collection[str]) -> str | None:
     """Return the new name if ``name`` was renamed and the new name is in ``known``; otherwise None.
 
-    If ``name`` contains colons, each word between them is looked up separately.
+    If ``name`` contains colons, each of the words between the colons is looked up separately.
     """
     new = ":".join(RENAMED.get(word, word) for word in name.split(":")) if isinstance(name, str) else None
     return new if new != name and new in known else None
@@ -311,7 +309,8 @@ def refuse_shipped_path(path: str, agent: str = "") -> None:
 
 
 def check_whole_number(what: str, value: object, least: int, most: int | None = None) -> None:
-    """Raise ``InvalidInput`` unless ``value`` is a whole number from ``least`` to ``most`` (None: no upper limit).
+    """Raise ``InvalidInput`` unless ``value`` is a whole number from ``least`` to ``most``; None as ``most``: no upper
+    limit.
 
     ``what``: name of the value; the error message begins with this name.
     """

@@ -36,9 +36,9 @@ T = TypeVar("T")
 
 
 class Part:
-    """Value of an entry point: the arguments of a ``register_...`` function, except the name.
+    """Value of an entry point: all arguments of a ``register_...`` function except the name.
 
-    The ``register_...`` function registers the part under the name of the entry point. For example, an entry point in
+    The ``register_...`` function registers the object under the name of the entry point. For example, an entry point in
     the group ``ethbrake_marl.measures`` with the value ``part`` below has the same effect as ``register_measure(name,
     closing, unit="m/s")``.
 
@@ -73,7 +73,7 @@ def giver(point: EntryPoint) -> str:
 
 
 def versions_used() -> dict[str, str]:
-    """Return a dictionary name -> version of the other packages that have added, for example, agents to this process.
+    """Return name -> version of the other packages that have added agents or other objects to this process.
 
     A package is in the dictionary only if at least one of the package's entry points has been loaded.
     """

@@ -123,7 +123,7 @@ class Out:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop redirecting stdout; after Ctrl-C, print a message and end the command with exit status 130.
+        """Stop redirecting stdout; if the block was ended by Ctrl-C, print a message and exit with status 130.
 
         The arguments describe the exception that ended the block, as for every context manager.
         """
@@ -186,9 +186,9 @@ class Out:
         check_target(path, force=self.force)
 
     def write(self, path: Path, content: bytes | str, what: str | None = None) -> None:
-        """Write ``content`` to a file, completely or not at all, and print ``WHAT: PATH`` on stderr.
+        """Write ``content`` to a file, completely or not at all, and print the line ``WHAT: PATH`` on stderr.
 
-        ``what``: word for the content, printed as WHAT; None: print nothing.
+        ``what``: word for the content, printed as WHAT; None: print no line.
         """
         from ethbrake_marl.files.store import write_output
 

@@ -76,7 +76,7 @@ class Check:
 
 
 def diagnose(*, compile_all: bool = False) -> list[Check]:
-    """Run all checks of the installation; return the results in the order in which problems should be solved.
+    """Run all checks of the installation; return their results in the order in which the user should solve problems.
 
     A check that raises an error is reported as failed. ``compile_all``: True: also call the usual commands on a few
     worlds, which compiles and stores all kernels that they use.

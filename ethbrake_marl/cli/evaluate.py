@@ -317,7 +317,7 @@ def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: f
 
 
 def _moving(rows: Sequence[evaluation.SummaryRow]) -> dict[str, int]:
-    """Return, for each agent with a shield, in how many worlds at least one vehicle still moves at the horizon.
+    """Return a dictionary: agent with a shield -> number of worlds in which some vehicle still moves at the horizon.
 
     ``rows``: rows of the results table, one per agent.
     """

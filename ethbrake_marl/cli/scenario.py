@@ -269,7 +269,7 @@ def _in_words(quantity: Any) -> str:
 
 
 def _news_in_words(scenario: scenarios.Scenario) -> str:
-    """Return a sentence about the scenario's V2X channel: what each vehicle knows, and when."""
+    """Return a sentence about what each vehicle knows, and when, through the scenario's V2X channel."""
     channel, about = scenario.v2x.channel._asdict(), type(scenario.v2x).model_fields
     usual = scenarios.CHANNELS["paper"]._asdict()
     other = {key: value for key, value in channel.items() if key in about and value != usual[key]}

@@ -91,7 +91,7 @@ class Wording:
         self.model, self._needed = model, needed
 
     def known(self, path: YamlPath) -> list[str]:
-        """Return the names of the keys that are allowed in place of the last key of ``path`` (keys and indices)."""
+        """Return the names of all keys that are possible in place of the last key of ``path`` (keys and indices)."""
         models = [self.model]
         for key in path[:-1]:
             inside = [model.model_fields[key].annotation for model in models if key in model.model_fields]
@@ -190,7 +190,7 @@ def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
 class Mistake(NamedTuple):
     """The first mistake that pydantic found in data from a program.
 
-    ``str(mistake)`` is a text with the place of the mistake and what would be valid.
+    ``str(mistake)`` is a text that says where the mistake is and what would be valid.
     """
 
     place: str  # place of the mistake, keys joined by dots; empty if the data as a whole are invalid
@@ -202,7 +202,7 @@ class Mistake(NamedTuple):
 
 
 def first_mistake(error: ValidationError) -> Mistake:
-    """Return the first mistake in pydantic's ``error``, for files that programs write and for settings in code."""
+    """Return the first mistake in pydantic's ``error`` for a file that a program wrote, or for settings in code."""
     detail = error.errors(include_url=False)[0]
     right = {"missing": "is missing", "extra_forbidden": "is an unknown key"}.get(detail["type"])
     return Mistake(".".join(str(key) for key in path_of(detail)), detail["input"], right or _right(detail))
@@ -237,7 +237,7 @@ def _describe(detail: ErrorDetails, path: YamlPath, wording: Wording) -> str:
 def _show(detail: ErrorDetails) -> str:
     """Return the invalid value as text for the message, or an empty text if the whole file is invalid.
 
-    A float where a whole number is required is shown with its decimal point.
+    A float in place of a whole number is shown with its decimal point.
     """
     value = detail["input"]
     if isinstance(value, BaseModel) or not detail["loc"]:

@@ -189,7 +189,7 @@ def _refuse_existing(path: Path) -> None:
 
 
 def _folder_to_disk(path: Path) -> None:
-    """Write the entries of the folder ``path`` to disk, so that renames survive a power failure (POSIX only)."""
+    """Write the file list of the folder ``path`` to disk, so that new names survive a power failure (POSIX only)."""
     if os.name == "posix":
         descriptor = os.open(path, os.O_RDONLY)
         try:

@@ -1,7 +1,7 @@
 """Checks of a scenario that concern several fields together.
 
-Each check raises a pydantic error for the first mistake that it finds. The error contains the invalid value and its
-path (keys and indices) inside the file.
+Each check raises a pydantic error for the first mistake that the check finds. The error contains the invalid value and
+its path (keys and indices) inside the file.
 """
 
 from __future__ import annotations

@@ -177,7 +177,8 @@ class ScenarioFields(FileModel):
     def _needed(cls, value: Any, info: ValidationInfo) -> Any:
         """Raise an error if a quantity has neither a value nor a default.
 
-        No value is needed if every vehicle type, or the table, declares the quantity, or if the scenario is a mixture.
+        The scenario needs no value of a quantity if every vehicle type, or the table, declares the quantity, or if the
+        scenario is a mixture.
         """
         key, data = str(info.field_name), info.data
         kinds = data.get("vehicle_types")
@@ -224,9 +225,7 @@ class ScenarioFields(FileModel):
     @field_validator("table")
     @classmethod
     def _columns_of_line(cls, value: Table | None, info: ValidationInfo) -> Table | None:
-        """Check that each column of the table fits the number of vehicles, and has only numbers in the quantity's
-        range.
-        """
+        """Check that each column of the table fits the number of vehicles, and that all its numbers are in range."""
         if value is None or "vehicles" not in info.data:
             return value
         known = columns_of_table({**QUANTITY.usual, **QUANTITY.optional}, info.data["vehicles"])
@@ -327,7 +326,7 @@ class ScenarioFields(FileModel):
         return {i: role for i, role in enumerate(roles) if role != LEARNER}
 
     def play_pieces(self, worlds: Worlds, driven: Sequence[int] = ()) -> Worlds:
-        """Return ``worlds`` with the commands over time of each vehicle that follows a ``profile`` script.
+        """Return ``worlds`` with the accelerations over time of each vehicle that follows a ``profile`` script.
 
         ``driven``: indices (from 0) of controlled vehicles, which follow no script.
         """
@@ -390,8 +389,8 @@ class ScenarioFields(FileModel):
     def equipped(self, types: Ints | None = None) -> Equipped:
         """Return the V2X equipment of vehicles with the types ``types`` (indices of vehicle types, [n, N]).
 
-        If ``types`` is None, the result has one row, [1, N]: for each vehicle the least equipment of all its possible
-        types.
+        If ``types`` is None, the result has one row, [1, N]: for each vehicle the least equipment among all its
+        possible types.
         """
         line, each = self.types_of_line, []
         own = self.v2x.vehicles or {}
@@ -429,7 +428,7 @@ class ScenarioFields(FileModel):
         return tuple(quantities)
 
     def supports(self, field: str) -> tuple[tuple[float, float], ...]:
-        """Return (smallest, largest) value of the quantity ``field`` for each vehicle, pair or world.
+        """Return (smallest, largest) possible value of the quantity ``field`` for each vehicle, pair or world.
 
         The range of a vehicle includes the values of all its possible types.
         """
@@ -461,7 +460,7 @@ class ScenarioFields(FileModel):
         return tuple(self.table_entries.get((field, i), entry) for i, entry in enumerate(entries))
 
     def bounds(self, field: str, *, dry: bool = False) -> tuple[tuple[float, float], ...]:
-        """Return (smallest, largest) value of a declared or derived quantity for each vehicle, pair or world.
+        """Return (smallest, largest) possible value of a declared or derived quantity for each vehicle, pair or world.
 
         Args:
             field: key of a quantity that every world has: ``gaps_m``, ``speeds_mps``, ``mass_t``, ...

@@ -297,7 +297,7 @@ class WithLoad(_Distribution):
         return min(self.with_load) + low, max(self.with_load) + high
 
     def value(self, load: Floats, u: Floats) -> Floats:
-        """Return ``empty + (full - empty) load``, plus an amount that ``u`` draws from ``spread``.
+        """Return ``empty + (full - empty) load``, plus the value of the distribution ``spread`` for ``u``.
 
         The array ``load`` (loads in [0, 1]), the array ``u`` (uniform numbers in [0, 1)) and the result have the same
         shape.

@@ -269,7 +269,7 @@ Entry = tuple[str, int]  # quantity and index (from 0) of the vehicle or pair
 
 
 def columns_of_table(rules: Mapping[str, QuantityRule], vehicles: int) -> dict[str, Entry]:
-    """Return the columns of a table that has the quantities in ``rules``: column name -> (key of the quantity, index).
+    """Return the columns of a table of the quantities ``rules``: name -> (key of quantity, index of vehicle or pair).
 
     An example is ``{"gap_1_m": ("gaps_m", 0), ...}``.
 

@@ -91,7 +91,7 @@ class ScriptSpec(NamedTuple):
         return max(braking for _, braking in self.pieces) if self.name == _PROFILE else self.deceleration_mps2
 
     def is_state_free(self) -> bool:
-        """Return whether the script does not need the state: ``full_brake``, ``coast``, ``constant:a`` or a profile.
+        """Return whether the script ignores the state; True for ``full_brake``, ``coast``, ``constant:a`` and profiles.
 
         Raises ``InvalidInput`` if one of these four scripts has a missing, invalid or forbidden argument.
         """

@@ -28,7 +28,7 @@ def clusters_of(kinds: Mapping[str, _Texts], index: Ints) -> _Texts | None:
     if these worlds contain different vehicles. In a mixture, a world without a recording is a cluster of its own.
 
     Args:
-        kinds: texts about each world, such as ``Sample.kinds``: name of the column -> texts, [n].
+        kinds: texts about each world, in the form of ``Sample.kinds``: name of the column -> texts, [n].
         index: number of each world in its list, [n].
 
     """

@@ -94,7 +94,7 @@ def sample(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, chann
 def members_of(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Ints:
     """Return, for each world of a mixture, the index in ``scenario.members`` of the world's scenario, [n].
 
-    All indices are 0 if the scenario is not a mixture. The arguments have the same meaning as in ``sample``.
+    All returned indices are 0 if the scenario is not a mixture. The arguments have the same meaning as in ``sample``.
     """
     cumulative = np.cumsum([member.weight for member in scenario.mixture or ()] or [1.0])
     u = uniform_numbers(seed, channel, 0, first, n, OF_WORLD, of=MIXTURE)[:, 0]
@@ -190,7 +190,7 @@ def uniform_numbers(
     ``first + k``. Each number is the upper 53 bits of a 64-bit integer from the Philox generator, divided by 2^53.
 
     Args:
-        seed: seed of the list.
+        seed: seed of the list of worlds.
         channel: ``"list"`` (worlds for evaluation) or ``"training"``.
         attempt: number of the draw, from 0; a rejected world is drawn again with the next attempt number.
         first: number of the first world in the list, from 0.
@@ -252,7 +252,7 @@ def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, drawn: Sample
 
     Args:
         scenario: the scenario to draw from.
-        seed: seed of the list.
+        seed: seed of the list of worlds.
         channel: ``"list"`` (worlds for evaluation) or ``"training"``.
         drawn: the sample of all worlds, as drawn in the first attempt.
         early: mask [n]: True for each world in ``drawn`` that is rejected because of an early impact (an impact before
@@ -275,10 +275,9 @@ def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, drawn: Sample
 
 
 def _redraw_one(scenario: ScenarioFields, seed: int, channel: Channel, index: Ints) -> None:
-    """Draw world number ``index`` [1] in all remaining attempts; raise ``InvalidInput`` if it always has an early
-    impact.
+    """Draw world ``index`` [1] in all remaining attempts; raise ``InvalidInput`` if all have an early impact.
 
-    If a scenario has no acceptable worlds, repeated draws of a single world show this sooner than draws of the whole
+    If no world of a scenario is acceptable, repeated draws of a single world show this sooner than draws of the whole
     list. ``seed`` and ``channel`` have the same meaning as in ``sample``.
     """
     for attempt in range(_PATIENCE, MOST_ATTEMPTS):

@@ -32,7 +32,7 @@ _DISTRIBUTION = (
 
 
 class ScenarioWording(Wording):
-    """Texts of the error messages about a scenario, or about a part of a scenario such as ``v2x``."""
+    """Texts for error messages about the content of a scenario file."""
 
     def instead(self, key: str) -> str:
         """Return a hint for an unknown key that people often try: another word for friction, or the slope of the road.
@@ -158,8 +158,8 @@ class Scenario(ScenarioFields):
         """Return worlds ``first`` to ``first + n - 1`` of the endless list of worlds that belongs to ``seed``.
 
         World k of the list is always the same, bit for bit. ``channel``: ``"list"`` (worlds for evaluation) or
-        ``"training"``, two independent lists. Raises ``InvalidInput`` for an invalid ``n``, ``seed`` or ``first``. See
-        ``sampling.sample``.
+        ``"training"``; the two lists of worlds are independent. Raises ``InvalidInput`` for an invalid ``n``, ``seed``
+        or ``first``. See ``sampling.sample``.
         """
         return sample(self, n, seed, first=first, channel=channel)
 
@@ -170,7 +170,7 @@ class Scenario(ScenarioFields):
     def content(self, without: Collection[str]) -> dict[str, Any]:
         """Return every value of the scenario, including defaults, as plain data, except the keys in ``without``.
 
-        The content of a mixture includes the values of its scenarios, without title, description and source.
+        The content of a mixture includes the content of its scenarios, but not their titles, descriptions and sources.
         """
         content = self.model_dump(mode="json", exclude=set(without))
         if self.mixture is not None and self.members:
@@ -184,8 +184,8 @@ class Scenario(ScenarioFields):
         """Return a copy of the scenario with changed values, for example ``replace(mass_t=2.0)``.
 
         If ``changes`` declares gaps or speeds by another key, such as ``time_gaps_s``, the old key (``gaps_m``) is
-        removed. In a mixture the values change in every scenario. Raises ``InvalidInput`` if the result is not a valid
-        scenario.
+        removed. If the scenario is a mixture, the values change in each of its scenarios. Raises ``InvalidInput`` if
+        the result is not a valid scenario.
         """
         return Scenario(**changed_content(self.declared(), changes))
 
@@ -253,10 +253,10 @@ def _range(key: str, low: float, high: float, positive: bool = False) -> dict[st
     """Return the JSON schema of a quantity; it allows only numbers in the given range, also in distributions and lists.
 
     Args:
-        key: key of the quantity.
-        low: smallest allowed value.
-        high: largest allowed value.
-        positive: True: the value ``low`` itself is not allowed.
+        key: key of the quantity whose schema is returned.
+        low: smallest allowed value of the quantity.
+        high: largest allowed value of the quantity.
+        positive: True: the quantity must be above ``low``; False: it may also equal ``low``.
 
     """
     limits = {"exclusiveMinimum" if positive else "minimum": low, "maximum": high}

@@ -259,7 +259,7 @@ class Table(FileModel):
         return self
 
     def column_values(self) -> dict[str, TableColumn]:
-        """Return each column of the table by name, also ``recording``, together with the weights of the rows."""
+        """Return the table's columns by name, including ``recording``; each column also has the weights of the rows."""
         rows = self.rows or ()
         weights = self.weights if isinstance(self.weights, tuple) else (1.0,) * len(rows)
         cumulative = np.cumsum(np.asarray(weights))

@@ -22,7 +22,7 @@ class Algorithm(ABC):
     A subclass must implement ``build``, which returns the model. A subclass may override ``actors`` (the policies
     inside the model), ``tensors`` (the weights of a policy), ``optimizers`` (the model's optimisers),
     ``learned_beside`` (what a checkpoint saves in addition to ``model.policy``) and ``log_noise`` (the exploration
-    noise). The default methods fit a model whose ``policy`` has one ``optimizer``, such as PPO and A2C.
+    noise). The default methods fit a model whose attribute ``policy`` has one ``optimizer``, such as PPO and A2C.
     """
 
     @abstractmethod
@@ -38,8 +38,8 @@ class Algorithm(ABC):
     def actors(self, model: BaseAlgorithm) -> tuple[BasePolicy, ...]:
         """Return the policies inside the model that choose actions.
 
-        The result contains one policy for all learners or, in the scheme ``independent``, one policy for each learner,
-        front to rear.
+        The result contains one policy for all learners or, in the scheme ``independent``, one policy for each learner
+        in the order front to rear.
         """
         return (model.policy,)
 

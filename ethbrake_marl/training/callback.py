@@ -44,7 +44,7 @@ class StopRequested(Exception):
 
 
 class Watchers(NamedTuple):
-    """Functions that a training run calls: to measure its policies, to ask whether to stop, and to report progress."""
+    """Functions that a training run calls to measure its policies, to learn whether to stop, and to report progress."""
 
     evaluate: Evaluate | None  # takes the current policies and returns their metrics; None: no measurements
     stop_at: StopAt | None  # takes the metrics of an evaluation; returns a reason to stop, or None to continue
@@ -117,8 +117,7 @@ class RunCallback(BaseCallback):
             self._write_checkpoint()
 
     def _take_policies(self) -> None:
-        """Store policies with the current weights in ``course``, unless ``course`` has the weights of this update
-        already.
+        """Store policies with the current weights in ``course``, unless it has the weights of this update already.
 
         Raises ``TrainingDiverged`` if a weight is not finite.
         """
@@ -204,7 +203,7 @@ class RunCallback(BaseCallback):
         return TrainingState(numbers, arrays)
 
     def restore(self, state: TrainingState) -> None:
-        """Restore model and progress from a checkpoint, so that the training continues from this checkpoint.
+        """Restore model and progress from a checkpoint, so that the training run continues from this checkpoint.
 
         Raises ``CorruptBundle`` if the checkpoint does not fit this model.
         """

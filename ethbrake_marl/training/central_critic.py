@@ -32,8 +32,8 @@ class _OwnPartForTheActor(MlpExtractor):
     entries.
 
     Args:
-        own: number of entries at the beginning of an observation row that the actor sees.
-        whole: number of all entries of an observation row, which the critic sees.
+        own: number of entries that the actor sees, at the beginning of an observation row.
+        whole: number of all entries of an observation row; the critic sees all of them.
         net_arch: sizes of the layers, as in Stable-Baselines3's ``ActorCriticPolicy``.
         activation_fn: activation function, as in Stable-Baselines3's ``ActorCriticPolicy``.
 

@@ -32,7 +32,7 @@ Measure = Callable[[Training], Evaluate]  # function that returns the ``Evaluate
 
 
 def measure_on_list(training: Training) -> Evaluate:
-    """Draw the fixed list of worlds, and return a function that measures policies on this list.
+    """Draw the fixed list of worlds, and return a function that measures policies in the worlds of this list.
 
     The returned function takes a ``Policy`` or ``PolicyTeam``, and returns the metrics of ``measure_team``.
     """

@@ -158,7 +158,7 @@ class IndependentPPO(PPO):
     def _whose_turn(self, turns: int) -> int:
         """Return the number of the learner (0 = foremost) that learns in the next update.
 
-        The result depends only on the number of decisions so far, so a resumed training has the same turns.
+        The result depends only on the number of decisions so far, so a resumed training run has the same turns.
         """
         rollout = self.n_envs * self.n_steps
         planned = -(-self._total_timesteps // rollout)

@@ -174,9 +174,7 @@ def _restore_replay(memory: Any, place: Any, arrays: Arrays) -> None:
 
 
 def _try_step(optimizer: torch.optim.Optimizer) -> None:
-    """Make a trial step with a copy of ``optimizer``; torch raises an error if the optimiser does not fit the
-    weights.
-    """
+    """Make a trial step with a copy of ``optimizer``; torch raises an error if optimiser and weights do not fit."""
     tried = copy.deepcopy(optimizer)
     for group in tried.param_groups:
         for weights in group["params"]:

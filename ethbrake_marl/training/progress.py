@@ -39,7 +39,7 @@ class Course:
 
     @property
     def wall_s(self) -> float:
-        """Wall time spent on this training so far (s), without the time between a stop and the call of ``resume``."""
+        """Wall time of this training run so far (s), without the time between a stop and the call of ``resume``."""
         return self.wall_before_s + time.monotonic() - self.started
 
     @property

@@ -88,7 +88,7 @@ class RunDirectory:
         """Write ``run.json`` anew: status, start time of the run and, unless the status is ``running``, its end time.
 
         Args:
-            status: the status of the run.
+            status: status of the run to record, such as ``running``.
             more: further entries to write into ``run.json``.
 
         """
@@ -100,7 +100,7 @@ class RunDirectory:
         self.write_json(self.status, {"format": "ethbrake-run", "format_version": 1, "status": status, **times, **more})
 
     def remove_results(self) -> None:
-        """Delete the results and reports of ``ethbrake run``, which do not apply to the continued training."""
+        """Delete results and reports of ``ethbrake run``, because they do not apply to the continued training run."""
         own, written = {path.name for path in vars(self).values()}, read_object(self.status).get(self.WRITTEN)
         names = written if isinstance(written, list) else []
         for path in [*self.path.iterdir()]:
@@ -129,7 +129,7 @@ class RunDirectory:
 
     @property
     def is_finished(self) -> bool:
-        """Whether the training in this folder has finished."""
+        """Whether the training run in this folder has finished."""
         return self.status.is_file() and read_object(self.status).get("status") == "finished"
 
     def wait_for_others(self, longest_s: float) -> None:
