@@ -169,7 +169,7 @@ class Out:
         say(text)
 
     def check(self, path: Path | None, *endings: str, what: str = "the file") -> None:
-        """Raise ``InvalidInput`` or ``AlreadyExists`` if a file cannot be written; a command calls this method first.
+        """Raise ``InvalidInput`` or ``AlreadyExists`` if a file cannot be written; call this method first.
 
         Args:
             path: path of the file; None: no file was requested, and nothing is checked.

@@ -106,7 +106,7 @@ def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
 def _dependencies() -> Iterator[Check]:
     """Yield one check per dependency, which succeeds if a required version is installed.
 
-    A missing package that only an extra needs does not count as a failure.
+    If a missing package is needed only by an extra, the check of this package does not fail.
     """
     from packaging.version import Version
 

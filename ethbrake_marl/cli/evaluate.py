@@ -281,7 +281,7 @@ def _write_worlds(out: Out, output: Path | None, result: evaluation.Evaluation, 
 
 
 def _write_results(out: Out, output: Path | None, results: object, *beside: str) -> None:
-    """Write ``results.json`` into the folder ``output``, and delete earlier result files not named in ``beside``.
+    """Write ``results.json`` into the folder ``output``; delete earlier result files that ``beside`` does not name.
 
     If ``output`` is None, do nothing.
     """

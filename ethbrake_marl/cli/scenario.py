@@ -115,7 +115,7 @@ def _drawn_lines(scenario: scenarios.Scenario, sample: scenarios.Sample) -> tupl
     """Return (lines, text, columns), three descriptions of the quantities in the worlds of ``sample``.
 
     ``lines`` is a table with the range of each varying quantity, and ``text`` lists the fixed quantities. ``columns``
-    is for JSON: ``{"gap_1_m": {"least": 5.0, "median": 7.0, "largest": 9.0}}``.
+    is plain data for JSON, such as ``{"gap_1_m": {"least": 5.0, "median": 7.0, "largest": 9.0}}``.
     """
     import numpy as np
 

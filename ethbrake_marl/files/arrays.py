@@ -109,7 +109,7 @@ def safetensors_headers(data: bytes) -> dict[str, ArrayHeader]:
 
 
 def _lengths(shape: object) -> tuple[int, ...]:
-    """Convert a shape from JSON to a tuple; an invalid length becomes -1, which differs from every required length."""
+    """Convert a shape from JSON to a tuple; an invalid length becomes -1, which no required length equals."""
     return tuple(each if type(each) is int else -1 for each in (shape if isinstance(shape, list) else [None]))
 
 

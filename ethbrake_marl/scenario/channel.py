@@ -23,8 +23,9 @@ observes another vehicle's latency, it observes the *own* latency of that vehicl
 channel. Under the preset ``paper`` a vehicle knows the state of every vehicle as soon as its own latency has elapsed.
 
 With ``persistence: first``, vehicle i knows the present state of vehicle j after the first message. With ``persistence:
-periodic``, vehicle j sends a message in every period T, and the same Gilbert-Elliott channel may lose it. Vehicle i
-then knows the state of vehicle j that is contained in the newest message that has arrived (``physics.messages``).
+periodic``, vehicle j sends a message in every message period T, and each message may be lost in a burst of the link's
+Gilbert-Elliott channel. Vehicle i then knows the state of vehicle j that is contained in the newest message that has
+arrived (``physics.messages``).
 """
 
 from __future__ import annotations

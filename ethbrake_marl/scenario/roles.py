@@ -41,8 +41,9 @@ class ScriptSpec(NamedTuple):
     def parse(spec: str) -> ScriptSpec:
         """Parse ``spec``, a text ``name[:argument]``.
 
-        Raises ``InvalidInput`` unless the name matches ``[a-z][a-z0-9_@.-]*`` and the argument has no spaces. Also
-        raises ``InvalidInput`` for a Python file, because loading somebody else's scenario must not run code.
+        Raises ``InvalidInput`` unless the name matches ``[a-z][a-z0-9_@.-]*`` and the argument has no spaces.
+        ``InvalidInput`` is also raised if ``spec`` names a Python file, because loading somebody else's
+        scenario must not run code.
         """
         match = _SPEC.fullmatch(spec) if isinstance(spec, str) else None
         if match is None:

@@ -146,7 +146,7 @@ def sample_by(scenario: ScenarioFields, numbers: Callable[[int, tuple[int, ...]]
 def drawn_quantities(
     scenario: ScenarioFields, numbers: Callable[[int, tuple[int, ...]], Floats], typed: tuple[Ints, Floats] | None
 ) -> Callable[[str], Floats]:
-    """Return a function that maps the key of a declared quantity to its values in n worlds, [n, entries].
+    """Return a function: key of a declared quantity -> values of this quantity in n worlds, [n, entries].
 
     A quantity has one entry per vehicle, per pair or per world; ``fields.QUANTITY`` says which.
 

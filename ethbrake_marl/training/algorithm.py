@@ -67,7 +67,7 @@ class Algorithm(ABC):
     def log_noise(self, model: BaseAlgorithm) -> Tensor | None:
         """Return the logarithm of the model's exploration noise, or None if the model has no such noise.
 
-        If the exploration noise is not finite or not above 0, the training stops with an error.
+        If the model's exploration noise is not finite or not above 0, the training run stops with an error.
         """
         log_std: Tensor | None = getattr(model.policy, "log_std", None)
         return None if log_std is None else log_std.detach()

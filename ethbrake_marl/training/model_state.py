@@ -111,7 +111,8 @@ def _restore_weights(model: Model, algorithm: Algorithm, rates: Mapping[str, flo
 def _captured_rows(model: Model) -> Arrays:
     """Return the latest observation of every learner, and the returns and lengths of the latest episodes.
 
-    Stable-Baselines3 needs the observations to continue the rollouts, and the returns and lengths to log their means.
+    Stable-Baselines3 needs the observations to continue the rollouts; it needs the returns and lengths to log their
+    means.
     """
     observations: Any = model._last_obs
     episodes = list(model.ep_info_buffer or ())

@@ -54,7 +54,7 @@ def tensors_of_layers(name: str, layers: nn.Sequential) -> dict[str, Float32s]:
     Args:
         name: name of the network in the bundle, such as ``policy`` or ``gate``. The names of all returned tensors begin
             with ``name``.
-        layers: linear layers, possibly with activations between them. The last linear layer is the output.
+        layers: linear layers, possibly with activations between them. The last linear layer is the output layer.
 
     """
     linear = [layer for layer in layers if isinstance(layer, nn.Linear)]

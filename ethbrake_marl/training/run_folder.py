@@ -89,7 +89,7 @@ class RunDirectory:
 
         Args:
             status: status of the run to record, such as ``running``.
-            more: further entries to write into ``run.json``.
+            more: further entries to write into ``run.json``, by key.
 
         """
         now = datetime.now(UTC).isoformat(timespec="seconds")
