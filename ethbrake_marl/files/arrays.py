@@ -199,7 +199,7 @@ def _npy_header(name: str, beginning: bytes) -> tuple[ArrayHeader, int]:
 
 
 def _check_directory(data: bytes) -> None:
-    """Raise ``ValueError`` unless the end of ``data`` is the end of a zip archive with one small directory of files.
+    """Raise ``ValueError`` unless ``data`` ends with a small zip directory, as a plain ``.npz`` archive does.
 
     Call this function before opening the archive, because a zip reader creates an object for every entry of the
     archive's directory.

@@ -275,7 +275,7 @@ def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, drawn: Sample
 
 
 def _redraw_one(scenario: ScenarioFields, seed: int, channel: Channel, index: Ints) -> None:
-    """Draw world ``index`` [1] in all remaining attempts; raise ``InvalidInput`` if all have an early impact.
+    """Raise ``InvalidInput`` if world number ``index`` [1] has an early impact in all remaining attempts to draw it.
 
     If no world of a scenario is acceptable, repeated draws of a single world show this sooner than draws of the whole
     list. ``seed`` and ``channel`` have the same meaning as in ``sample``.

@@ -37,8 +37,7 @@ StopAt = Callable[[Mapping[str, float]], str | None]
 
 
 class StopRequested(Exception):
-    """Internal exception that the callback raises in order to leave Stable-Baselines3's training loop between two
-    updates.
+    """Internal exception that the callback raises to leave Stable-Baselines3's training loop between two updates.
 
     The argument of the exception is the reason that ``StopAt`` returned, or None after Ctrl-C.
     """
