@@ -175,7 +175,7 @@ def naming_extras() -> Iterator[None]:
 
 
 def need(package: str) -> None:
-    """Raise ``MissingExtra`` if ``package``, a package of an optional extra, is not installed; import nothing."""
+    """Raise ``MissingExtra`` if ``package``, a package of an optional extra, is not installed; do not import it."""
     if find_spec(package) is None:
         raise _missing(package)
 
@@ -206,7 +206,7 @@ class PhysicsError(EthBrakeError, ArithmeticError):
         return one_line("; ".join([*named, f"and {count_of(more, 'more world')}"] if more else named))
 
     def renumbered(self, rows: Sequence[int] | NDArray[np.int64]) -> PhysicsError:
-        """Return this error with its rows in a larger batch, whose row ``rows[k]`` is row k of this batch."""
+        """Return this error with other row numbers: row k of this batch becomes row ``rows[k]`` of a larger batch."""
         return PhysicsError({int(rows[row]): reason for row, reason in self.worlds.items()})
 
 
@@ -229,13 +229,13 @@ class AgentFailed(InvalidInput):
         return one_line(f"agent {self.agent!r}{where}, {self.reason}")
 
     def renumbered(self, rows: Sequence[int] | NDArray[np.int64]) -> AgentFailed:
-        """Return this error with its row in a larger batch, whose row ``rows[k]`` is row k of this batch."""
+        """Return this error with another row number: row k of this batch becomes row ``rows[k]`` of a larger batch."""
         return AgentFailed(self.agent, None if self.row is None else int(rows[self.row]), self.reason)
 
     @staticmethod
     @contextmanager
     def naming(name: str, others: Collection[str] = ()) -> Iterator[None]:
-        """Context manager: change the agent's name in an ``AgentFailed`` error to ``name``, which the user knows.
+        """Context manager: if the block raises ``AgentFailed``, replace the agent's name in the error by ``name``.
 
         ``others``: names of the agents of the other vehicles; an error of one of these agents keeps the agent's name.
         """
@@ -248,7 +248,7 @@ class AgentFailed(InvalidInput):
 
 
 class Unfamiliar(UserWarning):
-    """Warning: a trained policy is used in worlds unlike those it was trained in."""
+    """Warning: a trained policy is used in worlds that differ from the worlds of its training."""
 
 
 @contextmanager
@@ -265,13 +265,13 @@ def renumbered(rows: Sequence[int] | NDArray[np.int64]) -> Iterator[None]:
 
 
 class UncertifiedStep(EthBrakeError):
-    """The engine's step differs from the step that the shield certified, so the step is undone."""
+    """The engine's time step differs from the step that the shield certified, so the engine's step is undone."""
 
 
 def new_name(name: object, known: Collection[str]) -> str | None:
     """Return the new name if ``name`` was renamed and the new name is in ``known``; otherwise None.
 
-    If ``name`` contains colons, each word between them is looked up separately.
+    If ``name`` contains colons, each of the words between the colons is looked up separately.
     """
     new = ":".join(RENAMED.get(word, word) for word in name.split(":")) if isinstance(name, str) else None
     return new if new != name and new in known else None
@@ -309,7 +309,8 @@ def refuse_shipped_path(path: str, agent: str = "") -> None:
 
 
 def check_whole_number(what: str, value: object, least: int, most: int | None = None) -> None:
-    """Raise ``InvalidInput`` unless ``value`` is a whole number from ``least`` to ``most`` (None: no upper limit).
+    """Raise ``InvalidInput`` unless ``value`` is a whole number from ``least`` to ``most``; None as ``most``: no upper
+    limit.
 
     ``what``: name of the value; the error message begins with this name.
     """
@@ -325,7 +326,7 @@ def check_one_learner(scenario: str, learners: Sequence[str], advice: str) -> No
     Args:
         scenario: name of the scenario.
         learners: names of the scenario's learners.
-        advice: what the user can do instead.
+        advice: what the user can do; the error message ends with this text.
 
     """
     if len(learners) != 1:

@@ -46,7 +46,7 @@ def on_first_compilation(tell: Callable[[Path, bool], None]) -> None:
 def tell_compilation(nothing_kept: bool) -> None:
     """Call each callback of ``on_first_compilation`` once, before a kernel is compiled.
 
-    ``nothing_kept``: true if this process has not loaded any kernel from the cache yet.
+    ``nothing_kept``: true if this process has not loaded any compiled kernel from the cache folder yet.
     """
     while _tellers:
         _tellers.pop()(cache_folder(), nothing_kept)

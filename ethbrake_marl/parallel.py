@@ -97,7 +97,7 @@ def _answer(call: bytes) -> Any:
 
 @cache
 def _end_with_parent() -> None:
-    """Make this worker process exit when its parent process has ended, even in the middle of a call."""
+    """Make this worker process exit when its parent process ends, even in the middle of a call."""
 
     def watch(parent: int) -> None:
         while os.getppid() == parent:

@@ -1,14 +1,14 @@
 """Registries of agents, shields, measures, features, objectives, algorithms and commands, by name.
 
-Each registry contains the objects, called *parts*, of one kind, for example all agents. A running program adds a part
-with a ``register_...`` function. An installed package adds a part with an entry point in its ``pyproject.toml``, as
-this package does for its extensions:
+Each registry contains all objects of one kind, for example all agents. A running program adds an object with a
+``register_...`` function. An installed package adds an object with an entry point in its ``pyproject.toml``, as this
+package does for its extensions:
 
     [project.entry-points."ethbrake_marl.agents"]
     gentle = "my_package.agents:make_gentle"
 
-When the name is first used, the entry point is loaded and its value is passed to the ``register_...`` function. A part
-that is installed but not used is never imported, so it cannot break anything.
+When the name is first used, the entry point is loaded and its value is passed to the ``register_...`` function. An
+object that is installed but not used is never imported, so it cannot break anything.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ T = TypeVar("T")
 
 
 class Part:
-    """Value of an entry point: the arguments of a ``register_...`` function, except the name.
+    """Value of an entry point: all arguments of a ``register_...`` function except the name.
 
-    The ``register_...`` function registers the part under the name of the entry point. For example, an entry point in
+    The ``register_...`` function registers the object under the name of the entry point. For example, an entry point in
     the group ``ethbrake_marl.measures`` with the value ``part`` below has the same effect as ``register_measure(name,
     closing, unit="m/s")``.
 
@@ -73,26 +73,27 @@ def giver(point: EntryPoint) -> str:
 
 
 def versions_used() -> dict[str, str]:
-    """Return a dictionary name -> version of the other packages that have added, for example, agents to this process.
+    """Return name -> version of the other packages that have added agents or other objects to this process.
 
-    The dictionary contains a package only if one of the package's entry points has been loaded.
+    A package is in the dictionary only if at least one of the package's entry points has been loaded.
     """
     return dict(sorted(_VERSIONS.items()))
 
 
 class Registry(Mapping[str, T]):
-    """Mapping name -> part for all parts (such as agents) of one kind. A part is loaded when it is first looked up.
+    """Mapping name -> object for all objects of one kind, for example all agents. An object is loaded when its name is
+    first looked up.
 
-    Testing whether a name exists, and iterating over the names, load no part. Looking up a name raises ``UnknownName``
-    if no part has this name. A look-up raises ``InvalidInput`` if the part cannot be loaded or two installed packages
-    define it, and ``MissingExtra`` if a package of an extra is missing.
+    Neither the test whether a name exists nor an iteration over the names loads an object. Looking up a name raises
+    ``UnknownName`` if the registry has no object of this name. Looking up a name raises ``InvalidInput`` if the object
+    cannot be loaded or if two installed packages define it, and ``MissingExtra`` if a package of an extra is missing.
 
     Args:
-        kind: word for one part in messages, for example ``agent``.
+        kind: noun for one object of the registry in messages, for example ``agent``.
         group: group of the entry points, without the prefix ``ethbrake_marl.``.
-        register: function that is called with the name and the value of an entry point, and calls ``add`` on this
-            registry.
-        built_in: name -> part, for parts that are defined in code rather than by entry points.
+        register: function that is called with the name and value of an entry point; it must call the method ``add`` of
+            this registry.
+        built_in: name -> object, for objects that are defined in code rather than by entry points.
 
     """
 
@@ -108,7 +109,7 @@ class Registry(Mapping[str, T]):
         return name in self.loaded or name in points(self.group)
 
     def __iter__(self) -> Iterator[str]:
-        """Yield the names: built-in parts first, then entry points, then parts that this process registered."""
+        """Yield the names: first built-in objects, then entry points, then objects that this process registered."""
         built_in = (name for name in self.loaded if name in self._built_in)
         return iter(dict.fromkeys([*built_in, *points(self.group), *self.loaded]))
 
@@ -124,10 +125,11 @@ class Registry(Mapping[str, T]):
         return self.loaded[name]
 
     def load(self, name: str) -> list[str]:
-        """Load the part (such as an agent) called ``name`` if needed; return the names of all parts that it defines.
+        """Load the object (such as an agent) called ``name`` if needed; return all names that its entry point defines.
 
-        An entry point defines several parts if its value is a dictionary, otherwise one part. Raises ``UnknownName`` if
-        no part has this name, and ``InvalidInput`` or ``MissingExtra`` if the part cannot be loaded.
+        An entry point defines several objects if its value is a dictionary, and otherwise one object. Raises
+        ``UnknownName`` if the registry has no object of this name, and ``InvalidInput`` or ``MissingExtra`` if the
+        object cannot be loaded.
         """
         candidates = points(self.group).get(name, [])
         givers = [OURS] * (name in self._built_in) + [giver(point) for point in candidates]
@@ -168,10 +170,10 @@ class Registry(Mapping[str, T]):
         return list(parts)
 
     def add(self, name: str, part: T, is_same: Callable[[T], bool]) -> None:
-        """Add ``part`` (such as an agent) under ``name``; raise ``AlreadyExists`` if another part has the name.
+        """Add ``part`` (such as an agent) under ``name``; raise ``AlreadyExists`` if another object has the name.
 
-        ``is_same`` is called with the part that is registered under ``name``, and returns whether it equals ``part``;
-        an equal part is not added again.
+        ``is_same`` is called with the object that is registered under ``name``, and returns whether it equals ``part``;
+        an equal object is not added again.
         """
         if name not in self.loaded and name in self and name not in self._loading:
             self.load(name)
@@ -183,11 +185,13 @@ class Registry(Mapping[str, T]):
             )
 
     def usable(self) -> dict[str, T]:
-        """Load all parts of this kind (such as all agents) and return those that could be loaded: name -> part."""
+        """Load all objects of this kind (such as all agents); return those that could be loaded: name -> object."""
         return {name: self.loaded[name] for name in self if self.why_not(name) is None and name in self.loaded}
 
     def why_not(self, name: str) -> str | None:
-        """Load the part (such as an agent) called ``name``; return the error message if this fails, otherwise None."""
+        """Load the object (such as an agent) called ``name``; return the error message if this fails, otherwise
+        None.
+        """
         try:
             self.load(name)
         except (InvalidInput, MissingExtra) as error:

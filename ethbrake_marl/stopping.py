@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM set a flag that a long computation checks between two steps, and raise no exception."""
+"""Ctrl-C and SIGTERM set a flag instead of raising an exception; a long computation checks the flag between steps."""
 
 from __future__ import annotations
 

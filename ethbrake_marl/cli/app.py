@@ -109,7 +109,7 @@ def run_command(arguments: Sequence[str]) -> int:
 
 
 def _shell_asks(environment: Mapping[str, str]) -> bool:
-    """Return whether a shell runs this command to complete a command line (see ``--show-completion``).
+    """Return whether a shell runs this command in order to complete a command line (see ``--show-completion``).
 
     ``environment``: environment variables. A variable that requests a completion is ignored if the other variables of
     the completion script are missing, so a command never fails because a stray variable is set.
@@ -193,7 +193,7 @@ def tell_compilation(folder: Path, empty: bool) -> None:
 
 
 def abandon_output() -> None:
-    """Discard buffered output that cannot be written (full disk), so that Python does not fail again at exit."""
+    """Discard buffered output that cannot be written (full disk); otherwise Python would raise an error at exit."""
     try:
         sys.stdout.flush()
     except OSError:

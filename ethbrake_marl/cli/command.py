@@ -123,7 +123,7 @@ class Out:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop redirecting stdout; after Ctrl-C, print a message and end the command with exit status 130.
+        """Stop redirecting stdout; if the block was ended by Ctrl-C, print a message and exit with status 130.
 
         The arguments describe the exception that ended the block, as for every context manager.
         """
@@ -169,7 +169,7 @@ class Out:
         say(text)
 
     def check(self, path: Path | None, *endings: str, what: str = "the file") -> None:
-        """Raise ``InvalidInput`` or ``AlreadyExists`` if a file cannot be written; a command calls this method first.
+        """Raise ``InvalidInput`` or ``AlreadyExists`` if a file cannot be written; call this method first.
 
         Args:
             path: path of the file; None: no file was requested, and nothing is checked.
@@ -186,9 +186,9 @@ class Out:
         check_target(path, force=self.force)
 
     def write(self, path: Path, content: bytes | str, what: str | None = None) -> None:
-        """Write ``content`` to a file, completely or not at all, and print ``WHAT: PATH`` on stderr.
+        """Write ``content`` to a file, completely or not at all, and print the line ``WHAT: PATH`` on stderr.
 
-        ``what``: word for the content, printed as WHAT; None: print nothing.
+        ``what``: word for the content, printed as WHAT; None: print no line.
         """
         from ethbrake_marl.files.store import write_output
 
@@ -212,7 +212,7 @@ class Out:
             done: number of units of work that are done.
             total: number of all units of work.
             harm: text with the harm in the latest evaluation, shown after the name of the task.
-            note: message to print once, above the bars.
+            note: message to print once, above the progress bars.
 
         """
         label = one_line(f"{name}, {harm}" if harm else name)
@@ -254,7 +254,7 @@ class Out:
 class _PlainConsole(Console):
     """Console of rich that prints texts literally, without interpreting markup, and escapes control characters.
 
-    ``width``: number of columns; None: width of the terminal.
+    ``width``: width of the console in characters; None: width of the terminal.
     """
 
     def __init__(self, file: TextIO, *, width: int | None = None) -> None:

@@ -76,7 +76,7 @@ class Check:
 
 
 def diagnose(*, compile_all: bool = False) -> list[Check]:
-    """Run all checks of the installation; return the results in the order in which problems should be solved.
+    """Run all checks of the installation; return their results in the order in which the user should solve problems.
 
     A check that raises an error is reported as failed. ``compile_all``: True: also call the usual commands on a few
     worlds, which compiles and stores all kernels that they use.
@@ -106,7 +106,7 @@ def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
 def _dependencies() -> Iterator[Check]:
     """Yield one check per dependency, which succeeds if a required version is installed.
 
-    A missing package that only an extra needs does not count as a failure.
+    If a missing package is needed only by an extra, the check of this package does not fail.
     """
     from packaging.version import Version
 

@@ -281,7 +281,7 @@ def _write_worlds(out: Out, output: Path | None, result: evaluation.Evaluation, 
 
 
 def _write_results(out: Out, output: Path | None, results: object, *beside: str) -> None:
-    """Write ``results.json`` into the folder ``output``, and delete earlier result files not named in ``beside``.
+    """Write ``results.json`` into the folder ``output``; delete earlier result files that ``beside`` does not name.
 
     If ``output`` is None, do nothing.
     """
@@ -317,7 +317,7 @@ def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: f
 
 
 def _moving(rows: Sequence[evaluation.SummaryRow]) -> dict[str, int]:
-    """Return, for each agent with a shield, in how many worlds at least one vehicle still moves at the horizon.
+    """Return a dictionary: agent with a shield -> number of worlds in which some vehicle still moves at the horizon.
 
     ``rows``: rows of the results table, one per agent.
     """
@@ -367,8 +367,8 @@ def shield_command(
     """Compare agents without and with the shield.
 
     Each agent runs in the same worlds without a shield, with the shield in episode mode, and with the shield in step
-    mode. A team of several learners runs without a shield, with the shield in step mode, and with that shield plus
-    caps. Write the names of the agents without a shield: full_brake, not full_brake+step. The shield bounds
+    mode. A team of several learners runs without a shield, with the shield in step mode, and with the shield in step
+    mode plus caps. Write the names of the agents without a shield: full_brake, not full_brake+step. The shield bounds
     first-impact harm, or total harm with --set harm_count=total. For each action that step mode replaced, the table
     says what harm the replaced action would have caused: more (the replacement was needed), the same (harmless) or less
     (costly).

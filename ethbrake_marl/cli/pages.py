@@ -1,4 +1,6 @@
-"""Registry of the functions that draw pages and pictures for commands. Extensions register such functions."""
+"""Registry of the functions that draw pages and pictures for commands. An extension registers its own functions
+here.
+"""
 
 from __future__ import annotations
 

@@ -115,7 +115,7 @@ def _drawn_lines(scenario: scenarios.Scenario, sample: scenarios.Sample) -> tupl
     """Return (lines, text, columns), three descriptions of the quantities in the worlds of ``sample``.
 
     ``lines`` is a table with the range of each varying quantity, and ``text`` lists the fixed quantities. ``columns``
-    is for JSON: ``{"gap_1_m": {"least": 5.0, "median": 7.0, "largest": 9.0}}``.
+    is plain data for JSON, such as ``{"gap_1_m": {"least": 5.0, "median": 7.0, "largest": 9.0}}``.
     """
     import numpy as np
 
@@ -223,10 +223,11 @@ def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
 
 
 def _refused(scenario: scenarios.Scenario, sample: scenarios.Sample | None = None) -> str:
-    """Return the number of draws that were rejected for an early impact, as a text ``: 3 of 203 draws (1.5 %)``.
+    """Return the number of draws rejected for an impact before any learner can act: ``: 3 of 203 draws (1.5 %)``.
 
-    The text is empty for a scenario without a table. If the scenario has a table, rejections change how often each row
-    of the table occurs in the worlds. ``sample``: worlds whose rejected draws are counted; None: draw 200 worlds.
+    The returned text is empty for a scenario without a table. If the scenario has a table, rejections change how often
+    each row of the table occurs in the worlds. ``sample``: worlds whose rejected draws are counted; None: draw 200
+    worlds.
     """
     if all(each.table is None for each in scenario.members or (scenario,)):
         return ""
@@ -268,7 +269,7 @@ def _in_words(quantity: Any) -> str:
 
 
 def _news_in_words(scenario: scenarios.Scenario) -> str:
-    """Return a sentence about the scenario's V2X channel: what each vehicle knows, and when."""
+    """Return a sentence about what each vehicle knows, and when, through the scenario's V2X channel."""
     channel, about = scenario.v2x.channel._asdict(), type(scenario.v2x).model_fields
     usual = scenarios.CHANNELS["paper"]._asdict()
     other = {key: value for key, value in channel.items() if key in about and value != usual[key]}

@@ -48,7 +48,7 @@ def run_folder(scenario: scenarios.Scenario, recipe: training.TrainingRecipe, se
     """Return the default folder of a run: ``runs/SCENARIO-RECIPE-seedSEED``.
 
     If the recipe has a scheme for several learners, the name is ``runs/SCENARIO-RECIPE-SCHEME-seedSEED``. ``seed``:
-    seed of the training; None: the recipe's seed.
+    seed of the training run; None: the recipe's seed.
     """
     plan = recipe.name if recipe.scheme is None else f"{recipe.name}-{recipe.scheme}"
     return RUNS / f"{scenario.name}-{plan}-seed{recipe.seed if seed is None else seed}"

@@ -109,7 +109,7 @@ def safetensors_headers(data: bytes) -> dict[str, ArrayHeader]:
 
 
 def _lengths(shape: object) -> tuple[int, ...]:
-    """Convert a shape from JSON to a tuple; an invalid length becomes -1, which differs from every required length."""
+    """Convert a shape from JSON to a tuple; an invalid length becomes -1, which no required length equals."""
     return tuple(each if type(each) is int else -1 for each in (shape if isinstance(shape, list) else [None]))
 
 
@@ -199,7 +199,7 @@ def _npy_header(name: str, beginning: bytes) -> tuple[ArrayHeader, int]:
 
 
 def _check_directory(data: bytes) -> None:
-    """Raise ``ValueError`` unless ``data`` ends like a simple zip archive with a small directory.
+    """Raise ``ValueError`` unless ``data`` ends with a small zip directory, as a plain ``.npz`` archive does.
 
     Call this function before opening the archive, because a zip reader creates an object for every entry of the
     archive's directory.

@@ -29,7 +29,7 @@ class FileSchema(GenerateJsonSchema):
 
 
 def schema_lines(kind: str, command: str) -> str:
-    """Return comment lines for a new YAML file that name its JSON schema and the command that prints the schema.
+    """Return comment lines for a new YAML file; they name its JSON schema and the command that prints this schema.
 
     Args:
         kind: kind of the file, ``scenario`` or ``recipe``.

@@ -76,13 +76,14 @@ def require(holds: bool, at: YamlPath, value: Any, right: str) -> None:
 class Wording:
     """Texts for error messages about one kind of file.
 
-    A subclass may override ``needed``, ``instead``, ``owner`` and ``right`` with texts about the keys of this file.
+    A subclass may override ``needed`` (what to write for a missing key), ``instead`` (what to write instead of an
+    unknown key), ``owner`` (the vehicle or pair of a value) and ``right`` (what would be valid instead of a value).
 
     A *path* is a tuple of the keys and indices that lead to a value, for example ``("mixture", 0, "weight")``.
 
     Args:
         model: pydantic model of the file.
-        needed: text that says what must be written for a missing key; the same text for every key.
+        needed: text that says what must be written for a missing key; it is used for every missing key.
 
     """
 
@@ -90,7 +91,7 @@ class Wording:
         self.model, self._needed = model, needed
 
     def known(self, path: YamlPath) -> list[str]:
-        """Return the names of the keys that are allowed in place of the last key of ``path`` (keys and indices)."""
+        """Return the names of all keys that are possible in place of the last key of ``path`` (keys and indices)."""
         models = [self.model]
         for key in path[:-1]:
             inside = [model.model_fields[key].annotation for model in models if key in model.model_fields]
@@ -115,7 +116,7 @@ class Wording:
     def right(self, detail: ErrorDetails) -> str:
         """Return what would be valid instead of the value in ``detail`` (a mistake, as pydantic reports it).
 
-        If the text is empty, the error message uses a general text instead.
+        If the returned text is empty, the error message uses a general text instead.
         """
         return ""
 
@@ -189,7 +190,7 @@ def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
 class Mistake(NamedTuple):
     """The first mistake that pydantic found in data from a program.
 
-    ``str(mistake)`` is a text with the place of the mistake and what would be valid.
+    ``str(mistake)`` is a text that says where the mistake is and what would be valid.
     """
 
     place: str  # place of the mistake, keys joined by dots; empty if the data as a whole are invalid
@@ -201,7 +202,7 @@ class Mistake(NamedTuple):
 
 
 def first_mistake(error: ValidationError) -> Mistake:
-    """Return the first mistake in pydantic's ``error``, for files that programs write and for settings in code."""
+    """Return the first mistake in pydantic's ``error`` for a file that a program wrote, or for settings in code."""
     detail = error.errors(include_url=False)[0]
     right = {"missing": "is missing", "extra_forbidden": "is an unknown key"}.get(detail["type"])
     return Mistake(".".join(str(key) for key in path_of(detail)), detail["input"], right or _right(detail))
@@ -236,7 +237,7 @@ def _describe(detail: ErrorDetails, path: YamlPath, wording: Wording) -> str:
 def _show(detail: ErrorDetails) -> str:
     """Return the invalid value as text for the message, or an empty text if the whole file is invalid.
 
-    A float where a whole number is required is shown with its decimal point.
+    A float in place of a whole number is shown with its decimal point.
     """
     value = detail["input"]
     if isinstance(value, BaseModel) or not detail["loc"]:
@@ -282,7 +283,8 @@ def _right(detail: ErrorDetails) -> str:
 def suggestion(key: str, known: Iterable[str]) -> str:
     """Return a hint for an unknown ``key``: "did you mean ...?" or the key's new name; empty if no key is similar.
 
-    ``known``: the valid keys. A key with a wrong or missing unit is also recognised: ``gaps_km``, ``mass``.
+    ``known``: the valid keys. The function also recognises a valid key with a wrong or missing unit: ``gaps_km``,
+    ``mass``.
     """
     names = sorted(known)
     if new := new_name(key, names):

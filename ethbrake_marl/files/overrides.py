@@ -70,8 +70,8 @@ class Override:
 def _placed(part: Any, path: tuple[str, ...], override: Override) -> Any:
     """Return a copy of ``part`` (a mapping, list or other value) in which ``path`` has the value of ``override``.
 
-    ``path``: last keys of ``override.path``; if ``path`` is empty, the value replaces ``part``. Mappings that are
-    missing along the path are created.
+    ``path``: those last keys of ``override.path`` that lead from ``part`` to the value; if ``path`` is empty, the value
+    replaces ``part``. Mappings that are missing along the path are created.
     """
     if not path:
         return override.value

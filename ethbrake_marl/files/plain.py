@@ -30,9 +30,9 @@ def read_plain(
     The limit on the size also applies to a file that grows while it is read.
 
     Args:
-        path: path of the file.
+        path: path of the file to open or read.
         limit_bytes: largest accepted size of the file.
-        refusal: class of the error to raise; see ``open_plain``.
+        refusal: class of the error to raise if the file cannot be read; ``open_plain`` lists the cases.
         follow_links: whether a symbolic link is accepted.
 
     """
@@ -54,11 +54,11 @@ def open_plain(
     """Open a plain file of at most ``limit_bytes`` for reading, as a context manager.
 
     Kind and size of the file are checked before it is opened, so a pipe or device is not opened. Kind and size are
-    checked again after opening, in case another process has replaced the file. The function never waits for the file to
-    open.
+    checked again after opening, in case another process has replaced the file. The function does not wait if the file
+    cannot be opened at once.
 
     Args:
-        path: path of the file.
+        path: path of the file to open or read.
         limit_bytes: largest accepted size of the file.
         refusal: class of the error to raise if the file does not exist, is not a plain file, is too large, or cannot be
             read (also inside the block). The error message contains the path and the reason.

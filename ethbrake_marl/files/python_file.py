@@ -82,7 +82,7 @@ def _run(content: bytes, path: Path, sha256: str, what: str) -> ModuleType:
     Args:
         content: bytes of the file.
         path: resolved path of the file.
-        sha256: SHA-256 of the content, part of the module's name.
+        sha256: SHA-256 of the content, which becomes a part of the module's name.
         what: how error messages name the file.
 
     """

@@ -25,7 +25,7 @@ WIDE = 120  # smallest width of a terminal (characters) in which every column is
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """An estimate and its confidence interval; the interval is None if it cannot be computed (from one world)."""
+    """An estimate and its confidence interval; the interval is None if it cannot be computed, as for one world."""
 
     value: float  # estimated value
     interval: tuple[float, float] | None  # low and high end of the confidence interval
@@ -39,7 +39,7 @@ class Estimate:
         """Format the estimate and its confidence interval as text: ``24.19 [23.85, 24.53]``.
 
         Args:
-            digits: number of digits after the decimal point.
+            digits: number of digits after the decimal point in the text.
             scale: factor that multiplies all numbers, for example 100 for per cent.
             unit: text to put directly after the value, such as ``" %"``.
 
@@ -54,7 +54,7 @@ class Estimate:
     def side_by_side(estimates: Mapping[str, Estimate | None]) -> dict[str, Any]:
         """Convert estimates to a dictionary for JSON: ``{"x": 1.5, "x_interval": [1.0, 2.0]}``.
 
-        If the estimate ``x`` is None, both ``x`` and ``x_interval`` are None in the dictionary.
+        If the estimate ``x`` is None, the values of ``x`` and ``x_interval`` in the dictionary are None.
         """
         cells: dict[str, Any] = {}
         for name, estimate in estimates.items():
@@ -224,8 +224,8 @@ class Sheet:
     def markdown(self) -> str:
         """Return the table as Markdown, without title and note.
 
-        Because Markdown tables have no sections, the first cell of a row begins with the section's name:
-        ``Section: cell``.
+        Because Markdown tables have no sections, the name of the section stands at the beginning of each row's first
+        cell: ``Section: cell``.
         """
         columns, section = self._columns(), ""
         lines = [[column.heading for column in columns], ["---" if column.text else "---:" for column in columns]]
@@ -269,7 +269,9 @@ class Sheet:
         return "\n".join([*lines, "</tbody>", "</table></div>", *note])
 
     def json(self) -> list[dict[str, Any]]:
-        """Return one mapping per row: cells by column name, estimates with their intervals. Sections are omitted."""
+        """Return one mapping per row: name of a column -> cell; an estimate also has an entry for its confidence
+        interval. Sections are omitted.
+        """
         columns, rows = self._columns(), []
         for row in self.rows:
             cells = {} if isinstance(row, str) else dict(zip(columns, row, strict=False))
@@ -314,7 +316,7 @@ def csv_text(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = 
     values are written as empty cells.
 
     Args:
-        rows: rows, each a mapping from column names to values.
+        rows: rows of the table, each a mapping from column names to values.
         columns: names of the columns to write, in order, such as ``x_low``; None: all, in order of appearance.
 
     """
@@ -347,7 +349,7 @@ def parquet_file(
     installed.
 
     Args:
-        path: path of the new file.
+        path: path of the new Parquet file.
         told: function that is called at the end of the ``with`` block and returns metadata (key -> text) for the
             Parquet file; None: no metadata.
         **options: options of ``pyarrow.parquet.ParquetWriter``.

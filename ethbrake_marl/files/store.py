@@ -153,7 +153,9 @@ def remove_folder(path: Path) -> None:
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Delete temporary files that killed processes left in ``folder``, to which no other process may be writing."""
+    """Delete temporary files that killed processes left in ``folder``; no other process may be writing there
+    meanwhile.
+    """
     for left in folder.glob(f"{_HIDDEN}*{_UNFINISHED}"):
         if left.is_dir() and not left.is_symlink():
             shutil.rmtree(left)
@@ -187,7 +189,7 @@ def _refuse_existing(path: Path) -> None:
 
 
 def _folder_to_disk(path: Path) -> None:
-    """Write the entries of the folder ``path`` to disk, so that renames survive a power failure (POSIX only)."""
+    """Write the file list of the folder ``path`` to disk, so that new names survive a power failure (POSIX only)."""
     if os.name == "posix":
         descriptor = os.open(path, os.O_RDONLY)
         try:

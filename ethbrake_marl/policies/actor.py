@@ -48,18 +48,18 @@ class Actor:
     def choose(self, x: Float32s) -> NDArray[np.int64]:
         """Return the index (from 0) of the expert that the gating network selects for each observation, [rows].
 
-        ``x`` are observations, [F, rows].
+        ``x`` are observations of the policy, one per column, [F, rows].
         """
         chosen: NDArray[np.int64] = self._forward(self._gate, x).argmax(axis=0)
         return chosen
 
     def take(self, number: NDArray[np.int64], x: Float32s) -> Float32s:
-        """Return for each observation the action that belongs to the index in ``number``, [1, rows].
+        """Return for each observation the action that its entry of ``number`` selects, [1, rows].
 
         Args:
-            number: index of the chosen policy or action for each observation, [rows]. In ``number``, the first indices
-                (0, 1, ...) choose a policy in ``NetworkSpec.among``; the indices after them choose a fixed action.
-            x: observations, [F, rows].
+            number: index of the chosen policy or action for each observation, [rows]. The lowest values of ``number``
+                (0, 1, ...) choose a policy in ``NetworkSpec.among``; the values after them choose a fixed action.
+            x: observations of the policy, one per column, [F, rows].
 
         """
         actions = self._actions[np.newaxis, np.maximum(number - len(self._among), 0)]

@@ -26,7 +26,7 @@ class TensorRow(NamedTuple):
     shape: tuple[int, ...]  # length of each axis
 
     def inside(self, part: str) -> TensorRow:
-        """Return this row with ``part.`` in front of the tensor's name, for a tensor inside another policy."""
+        """Return this row with ``part.`` in front of the tensor's name, for a policy inside another policy."""
         return self._replace(name=f"{part}.{self.name}")
 
 
@@ -40,15 +40,16 @@ class NetworkSpec(FileModel):
     act without a critic.
 
     If ``networks`` is above 1, the policy is a mixture of experts. A mixture of experts has ``networks`` actors of the
-    same shape, and a gating network (hidden layers ``gate_hidden``) that scores the actors at every decision. The actor
-    with the highest score acts; if several actors have this score, the first of them acts. A mixture of experts has no
-    noise and no critic.
+    same shape, and a gating network (hidden layers ``gate_hidden``) that gives each actor a score at every decision.
+    The actor with the highest score acts; if several actors have the highest score, the first of them acts. A mixture
+    of experts has no noise and no critic.
 
     With output ``choice`` the actor computes a score for each of ``choices`` actions, which are evenly spaced from -1
-    to 1. The policy takes the action with the highest score; if several actions have this score, it takes the lowest of
-    these actions. A policy with output ``choice`` has no noise and no critic. The actor of a policy with output
-    ``choice`` may also score whole policies (``among``), which act on the same observation. In the actor's result, the
-    scores of the policies precede the scores of the actions.
+    to 1. The policy takes the action with the highest score; if several actions have the highest score, it takes the
+    lowest of these actions. A policy with output ``choice`` has no noise and no critic. The actor of a policy with
+    output ``choice`` may also compute a score for each of several other policies (``among``) that act on the same
+    observation; if a policy has the highest score, it chooses the action. In the actor's result, the scores of the
+    policies in ``among`` come before the scores of the fixed actions.
     """
 
     observation_size: Annotated[int, Field(ge=1, le=4096)]  # F, length of an observation
@@ -95,12 +96,12 @@ class NetworkSpec(FileModel):
 
     @property
     def actors(self) -> tuple[str, ...]:
-        """Prefix of the tensor names of each actor: ``("policy",)``, or ``("network_1", "network_2", ...)``."""
+        """Beginning of each actor's tensor names: ``("policy",)``, or ``("network_1", "network_2", ...)``."""
         return ("policy",) if self.networks == 1 else tuple(f"network_{m + 1}" for m in range(self.networks))
 
     @property
     def actions(self) -> Float32s:
-        """The fixed actions that the actor scores if ``output`` is ``choice``, [choices], from -1 to 1."""
+        """Fixed actions to which the actor gives scores if ``output`` is ``choice``, [choices], from -1 to 1."""
         levels: Float32s = np.linspace(-1.0, 1.0, self.choices or 0).astype(np.float32)
         return levels
 

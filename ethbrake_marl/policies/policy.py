@@ -59,12 +59,14 @@ class Policy:
         return Actor(self.manifest.network, self.tensors)
 
     def __call__(self, observation: Float32s) -> Float32s:
-        """Return the actions [n, A] in [-1, 1] for the observations [n, F], float32; no row depends on another."""
+        """Return the actions [n, A] in [-1, 1] for the observations [n, F], float32; each row is computed
+        independently.
+        """
         return self._actor(observation)
 
     @cached_property
     def observation(self) -> ObservationSpec:
-        """The observation on which this policy acts, with the time step of its training scenario.
+        """The policy's observation, with the time step of the scenario in which the policy was trained.
 
         Raises ``UnknownName`` if a feature does not exist any more.
         """
@@ -115,7 +117,7 @@ class Policy:
 
     @property
     def among(self) -> tuple[Policy, ...]:
-        """The policies among which this policy's network chooses (``NetworkSpec.among``); empty for most policies."""
+        """Policies among which the network of this policy chooses (``NetworkSpec.among``); empty for most policies."""
         follows = {"network", "observation", "format_version", "weights_sha256", "manifest_sha256"}
         fields = self.manifest.model_dump(exclude=follows)
         members = []

@@ -15,7 +15,7 @@ from ethbrake_marl.policies.policy import MANIFEST, Policy
 
 @dataclass(frozen=True)
 class PolicyTeam:
-    """Policies of several learners that were trained together, one policy for each learner."""
+    """Policies of several learners that were trained together, with one policy for each learner."""
 
     drivers: Mapping[str, Policy]  # vehicle name -> policy, front to rear: ``{"vehicle_2": policy, ...}``
 

@@ -132,7 +132,7 @@ BENCHMARK = (  # scenarios that ship with a table of best known harm, which the 
 
 
 def group_of_scenarios(name: str) -> list[str]:
-    """Return the names of the scenarios in a group: ``benchmark``, or a folder of shipped scenarios (``stress``).
+    """Return the names of the scenarios in a group; groups are ``benchmark`` and folders of shipped scenarios.
 
     The list is empty if ``name`` is not the name of a group.
     """
@@ -213,7 +213,7 @@ def _with_rows(document: Document, at: YamlPath, content: Any, folder: Path) -> 
     Args:
         document: file that contains the scenario, for error messages.
         at: keys and indices that lead to the scenario inside the document; ``()``: the whole document is the scenario.
-        content: content of the scenario.
+        content: content of the scenario as plain data.
         folder: folder to which the path of the table's file is relative.
 
     """

@@ -16,15 +16,16 @@ Vehicle i can react to the emergency from the time ``latency_i`` (in s after the
 
     latency_i = max(own latency_i, min(tau_i1, latency_(i-1) + hop_(i, i-1)))
 
-At the time ``latency_i`` the own latency of vehicle i has elapsed, and vehicle i has received the message of Vehicle 1
-or seen the vehicle ahead brake. Vehicle i knows the state of vehicle j from ``max(latency_i, tau_ij)`` on. If vehicle i
-also sees vehicle j, it knows the state of vehicle j from ``max(latency_i, min(tau_ij, hop_ij))`` on. If a vehicle
+At the time ``latency_i``, vehicle i's own latency has elapsed, and vehicle i has either received the message of Vehicle
+1 or seen the vehicle ahead brake. Vehicle i knows the state of vehicle j from ``max(latency_i, tau_ij)`` on. If vehicle
+i also sees vehicle j, it knows the state of vehicle j from ``max(latency_i, min(tau_ij, hop_ij))`` on. If a vehicle
 observes another vehicle's latency, it observes the *own* latency of that vehicle, which does not include delays of the
-channel. Under the preset ``paper`` a vehicle knows everything as soon as its own latency has elapsed.
+channel. Under the preset ``paper`` a vehicle knows the state of every vehicle as soon as its own latency has elapsed.
 
 With ``persistence: first``, vehicle i knows the present state of vehicle j after the first message. With ``persistence:
-periodic``, vehicle j sends a message in every period T, and the same Gilbert-Elliott channel may lose it. Vehicle i
-then knows the state of vehicle j that the newest arrived message contains (``physics.messages``).
+periodic``, vehicle j sends a message in every message period T, and each message may be lost in a burst of the link's
+Gilbert-Elliott channel. Vehicle i then knows the state of vehicle j that is contained in the newest message that has
+arrived (``physics.messages``).
 """
 
 from __future__ import annotations
@@ -361,13 +362,13 @@ class V2X(FileModel):
 
     @staticmethod
     def width(vehicles: int) -> int:
-        """Return how many uniform numbers one world needs for all links of a line of ``vehicles`` vehicles."""
+        """Return how many uniform numbers one world needs for all links in a line of ``vehicles`` vehicles."""
         return PER_LINK * vehicles * vehicles
 
     def with_news(self, vehicles: Vehicles, u: Floats, equipped: Equipped) -> Vehicles:
         """Return ``vehicles`` with the channel's delays in the latencies, and times from which each knows the others.
 
-        The argument ``vehicles`` must contain latencies without delays of a channel; these latencies become
+        The argument ``vehicles`` must contain latencies that do not include delays of a channel; these latencies become
         ``own_latency_s`` of the result.
 
         Args:
@@ -387,7 +388,7 @@ class V2X(FileModel):
         return replace(vehicles, latency_s=latency, known_from_s=known)
 
     def heard_and_seen(self, u: Floats, equipped: Equipped) -> tuple[Floats, Floats]:
-        """Return (heard, seen): the time from which i can use the first message of j, and the delay until i sees j.
+        """Return (heard, seen): time from which vehicle i can use the first message of j, and delay until i sees j.
 
         Here i and j are vehicles; ``heard`` and ``seen`` have the shape [n, N, N] (world, i, j) and the unit s.
         Infinite means never.
@@ -410,10 +411,10 @@ class V2X(FileModel):
         return heard, np.where(in_sight[channel.senses], hop, np.inf)
 
     def with_channel(self, worlds: Worlds, u: Floats, key: Floats, time_step_s: float, equipped: Equipped) -> Worlds:
-        """Return ``worlds`` with the times from which each vehicle knows the others, and with the periodic messages.
+        """Return ``worlds`` with the times from which each vehicle knows every other, and with the periodic messages.
 
         Args:
-            worlds: worlds at the alert (time 0) that do not contain data of a channel yet.
+            worlds: worlds at the alert (time 0) that do not yet contain delays or messages of a channel.
             u: uniform numbers in [0, 1) that draw the random values of all links, [n, N * N * PER_LINK].
             key: number in [0, 1) for each world, [n], from which the random losses of all messages after the first one
                 are computed.
@@ -438,7 +439,7 @@ class V2X(FileModel):
         """Return the user's ``worlds`` with this channel's data added; raise ``InvalidInput`` if the channel is random.
 
         Args:
-            worlds: worlds that do not contain data of a channel yet.
+            worlds: worlds that do not yet contain delays or messages of a channel.
             time_step_s: time between two decisions (s).
             where: beginning of the error message, which says where the user gave the worlds.
             equipped: V2X equipment of the vehicles, in one row for all worlds; None if the equipment differs randomly
@@ -465,9 +466,9 @@ def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
     computed without logarithms, so every machine gets the same k.
 
     Args:
-        u: uniform numbers in [0, 1).
+        u: uniform numbers in [0, 1); from each of them one number k is computed.
         loss_begins: probability p per message period that a burst of losses begins.
-        loss_ends: probability r per message period that a burst of losses ends.
+        loss_ends: probability r that an ongoing burst of losses ends in one message period.
 
     """
     bound = loss_begins / (loss_begins + loss_ends)
@@ -486,7 +487,7 @@ def link_delays(channel: Channel, u: Floats) -> Floats:
     With the timing ``latency`` the delay is minus infinity: a vehicle knows everything after its own latency.
 
     Args:
-        channel: settings of the channel.
+        channel: settings of the V2X channel.
         u: uniform numbers in [0, 1) for each link, [..., PER_LINK].
 
     """

@@ -1,7 +1,7 @@
 """Checks of a scenario that concern several fields together.
 
-Each check raises a pydantic error for the first mistake that it finds. The error contains the invalid value and its
-path (keys and indices) inside the file.
+Each check raises a pydantic error for the first mistake that the check finds. The error contains the invalid value and
+its path (keys and indices) inside the file.
 """
 
 from __future__ import annotations
@@ -146,7 +146,8 @@ def _check_derived(scenario: ScenarioFields) -> None:
 def _check_scripts(scenario: ScenarioFields) -> None:
     """Raise an error if a script exceeds the capacity of its vehicle, or if vehicle_1 learns without an obstacle ahead.
 
-    Also raise an error if early impacts are rejected and a script depends on the state.
+    Also raise an error if the scenario rejects early impacts (impacts before the first learner can act) and a script
+    depends on the state.
     """
     for i, script in scenario.scripts.items():
         deceleration = ScriptSpec.parse(script).hardest_mps2 or 0.0

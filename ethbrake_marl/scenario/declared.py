@@ -177,7 +177,8 @@ class ScenarioFields(FileModel):
     def _needed(cls, value: Any, info: ValidationInfo) -> Any:
         """Raise an error if a quantity has neither a value nor a default.
 
-        No value is needed if every vehicle type, or the table, declares the quantity, or if the scenario is a mixture.
+        The scenario needs no value of a quantity if every vehicle type, or the table, declares the quantity, or if the
+        scenario is a mixture.
         """
         key, data = str(info.field_name), info.data
         kinds = data.get("vehicle_types")
@@ -224,7 +225,7 @@ class ScenarioFields(FileModel):
     @field_validator("table")
     @classmethod
     def _columns_of_line(cls, value: Table | None, info: ValidationInfo) -> Table | None:
-        """Check that each column of the table fits the number of vehicles, and has only numbers in range."""
+        """Check that each column of the table fits the number of vehicles, and that all its numbers are in range."""
         if value is None or "vehicles" not in info.data:
             return value
         known = columns_of_table({**QUANTITY.usual, **QUANTITY.optional}, info.data["vehicles"])
@@ -242,7 +243,9 @@ class ScenarioFields(FileModel):
     @field_validator(*QUANTITY.declared)
     @classmethod
     def _entries(cls, value: Any, info: ValidationInfo) -> Any:
-        """Check that every possible value of a quantity is in range, and that a list has one per vehicle or pair."""
+        """Check that all possible values of a quantity are in range, and that a list has one value per vehicle or
+        pair.
+        """
         rule, vehicles = QUANTITY.declared[str(info.field_name)], info.data.get("vehicles")
         if value is None:
             return value
@@ -323,7 +326,7 @@ class ScenarioFields(FileModel):
         return {i: role for i, role in enumerate(roles) if role != LEARNER}
 
     def play_pieces(self, worlds: Worlds, driven: Sequence[int] = ()) -> Worlds:
-        """Return ``worlds`` with the commands over time of each vehicle that follows a ``profile`` script.
+        """Return ``worlds`` with the accelerations over time of each vehicle that follows a ``profile`` script.
 
         ``driven``: indices (from 0) of controlled vehicles, which follow no script.
         """
@@ -386,8 +389,8 @@ class ScenarioFields(FileModel):
     def equipped(self, types: Ints | None = None) -> Equipped:
         """Return the V2X equipment of vehicles with the types ``types`` (indices of vehicle types, [n, N]).
 
-        If ``types`` is None, the result has one row, [1, N]: for each vehicle the least equipment of all its possible
-        types.
+        If ``types`` is None, the result has one row, [1, N]: for each vehicle the least equipment among all its
+        possible types.
         """
         line, each = self.types_of_line, []
         own = self.v2x.vehicles or {}
@@ -409,8 +412,8 @@ class ScenarioFields(FileModel):
 
         An example is ``({0: 2.0, 1: 9.5}, ...)`` for ``mass_t``. The keys of a mapping are the indices of the vehicle's
         possible types; without vehicle types the only key is 0. If a vehicle type does not declare the quantity, the
-        mapping has the scenario's general declaration for this type. Raises the same errors as the method
-        ``quantities``.
+        mapping has the scenario's declaration outside ``vehicle_types`` for this type. Raises the same errors as the
+        method ``quantities``.
         """
         line = self.types_of_line
         if line is None or field not in QUANTITY.of_a_type:
@@ -425,7 +428,7 @@ class ScenarioFields(FileModel):
         return tuple(quantities)
 
     def supports(self, field: str) -> tuple[tuple[float, float], ...]:
-        """Return (smallest, largest) value of the quantity ``field`` for each vehicle, pair or world.
+        """Return (smallest, largest) possible value of the quantity ``field`` for each vehicle, pair or world.
 
         The range of a vehicle includes the values of all its possible types.
         """
@@ -457,7 +460,7 @@ class ScenarioFields(FileModel):
         return tuple(self.table_entries.get((field, i), entry) for i, entry in enumerate(entries))
 
     def bounds(self, field: str, *, dry: bool = False) -> tuple[tuple[float, float], ...]:
-        """Return (smallest, largest) value of a declared or derived quantity for each vehicle, pair or world.
+        """Return (smallest, largest) possible value of a declared or derived quantity for each vehicle, pair or world.
 
         Args:
             field: key of a quantity that every world has: ``gaps_m``, ``speeds_mps``, ``mass_t``, ...
@@ -484,8 +487,8 @@ def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]
     """Compute all quantities of k worlds from the declared quantities: key -> values, [k, entries].
 
     Derived quantities are ``speed = line speed + own deviation``, ``gap = time gap x speed of the pair's rear vehicle``
-    and ``latency = own latency + time of the alert``. The derived quantities increase with the declared ones, so bounds
-    of declared quantities give bounds of derived ones.
+    and ``latency = own latency + time of the alert``. Every derived quantity increases if a declared quantity
+    increases, so bounds of the declared quantities give bounds of the derived quantities.
 
     Args:
         scenario: the scenario that declares the quantities.
@@ -507,7 +510,7 @@ def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]
 
 
 def on_road(found: Mapping[str, Floats]) -> dict[str, Floats]:
-    """Return ``found`` with all braking and driving capacities limited to friction times gravity.
+    """Return the quantities ``found``, with all braking and driving capacities limited to friction times gravity.
 
     ``found`` maps keys such as ``"friction"`` and ``"braking_capacity_mps2"`` to values, [k, entries]. If ``found`` has
     no key ``"friction"``, the capacities are not limited.
@@ -540,7 +543,7 @@ def obstacle_gap(
 
 
 def _supports_of(scenario: ScenarioFields) -> Callable[[str], Floats]:
-    """Return a function that maps a key to the smallest and largest value per vehicle or pair, [2, entries]."""
+    """Return a function: key of a quantity -> smallest and largest value for each vehicle or pair, [2, entries]."""
     return lambda key: np.array(scenario.supports(key)).T
 
 

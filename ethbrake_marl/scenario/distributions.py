@@ -117,7 +117,9 @@ class Normal(_Distribution):
         return self
 
     def _bounds(self) -> tuple[float, float]:
-        """Return the probabilities that a value before truncation is below ``low``, and that it is below ``high``."""
+        """Return the probabilities that a value of the untruncated distribution is below ``low``, and below
+        ``high``.
+        """
         shape = self.normal
         low, high = (normal_probability((end - shape.mean) / shape.sd) for end in (shape.low, shape.high))
         return low, high
@@ -131,8 +133,8 @@ class Normal(_Distribution):
         """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
 
         A value is ``mean + sd Q(p_low + (p_high - p_low) u)``, where Q is the quantile function of the standard normal
-        distribution. The numbers p_low and p_high are the probabilities that a value before truncation is below
-        ``low``, and below ``high``.
+        distribution. The numbers p_low and p_high are the probabilities that a value of the untruncated normal
+        distribution is below ``low``, and below ``high``.
         """
         shape = self.normal
         below, above = self._bounds()
@@ -295,7 +297,7 @@ class WithLoad(_Distribution):
         return min(self.with_load) + low, max(self.with_load) + high
 
     def value(self, load: Floats, u: Floats) -> Floats:
-        """Return ``empty + (full - empty) load``, plus an amount that ``u`` draws from ``spread``.
+        """Return ``empty + (full - empty) load``, plus the value of the distribution ``spread`` for ``u``.
 
         The array ``load`` (loads in [0, 1]), the array ``u`` (uniform numbers in [0, 1)) and the result have the same
         shape.

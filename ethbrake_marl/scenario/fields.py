@@ -83,7 +83,9 @@ class QuantityRule:
         return {"vehicle": vehicles, "pair": vehicles - 1, "world": 1}[self.per]
 
     def place(self, index: int) -> Place:
-        """Return (stream, column) of the random number that draws the value of vehicle or pair ``index`` (from 0)."""
+        """Return which random number draws the value of vehicle or pair ``index`` (from 0): (stream, column of the
+        stream).
+        """
         return self.stream, BLOCK * (self.block + index) + self.slot
 
     def column_of(self, index: int) -> str:
@@ -93,7 +95,7 @@ class QuantityRule:
     def owner(self, index: int) -> str:
         """Return the name of vehicle or pair ``index`` (from 0): ``vehicle_1``, or ``vehicle_1 to vehicle_2``.
 
-        The name is empty for a quantity with one value per world.
+        The returned name is empty for a quantity with one value per world.
         """
         front = f"vehicle_{index + 1}"
         return {"vehicle": front, "pair": f"{front} to vehicle_{index + 2}", "world": ""}[self.per]
@@ -267,7 +269,7 @@ Entry = tuple[str, int]  # quantity and index (from 0) of the vehicle or pair
 
 
 def columns_of_table(rules: Mapping[str, QuantityRule], vehicles: int) -> dict[str, Entry]:
-    """Return the columns of a table that has the quantities in ``rules``: column name -> (key of the quantity, index).
+    """Return the columns of a table of the quantities ``rules``: name -> (key of quantity, index of vehicle or pair).
 
     An example is ``{"gap_1_m": ("gaps_m", 0), ...}``.
 

@@ -1,4 +1,4 @@
-"""``Follower``: an additional vehicle behind the last vehicle of a scenario, at the same speed."""
+"""``Follower``: an additional vehicle behind the last vehicle of a scenario, with the speed of that last vehicle."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ethbrake_marl.scenario.fields import QUANTITY
 
 
 class Follower(FileModel):
-    """An additional vehicle behind the last vehicle, at the same speed, which brakes fully after its latency.
+    """An additional vehicle behind the last vehicle, with the same speed; it brakes fully after its latency.
 
     The default latency (0.75 s) and braking capacity (0.774 g) are those of the competent driver in UN Regulation 157.
     The default time gap (0.6 s) is our choice. The follower's brakes act at once, but the regulation's driver needs
@@ -31,9 +31,10 @@ class Follower(FileModel):
 def with_follower(document: Document, build: Callable[[Document], Any]) -> Document:
     """Return the document with the follower as one more vehicle of the line, and without the key ``follower``.
 
-    In the result, tables and lists also have entries for the follower. If the follower is invalid, the document is
-    returned unchanged, and the schema rejects the document later. Raises ``InvalidInput`` if the line of vehicles is
-    invalid, if vehicle types are declared, or if the speed of the last vehicle is random and not a column of the table.
+    In the returned document, the table and all lists also have entries for the follower. If the follower is invalid,
+    the document is returned unchanged, and the schema rejects the document later. Raises ``InvalidInput`` if the line
+    of vehicles is invalid, if vehicle types are declared, or if the speed of the last vehicle is random and not a
+    column of the table.
 
     Args:
         document: parsed file with a key ``follower``.

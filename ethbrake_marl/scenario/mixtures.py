@@ -40,11 +40,11 @@ def build_members(
 ) -> tuple[Document, tuple[AnyScenario, ...]]:
     """Build the scenarios listed under the key ``mixture``; return the completed document and these scenarios.
 
-    Keys that stand beside ``mixture`` in the file replace the same keys in every listed scenario. Shared settings, such
-    as ``vehicles``, are added to the document if all scenarios have the same value. If the list is invalid, the
-    function returns the unchanged document and no scenarios, and the schema rejects the document later. Raises
-    ``InvalidInput`` naming the invalid scenario, or the key that must have the same value in all scenarios but does
-    not.
+    Keys that stand beside ``mixture`` in the file replace the same keys in every listed scenario. If all scenarios have
+    the same value of a setting such as ``vehicles`` or ``v2x``, this value is added to the document. If the list under
+    ``mixture`` is invalid, the function returns the unchanged document and no scenarios, and the schema rejects the
+    document later. Raises ``InvalidInput`` if one of the scenarios is invalid, or if the scenarios have different
+    values for a key that they must share; the message names the scenario or the key.
 
     Args:
         document: parsed file with a key ``mixture``.
@@ -86,7 +86,7 @@ def _member_document(document: Document, i: int, entry: Mapping[str, Any], besid
     Args:
         document: parsed file of the mixture.
         i: position of the scenario in the list ``mixture``, from 0.
-        entry: content of the mixture's list at this position.
+        entry: content of this entry of the list ``mixture``.
         beside: keys and values that stand beside ``mixture`` in the file; they replace the same keys of the scenario.
 
     """

@@ -39,7 +39,8 @@ class Ranges:
     def sample(self, points: Floats) -> tuple[Sample, Bools]:
         """Return the worlds at ``points`` of the unit cube, and whether the scenario accepts each world, [n].
 
-        A world is not accepted if it has an early impact and the scenario says ``early_impacts: reject``.
+        A world is not accepted if the scenario says ``early_impacts: reject`` and an impact happens in this world
+        before the first learner can act.
 
         Args:
             points: coordinates of n points in [0, 1), in the order of ``names``, [n, coordinates].
@@ -58,7 +59,7 @@ class Ranges:
 
 
 def _of_quantities(scenario: ScenarioFields) -> dict[str, Place]:
-    """Return which uniform number draws each random quantity: name -> (stream of random numbers, column)."""
+    """Return which uniform number determines each random quantity: name -> (stream, column of the stream)."""
     used: list[str] = []
 
     def note(key: str) -> Floats:
@@ -79,7 +80,7 @@ def _of_quantities(scenario: ScenarioFields) -> dict[str, Place]:
 
 
 def _of_types(scenario: ScenarioFields) -> dict[str, Place]:
-    """Return which uniform numbers draw types and loads: name -> (stream of random numbers, column of the stream).
+    """Return which uniform numbers determine types and loads of vehicles: name -> (stream, column of the stream).
 
     Random numbers without effect are left out: the number that draws a vehicle's type if only one type is possible, and
     the number that draws its load if no quantity depends on the load.
@@ -110,7 +111,7 @@ def ranges(scenario: ScenarioFields) -> Ranges:
     """Return the coordinates of the scenario's unit cube, one for every random number of a world.
 
     Raises ``InvalidInput`` if the scenario has nothing random, if it is a mixture, or if its channel is not ``paper``.
-    In a mixture, or with another channel, a point of the unit cube would not determine a world.
+    In a mixture, or with a channel other than ``paper``, a point of the unit cube would not determine a world.
     """
     if scenario.members:
         members = ", ".join(member.name for member in scenario.members)

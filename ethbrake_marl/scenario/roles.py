@@ -41,8 +41,9 @@ class ScriptSpec(NamedTuple):
     def parse(spec: str) -> ScriptSpec:
         """Parse ``spec``, a text ``name[:argument]``.
 
-        Raises ``InvalidInput`` unless the name matches ``[a-z][a-z0-9_@.-]*`` and the argument has no spaces. Also
-        raises ``InvalidInput`` for a Python file, because loading somebody else's scenario must not run code.
+        Raises ``InvalidInput`` unless the name matches ``[a-z][a-z0-9_@.-]*`` and the argument has no spaces.
+        ``InvalidInput`` is also raised if ``spec`` names a Python file, because loading somebody else's
+        scenario must not run code.
         """
         match = _SPEC.fullmatch(spec) if isinstance(spec, str) else None
         if match is None:
@@ -91,9 +92,9 @@ class ScriptSpec(NamedTuple):
         return max(braking for _, braking in self.pieces) if self.name == _PROFILE else self.deceleration_mps2
 
     def is_state_free(self) -> bool:
-        """Return whether the script does not need the state: ``full_brake``, ``coast``, ``constant:a`` or a profile.
+        """Return whether the script ignores the state; True for ``full_brake``, ``coast``, ``constant:a`` and profiles.
 
-        Raises ``InvalidInput`` if the argument of such a script is missing, invalid or not allowed.
+        Raises ``InvalidInput`` if one of these four scripts has a missing, invalid or forbidden argument.
         """
         if self.name == _PROFILE:
             return len(self.pieces) > 0

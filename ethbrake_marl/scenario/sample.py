@@ -28,7 +28,7 @@ def clusters_of(kinds: Mapping[str, _Texts], index: Ints) -> _Texts | None:
     if these worlds contain different vehicles. In a mixture, a world without a recording is a cluster of its own.
 
     Args:
-        kinds: texts about each world, such as ``Sample.kinds``: name of the column -> texts, [n].
+        kinds: texts about each world, in the form of ``Sample.kinds``: name of the column -> texts, [n].
         index: number of each world in its list, [n].
 
     """
@@ -70,8 +70,8 @@ class Sample:
     def join(parts: Sequence[Sample], rejected: int) -> Sample:
         """Join samples into one, in the order of their world numbers.
 
-        Vehicle types must be in all samples of ``parts`` or in none; the same applies to scenarios and to recordings.
-        ``rejected``: number of rejected draws, which becomes ``Sample.rejected``.
+        Either all samples in ``parts`` have vehicle types, or no sample has; the same applies to scenarios and to
+        recordings. ``rejected``: number of rejected draws, which becomes ``Sample.rejected``.
         """
         index = np.concatenate([part.index for part in parts])
         order = np.argsort(index)
@@ -103,7 +103,7 @@ class Sample:
         """Return a text with the number of worlds for each scenario of a mixture and each vehicle type.
 
         An example is ``"; vehicle_1_type: car 7, truck 3"``. For the column ``recording``, the text contains only the
-        number of different recordings. The text is empty if the sample has no ``kinds``.
+        number of different recordings. The returned text is empty if the sample has no ``kinds``.
         """
         text = ""
         for kind, column in self.kinds.items():

@@ -60,7 +60,8 @@ def sample(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, chann
             list for training; the two lists are independent.
 
     Raises ``InvalidInput`` for a negative ``seed`` or ``first``, and for ``n < 1``. If the scenario rejects early
-    impacts, ``InvalidInput`` is also raised for a world that has an early impact in each of ``MOST_ATTEMPTS`` draws.
+    impacts (impacts before the first learner can act), ``InvalidInput`` is also raised for a world that has an early
+    impact in each of ``MOST_ATTEMPTS`` draws.
 
     """
     for name, value, least in (("number of worlds", n, 1), ("seed of the list", seed, 0), ("first world", first, 0)):
@@ -93,7 +94,7 @@ def sample(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, chann
 def members_of(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Ints:
     """Return, for each world of a mixture, the index in ``scenario.members`` of the world's scenario, [n].
 
-    All indices are 0 if the scenario is not a mixture. The arguments have the same meaning as in ``sample``.
+    All returned indices are 0 if the scenario is not a mixture. The arguments have the same meaning as in ``sample``.
     """
     cumulative = np.cumsum([member.weight for member in scenario.mixture or ()] or [1.0])
     u = uniform_numbers(seed, channel, 0, first, n, OF_WORLD, of=MIXTURE)[:, 0]
@@ -108,7 +109,7 @@ def middle_world(scenario: ScenarioFields) -> Worlds:
 
 
 def sample_by(scenario: ScenarioFields, numbers: Callable[[int, tuple[int, ...]], Floats], index: Ints) -> Sample:
-    """Return the worlds drawn with the random numbers that ``numbers`` returns; keep worlds with early impacts.
+    """Return the worlds drawn with the random numbers that ``numbers`` returns; early impacts are not rejected.
 
     Args:
         scenario: the scenario to draw from; it must not be a mixture.
@@ -145,7 +146,7 @@ def sample_by(scenario: ScenarioFields, numbers: Callable[[int, tuple[int, ...]]
 def drawn_quantities(
     scenario: ScenarioFields, numbers: Callable[[int, tuple[int, ...]], Floats], typed: tuple[Ints, Floats] | None
 ) -> Callable[[str], Floats]:
-    """Return a function that maps the key of a declared quantity to its values in n worlds, [n, entries].
+    """Return a function: key of a declared quantity -> values of this quantity in n worlds, [n, entries].
 
     A quantity has one entry per vehicle, per pair or per world; ``fields.QUANTITY`` says which.
 
@@ -189,8 +190,8 @@ def uniform_numbers(
     ``first + k``. Each number is the upper 53 bits of a 64-bit integer from the Philox generator, divided by 2^53.
 
     Args:
-        seed: seed of the list.
-        channel: ``"list"`` or ``"training"``.
+        seed: seed of the list of worlds.
+        channel: ``"list"`` (worlds for evaluation) or ``"training"``.
         attempt: number of the draw, from 0; a rejected world is drawn again with the next attempt number.
         first: number of the first world in the list, from 0.
         n: number of worlds.
@@ -210,8 +211,8 @@ def uniform_numbers(
 def _draw_numbers(scenario: ScenarioFields, index: Ints, seed: int, channel: Channel) -> Sample:
     """Return the worlds whose numbers in the scenario's list are ``index`` (ascending, [n]).
 
-    Worlds with early impacts are drawn again if the scenario says ``early_impacts: reject``. ``seed`` and ``channel``
-    have the same meaning as in ``sample``.
+    Worlds in which an impact happens before the first learner can act are drawn again if the scenario says
+    ``early_impacts: reject``. ``seed`` and ``channel`` have the same meaning as in ``sample``.
     """
     drawn = _draw(scenario, seed, channel, 0, index)
     if scenario.early_impacts == "keep" or not scenario.learners:
@@ -225,8 +226,9 @@ def _draw_numbers(scenario: ScenarioFields, index: Ints, seed: int, channel: Cha
 def early_impact(scenario: ScenarioFields, worlds: Worlds) -> Bools:
     """Return for each world whether an impact happens no later than the time at which the first learner can act, [n].
 
-    No learner can prevent this impact, because learners coast until the first learner can act, and the other vehicles
-    follow their scripts. Raises ``InvalidInput`` if a script depends on the state. The scenario must have a learner.
+    No learner can prevent this impact, because all learners coast until the first learner can act, and the other
+    vehicles follow their scripts. Raises ``InvalidInput`` if a script depends on the state. The scenario must have a
+    learner.
     """
     vehicles = worlds.vehicles
     command = np.zeros(worlds.speeds_mps.shape)
@@ -250,10 +252,11 @@ def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, drawn: Sample
 
     Args:
         scenario: the scenario to draw from.
-        seed: seed of the list.
-        channel: ``"list"`` or ``"training"``.
+        seed: seed of the list of worlds.
+        channel: ``"list"`` (worlds for evaluation) or ``"training"``.
         drawn: the sample of all worlds, as drawn in the first attempt.
-        early: mask [n]: True for each world in ``drawn`` that is rejected because of an early impact.
+        early: mask [n]: True for each world in ``drawn`` that is rejected because of an early impact (an impact before
+            the first learner can act).
 
     """
     parts, pending, rejected = [drawn.take(~early)], drawn.index[early], int(early.sum())
@@ -272,9 +275,9 @@ def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, drawn: Sample
 
 
 def _redraw_one(scenario: ScenarioFields, seed: int, channel: Channel, index: Ints) -> None:
-    """Raise ``InvalidInput`` if the world with the number ``index`` [1] has an early impact in all remaining attempts.
+    """Raise ``InvalidInput`` if world number ``index`` [1] has an early impact in all remaining attempts to draw it.
 
-    If a scenario has no acceptable worlds, repeated draws of a single world show this sooner than draws of the whole
+    If no world of a scenario is acceptable, repeated draws of a single world show this sooner than draws of the whole
     list. ``seed`` and ``channel`` have the same meaning as in ``sample``.
     """
     for attempt in range(_PATIENCE, MOST_ATTEMPTS):
@@ -293,7 +296,7 @@ def _unusable(scenario: ScenarioFields, world: int) -> InvalidInput:
 
 
 def _draw(scenario: ScenarioFields, seed: int, channel: Channel, attempt: int, index: Ints) -> Sample:
-    """Draw each world whose number is in ``index`` (ascending, [n]) once; keep worlds that have an early impact.
+    """Draw each world whose number is in ``index`` (ascending, [n]) once; do not reject any world for an early impact.
 
     ``attempt``: number of earlier draws of these worlds; every attempt uses other random numbers. ``seed`` and
     ``channel`` have the same meaning as in ``sample``.

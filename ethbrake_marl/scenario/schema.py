@@ -32,12 +32,12 @@ _DISTRIBUTION = (
 
 
 class ScenarioWording(Wording):
-    """Texts of the error messages about a scenario, or part of one."""
+    """Texts for error messages about the content of a scenario file."""
 
     def instead(self, key: str) -> str:
         """Return a hint for an unknown key that people often try: another word for friction, or the slope of the road.
 
-        For any other key the hint is empty.
+        For any other unknown key the hint is empty.
         """
         if "friction" in key or key == "mu":
             return "declare the friction of the road with the key friction, for instance friction: 0.5"
@@ -81,10 +81,11 @@ class ScenarioWording(Wording):
         return rule.owner(path[1]) if rule is not None and isinstance(path[1], int) else ""
 
     def right(self, detail: ErrorDetails) -> str:
-        """Return a text that says what an invalid quantity, or an invalid scenario of a mixture, must be.
+        """Return a text that says what would be valid instead of an invalid quantity or an invalid scenario of a
+        mixture.
 
-        For a misspelt distribution, the text contains a suggestion. For any other invalid value, the text is empty.
-        ``detail``: one mistake, as pydantic reports it.
+        For a misspelt distribution, the text contains a suggestion. For any other invalid value, the returned text is
+        empty. ``detail``: one mistake, as pydantic reports it.
         """
         if detail["type"] == "quantity":
             return f"must be a number, {_DISTRIBUTION}{_misspelt(detail['input'])}"
@@ -157,8 +158,8 @@ class Scenario(ScenarioFields):
         """Return worlds ``first`` to ``first + n - 1`` of the endless list of worlds that belongs to ``seed``.
 
         World k of the list is always the same, bit for bit. ``channel``: ``"list"`` (worlds for evaluation) or
-        ``"training"``, two independent lists. Raises ``InvalidInput`` for an invalid ``n``, ``seed`` or ``first``. See
-        ``sampling.sample``.
+        ``"training"``; the two lists of worlds are independent. Raises ``InvalidInput`` for an invalid ``n``, ``seed``
+        or ``first``. See ``sampling.sample``.
         """
         return sample(self, n, seed, first=first, channel=channel)
 
@@ -169,7 +170,7 @@ class Scenario(ScenarioFields):
     def content(self, without: Collection[str]) -> dict[str, Any]:
         """Return every value of the scenario, including defaults, as plain data, except the keys in ``without``.
 
-        The content of a mixture includes the values of its scenarios, without title, description and source.
+        The content of a mixture includes the content of its scenarios, but not their titles, descriptions and sources.
         """
         content = self.model_dump(mode="json", exclude=set(without))
         if self.mixture is not None and self.members:
@@ -183,8 +184,8 @@ class Scenario(ScenarioFields):
         """Return a copy of the scenario with changed values, for example ``replace(mass_t=2.0)``.
 
         If ``changes`` declares gaps or speeds by another key, such as ``time_gaps_s``, the old key (``gaps_m``) is
-        removed. In a mixture the values change in every scenario. Raises ``InvalidInput`` if the result is not a valid
-        scenario.
+        removed. If the scenario is a mixture, the values change in each of its scenarios. Raises ``InvalidInput`` if
+        the result is not a valid scenario.
         """
         return Scenario(**changed_content(self.declared(), changes))
 
@@ -249,13 +250,13 @@ def _reference(key: str) -> dict[str, Any]:
 
 
 def _range(key: str, low: float, high: float, positive: bool = False) -> dict[str, Any]:
-    """Return the JSON schema of a quantity that allows only numbers in its range, also in distributions and lists.
+    """Return the JSON schema of a quantity; it allows only numbers in the given range, also in distributions and lists.
 
     Args:
-        key: key of the quantity.
-        low: smallest allowed value.
-        high: largest allowed value.
-        positive: True: the value ``low`` itself is not allowed.
+        key: key of the quantity whose schema is returned.
+        low: smallest allowed value of the quantity.
+        high: largest allowed value of the quantity.
+        positive: True: the quantity must be above ``low``; False: it may also equal ``low``.
 
     """
     limits = {"exclusiveMinimum" if positive else "minimum": low, "maximum": high}

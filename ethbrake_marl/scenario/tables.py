@@ -113,7 +113,7 @@ def _fixed(scenario: ScenarioFields, field: str, index: int, full: Mapping[str, 
         scenario: the scenario that declares the quantity.
         field: key of the quantity, such as ``"gaps_m"``.
         index: index of the vehicle or pair, from 0.
-        full: quantities that are already known: key -> values in the n worlds, [n, entries].
+        full: quantities that are known already: key -> values in the n worlds, [n, entries].
 
     """
     if field == "obstacle_gap_m":
@@ -144,7 +144,7 @@ def _require_all(good: Bools, naming: _Naming, entry: Entry, column: Floats, rig
     Args:
         good: mask [n]: True for each world in which the value is valid.
         naming: whether error messages name a value by column and row, or by key and index.
-        entry: key of the value's quantity, and index of its vehicle or pair.
+        entry: key of the quantity, and index of the vehicle or pair, to which the checked values belong.
         column: the value of one quantity of one vehicle or pair in each world, [n].
         right: what would be valid, for the error message.
 
@@ -188,7 +188,7 @@ def _numbers(what: str, value: ArrayLike) -> Floats:
 
 
 def _read_csv(file: Path) -> tuple[list[str], list[list[str]], list[int]]:
-    """Return the header of a CSV file, its rows (at least one), and the number of the line on which each row begins.
+    """Return the header of a CSV file, its rows (at least one), and the line number at which each row begins.
 
     The cells of the rows are unchecked texts.
     """
@@ -220,10 +220,10 @@ def _cell_at(file: Path, header: list[str], row: list[str], line: int, column: s
 
     Args:
         file: path of the file, for error messages.
-        header: names of all columns.
-        row: texts of the row's cells.
-        line: number of the line on which the row begins, for error messages.
-        column: name of the column to read.
+        header: names of all columns of the CSV file, in order.
+        row: texts of the cells in one row of the CSV file.
+        line: number of the line on which this row begins, for error messages.
+        column: name of the column whose value is returned.
 
     """
     if len(row) != len(header):
@@ -236,7 +236,7 @@ def _cell_at(file: Path, header: list[str], row: list[str], line: int, column: s
 
 
 def table_columns(scenario: ScenarioFields) -> dict[str, Entry]:
-    """Return the columns that a table of initial states may have: column name -> (key of the quantity, index).
+    """Return the possible columns of a table of initial states: name -> (key of quantity, index of vehicle or pair).
 
     An example is ``{"gap_1_m": ("gaps_m", 0), "speed_1_mps": ("speeds_mps", 0)}``.
     """

@@ -13,7 +13,7 @@ from ethbrake_marl.scenario.schema import Scenario
 class Task:
     """The task of controlling some vehicles of a scenario; all other vehicles follow the scenario's scripts.
 
-    Raises ``InvalidInput`` for an index that no vehicle has, a repeated index, or an unknown harm count.
+    Raises ``InvalidInput`` for an index of a vehicle that does not exist, a repeated index, or an unknown harm count.
     """
 
     scenario: Scenario  # the scenario that the worlds are drawn from

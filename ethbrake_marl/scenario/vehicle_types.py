@@ -66,7 +66,8 @@ TypeQuantity = Annotated[
 class VehicleType(FileModel):
     """A vehicle type: its weight in the random draw, and its quantities.
 
-    A quantity that the type does not declare has the scenario's general declaration outside ``vehicle_types``.
+    If a type does not declare a quantity, the type has the scenario's declaration of this quantity outside
+    ``vehicle_types``.
     """
 
     weight: Weight = Field(default=1.0, description="how likely this type is, relative to the other types")
@@ -258,7 +259,7 @@ class Table(FileModel):
         return self
 
     def column_values(self) -> dict[str, TableColumn]:
-        """Return each column of the table by name, also ``recording``, together with the weights of the rows."""
+        """Return the table's columns by name, including ``recording``; each column also has the weights of the rows."""
         rows = self.rows or ()
         weights = self.weights if isinstance(self.weights, tuple) else (1.0,) * len(rows)
         cumulative = np.cumsum(np.asarray(weights))

@@ -19,7 +19,7 @@ from ethbrake_marl.training.team import has_policy_each, load_team
 
 
 def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
-    """Return the agent that drives with a trained policy, or a team if each learner of the run has its own policy.
+    """Return an agent that drives with a trained policy, or with a team if each learner of the run has its own policy.
 
     Args:
         argument: not used.

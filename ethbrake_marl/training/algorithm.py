@@ -20,9 +20,9 @@ class Algorithm(ABC):
     """Base class of a learning algorithm whose model is a ``BaseAlgorithm`` of Stable-Baselines3.
 
     A subclass must implement ``build``, which returns the model. A subclass may override ``actors`` (the policies
-    inside the model), ``tensors`` (the weights of a policy), ``optimizers`` and ``learned_beside`` (what a checkpoint
-    saves in addition to ``model.policy``), and ``log_noise`` (the exploration noise). The default methods fit a model
-    whose ``policy`` has one ``optimizer``, such as PPO and A2C.
+    inside the model), ``tensors`` (the weights of a policy), ``optimizers`` (the model's optimisers),
+    ``learned_beside`` (what a checkpoint saves in addition to ``model.policy``) and ``log_noise`` (the exploration
+    noise). The default methods fit a model whose attribute ``policy`` has one ``optimizer``, such as PPO and A2C.
     """
 
     @abstractmethod
@@ -38,8 +38,8 @@ class Algorithm(ABC):
     def actors(self, model: BaseAlgorithm) -> tuple[BasePolicy, ...]:
         """Return the policies inside the model that choose actions.
 
-        The result contains one policy for all learners or, in the scheme ``independent``, one policy for each learner,
-        front to rear.
+        The result contains one policy for all learners or, in the scheme ``independent``, one policy for each learner
+        in the order front to rear.
         """
         return (model.policy,)
 
@@ -67,7 +67,7 @@ class Algorithm(ABC):
     def log_noise(self, model: BaseAlgorithm) -> Tensor | None:
         """Return the logarithm of the model's exploration noise, or None if the model has no such noise.
 
-        If the exploration noise is not finite or not above 0, the training stops with an error.
+        If the model's exploration noise is not finite or not above 0, the training run stops with an error.
         """
         log_std: Tensor | None = getattr(model.policy, "log_std", None)
         return None if log_std is None else log_std.detach()

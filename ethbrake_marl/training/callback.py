@@ -37,14 +37,14 @@ StopAt = Callable[[Mapping[str, float]], str | None]
 
 
 class StopRequested(Exception):
-    """Internal exception by which the callback leaves Stable-Baselines3's training loop between two updates.
+    """Internal exception that the callback raises to leave Stable-Baselines3's training loop between two updates.
 
     The argument of the exception is the reason that ``StopAt`` returned, or None after Ctrl-C.
     """
 
 
 class Watchers(NamedTuple):
-    """Functions that a training run calls: to measure its policies, to ask whether to stop, and to report progress."""
+    """Functions that a training run calls to measure its policies, to learn whether to stop, and to report progress."""
 
     evaluate: Evaluate | None  # takes the current policies and returns their metrics; None: no measurements
     stop_at: StopAt | None  # takes the metrics of an evaluation; returns a reason to stop, or None to continue
@@ -117,8 +117,7 @@ class RunCallback(BaseCallback):
             self._write_checkpoint()
 
     def _take_policies(self) -> None:
-        """Copy the current weights as policies into ``course``, unless ``course`` already has the weights of this
-        update.
+        """Store policies with the current weights in ``course``, unless it has the weights of this update already.
 
         Raises ``TrainingDiverged`` if a weight is not finite.
         """
@@ -159,7 +158,9 @@ class RunCallback(BaseCallback):
         return sum(float(e["r"]) for e in episodes) / len(episodes) if episodes else None
 
     def tell(self, note: str = "") -> None:
-        """Report the progress of the training to ``on_progress``. ``note`` is a message for the user, shown once."""
+        """Report the progress of the training to ``on_progress``. ``note`` is a message for the user, which is shown
+        only once.
+        """
         if self._watchers.on_progress is None:
             return
         course = self.course
@@ -202,7 +203,7 @@ class RunCallback(BaseCallback):
         return TrainingState(numbers, arrays)
 
     def restore(self, state: TrainingState) -> None:
-        """Restore model and progress from a checkpoint, so that the training continues from this checkpoint.
+        """Restore model and progress from a checkpoint, so that the training run continues from this checkpoint.
 
         Raises ``CorruptBundle`` if the checkpoint does not fit this model.
         """

@@ -28,11 +28,12 @@ class CentralCriticPolicy(ActorCriticPolicy):
 
 
 class _OwnPartForTheActor(MlpExtractor):
-    """Hidden layers of an actor, which sees the first entries of an observation row, and of a critic, which sees all.
+    """Hidden layers of an actor, which sees the first entries of an observation row, and a critic, which sees all
+    entries.
 
     Args:
-        own: number of entries at the beginning of an observation row that the actor sees.
-        whole: number of all entries of an observation row, which the critic sees.
+        own: number of entries that the actor sees, at the beginning of an observation row.
+        whole: number of all entries of an observation row; the critic sees all of them.
         net_arch: sizes of the layers, as in Stable-Baselines3's ``ActorCriticPolicy``.
         activation_fn: activation function, as in Stable-Baselines3's ``ActorCriticPolicy``.
 

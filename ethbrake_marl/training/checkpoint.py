@@ -114,7 +114,8 @@ def newest_usable(folder: Path) -> tuple[TrainingState | None, list[str]]:
     """Read the newest undamaged checkpoint inside ``folder``, and delete newer checkpoints, which are damaged.
 
     Returns the state of the training run (None if there is no undamaged checkpoint), and an error message for each
-    damaged checkpoint. Raises ``InvalidInput`` for a checkpoint of another format, which is not deleted.
+    damaged checkpoint. If a checkpoint has another format, ``InvalidInput`` is raised, and this checkpoint is not
+    deleted.
     """
     reasons: list[str] = []
     for path in checkpoint_folders(folder):

@@ -133,9 +133,9 @@ def run_experiment(
     Args:
         scenario: scenario with at least one learner. Several learners are trained as a team, with the recipe's scheme.
         directory: the new folder of the run.
-        recipe: recipe of the training, which also defines the reward.
+        recipe: recipe of the training run, which also defines the reward.
         steps: number of decisions of all learners together in the training; None: the recipe's number.
-        seed: seed of the training; None: the recipe's seed.
+        seed: seed of the training run; None: the recipe's seed.
         episodes: number of worlds of the evaluation list.
         list_seed: seed of the evaluation list.
         force: whether to replace an earlier run in ``directory``.
@@ -242,8 +242,8 @@ def write_results(
 
     Args:
         folder: existing folder.
-        name: name of the files, without their endings.
-        rows: rows of the table, one per agent.
+        name: name of the two files, without their endings.
+        rows: rows of the results table, one per agent.
         harm_count: count of harm that the agents minimise, which the JSON file records.
         per_world: existing file with one row per world, to which the JSON file refers; None: there is no such file.
 

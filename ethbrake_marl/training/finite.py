@@ -23,7 +23,7 @@ def refuse_gradients(model: BaseAlgorithm, algorithm: Algorithm) -> None:
     """Make every optimiser of the model raise ``TrainingDiverged`` before a step with a gradient that is not finite.
 
     Args:
-        model: the model, whose optimisers are changed.
+        model: the model of Stable-Baselines3 whose optimisers are changed.
         algorithm: learning algorithm of the model, which lists the model's optimisers.
 
     """
@@ -45,7 +45,7 @@ def weights_are_finite(model: BaseAlgorithm, algorithm: Algorithm) -> bool:
 
     Args:
         model: the model.
-        algorithm: learning algorithm of the model, whose ``log_noise`` returns the model's exploration noise.
+        algorithm: learning algorithm of the model; its method ``log_noise`` returns the model's exploration noise.
 
     """
     logarithm = algorithm.log_noise(model)

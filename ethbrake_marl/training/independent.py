@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 
 class SeparatePolicies(BasePolicy):
-    """One actor-critic policy for each learner, each with its own optimiser, behind the interface of a single policy.
+    """One actor-critic policy and one optimiser for each learner, together with the interface of a single policy.
 
     The last entry of an observation row is the number of the learner that observes it (0 = foremost). Learners whose
     numbers are in ``resting`` do not explore: they take the mean action.
@@ -158,7 +158,7 @@ class IndependentPPO(PPO):
     def _whose_turn(self, turns: int) -> int:
         """Return the number of the learner (0 = foremost) that learns in the next update.
 
-        The result depends only on the number of decisions so far, so a resumed training has the same turns.
+        The result depends only on the number of decisions so far, so a resumed training run has the same turns.
         """
         rollout = self.n_envs * self.n_steps
         planned = -(-self._total_timesteps // rollout)

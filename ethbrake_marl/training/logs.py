@@ -16,10 +16,11 @@ def open_logs(run: RunDirectory, state: TrainingState | None) -> list[KVWriter]:
 
     Args:
         run: folder of the run.
-        state: checkpoint from which the training continues; None: the logs begin empty. Log rows that were written
+        state: checkpoint from which the training run continues; None: the logs begin empty. Log rows that were written
             after this checkpoint are dropped.
 
-    Returns one writer for each of the two logs, for ``output_formats`` of Stable-Baselines3's logger.
+    Returns a writer for ``progress.csv`` and a writer for the TensorBoard events, both for the argument
+    ``output_formats`` of Stable-Baselines3's ``Logger``.
 
     """
     run.progress.unlink(missing_ok=True)  # the path may be a link, whose target must not be overwritten

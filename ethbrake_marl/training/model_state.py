@@ -111,7 +111,8 @@ def _restore_weights(model: Model, algorithm: Algorithm, rates: Mapping[str, flo
 def _captured_rows(model: Model) -> Arrays:
     """Return the latest observation of every learner, and the returns and lengths of the latest episodes.
 
-    Stable-Baselines3 needs the observations to continue the rollouts, and the returns and lengths to log their means.
+    Stable-Baselines3 needs the observations to continue the rollouts; it needs the returns and lengths to log their
+    means.
     """
     observations: Any = model._last_obs
     episodes = list(model.ep_info_buffer or ())
@@ -135,7 +136,7 @@ def _restore_rows(model: Model, arrays: Arrays) -> None:
 
 
 def _captured_log(model: Model) -> dict[str, list[Any]]:
-    """Return what the logger has for the next row: name of a column -> [value, count, formats that omit the column]."""
+    """Return the logger's values for its next row: name of a column -> [value, count, formats that omit the column]."""
     log, pending = model.logger, {}
     for name, value in log.name_to_value.items():
         number = value.item() if isinstance(value, np.generic | torch.Tensor) else value
@@ -174,7 +175,7 @@ def _restore_replay(memory: Any, place: Any, arrays: Arrays) -> None:
 
 
 def _try_step(optimizer: torch.optim.Optimizer) -> None:
-    """Take a step with a copy of ``optimizer``; torch raises an error if the optimiser does not fit the weights."""
+    """Make a trial step with a copy of ``optimizer``; torch raises an error if optimiser and weights do not fit."""
     tried = copy.deepcopy(optimizer)
     for group in tried.param_groups:
         for weights in group["params"]:

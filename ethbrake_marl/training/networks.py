@@ -29,7 +29,7 @@ def tensors_of(policy: BasePolicy, spec: NetworkSpec) -> dict[str, Float32s]:
 def sb3_names(spec: NetworkSpec) -> dict[str, str]:
     """Return the names of a network's tensors: name in a policy bundle -> name in Stable-Baselines3's policy.
 
-    ``spec`` describes the network. The network belongs to PPO if ``spec.output`` is ``clip``, and to SAC if not.
+    ``spec`` describes the network. The network belongs to PPO if ``spec.output`` is ``clip``, and otherwise to SAC.
     Stable-Baselines3 also numbers the activations, so hidden layer k of a bundle has the number 2 k in
     Stable-Baselines3.
     """
@@ -54,7 +54,7 @@ def tensors_of_layers(name: str, layers: nn.Sequential) -> dict[str, Float32s]:
     Args:
         name: name of the network in the bundle, such as ``policy`` or ``gate``. The names of all returned tensors begin
             with ``name``.
-        layers: linear layers, possibly with activations between them. The last linear layer is the output.
+        layers: linear layers, possibly with activations between them. The last linear layer is the output layer.
 
     """
     linear = [layer for layer in layers if isinstance(layer, nn.Linear)]

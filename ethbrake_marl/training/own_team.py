@@ -47,7 +47,7 @@ def save_team(
         actors: actor of each learner, by the vehicle's name.
         env: environment in which the actors were trained. The team records the scenario, observations and reward of
             this environment.
-        seed: seed of the training; the team records this seed.
+        seed: seed of the training run; the team records this seed.
         steps: number of decisions of the training; the team records this number.
 
     Raises ``InvalidInput`` if an actor is not a perceptron with ReLU or Tanh, or if learners that share an actor

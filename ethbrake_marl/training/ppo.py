@@ -24,8 +24,8 @@ class Ppo(Algorithm):
     def build(self, training: Training, environment: EthBrakeVecEnv) -> PPO:
         """Return a new PPO model for a training run, which learns in ``environment``.
 
-        The training's scheme decides whether the model has a shared policy, a central critic, or one policy for each
-        learner.
+        The scheme of the training run decides whether the model has a shared policy, a central critic, or one policy
+        for each learner.
         """
         recipe = training.recipe
         assert isinstance(recipe, PpoRecipe)

@@ -39,7 +39,7 @@ class Course:
 
     @property
     def wall_s(self) -> float:
-        """Wall time spent on this training so far (s), without the time between a stop and the call of ``resume``."""
+        """Wall time of this training run so far (s), without the time between a stop and the call of ``resume``."""
         return self.wall_before_s + time.monotonic() - self.started
 
     @property
@@ -86,7 +86,7 @@ class Course:
 def objective_in_words(training: Training) -> str:
     """Return the name of the quantity that the learners minimise, such as ``total harm (own)``.
 
-    The name is empty if all learners minimise the harm of the whole line. A weighted sum of harms is called an
+    The returned name is empty if all learners minimise the harm of the whole line. A weighted sum of harms is called an
     objective, not a harm.
     """
     scenario, learners = training.scenario, training.scenario.learners

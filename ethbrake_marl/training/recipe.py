@@ -72,7 +72,7 @@ class Shape(FileModel):
 
         Args:
             observation_size: number of features of an observation.
-            more: fields of the returned ``NetworkSpec`` whose values differ from the defaults, such as
+            more: fields of the returned ``NetworkSpec`` that differ from their default values, such as
                 ``output="tanh"``.
 
         """
@@ -207,7 +207,7 @@ class TrainingRecipe(FileModel):
         """
 
     def begins(self, scenario: Scenario) -> str | None:
-        """Return a description of the initial weights for a scenario, or None if the initial weights are random."""
+        """Return a description of the initial weights in training on a scenario; None if they are random."""
         return None
 
     def derived(self) -> dict[str, float]:
@@ -269,8 +269,7 @@ class TrainingRecipe(FileModel):
         """Return the path of a recipe's file.
 
         If the argument contains a path separator or ends in ``.yaml``, the argument is a path, and the file need not
-        exist. If the argument is anything else, it must be the name of a shipped recipe; an unknown name raises
-        ``UnknownName``.
+        exist. Any other argument must be the name of a shipped recipe; an unknown name raises ``UnknownName``.
         """
         text = str(name_or_path)
         if Path(text).suffix in (".yaml", ".yml") or "/" in text or "\\" in text:
@@ -372,7 +371,7 @@ class TrainingRecipe(FileModel):
 
 
 def key_meanings(recipe: type[TrainingRecipe]) -> dict[str, str]:
-    """Return a dictionary: key of the recipes of class ``recipe`` -> description of the key.
+    """Return a dictionary: key of the recipes of class ``recipe`` -> description of this key.
 
     If a class declares a key without a description, the description in its base class is used.
     """
@@ -396,8 +395,8 @@ def register_algorithm(name: str, recipe: type[TrainingRecipe], algorithm: type[
         name: name of the algorithm, with 1 to 64 letters ``a-z``, digits, ``-`` and ``_``.
         recipe: class of the algorithm's recipes, a subclass of ``TrainingRecipe``, which also checks their YAML files.
         algorithm: class of the algorithm, a subclass of ``training.algorithm.Algorithm``, or the text
-            ``"module:class"``. If the text is given, the module (and torch, whose import takes seconds) is imported
-            only when a training run begins.
+            ``"module:class"``. If ``algorithm`` is such a text, the module (and torch, whose import takes seconds) is
+            imported only when a training run begins.
 
     Raises ``InvalidInput`` for an invalid name or a class that lacks a required method, and ``AlreadyExists`` if
     another algorithm has the name.

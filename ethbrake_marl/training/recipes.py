@@ -64,7 +64,7 @@ class PpoRecipe(TrainingRecipe):
         return self
 
     def check_learners(self, learners: int) -> None:
-        """Raise ``InvalidInput`` if the training has fewer updates than all learners together have turns to learn."""
+        """Raise ``InvalidInput`` if the training has fewer updates than turns (the turns of all learners added up)."""
         updates = -(-self.total_steps // (self.n_envs * learners * self.n_steps))
         if self.turns is not None and self.turns * learners > updates:
             raise InvalidInput(

@@ -60,7 +60,7 @@ class RunDirectory:
             team: content of ``team.json``; None: the file is not written.
             force: whether to replace an earlier run (a folder with a ``run.json``) or an empty folder.
 
-        Returns this object. Raises ``AlreadyExists`` if the folder exists and may not be replaced.
+        Returns this object. Returns this ``RunDirectory``.
 
         """
         path, is_run = self.path, self.status.is_file()
@@ -88,8 +88,8 @@ class RunDirectory:
         """Write ``run.json`` anew: status, start time of the run and, unless the status is ``running``, its end time.
 
         Args:
-            status: the status of the run.
-            more: further entries to write into ``run.json``.
+            status: status of the run to record, such as ``running``.
+            more: further entries to write into ``run.json``, by key.
 
         """
         now = datetime.now(UTC).isoformat(timespec="seconds")
@@ -100,7 +100,7 @@ class RunDirectory:
         self.write_json(self.status, {"format": "ethbrake-run", "format_version": 1, "status": status, **times, **more})
 
     def remove_results(self) -> None:
-        """Delete the results and reports of ``ethbrake run``, which do not apply to the continued training."""
+        """Delete results and reports of ``ethbrake run``, because they do not apply to the continued training run."""
         own, written = {path.name for path in vars(self).values()}, read_object(self.status).get(self.WRITTEN)
         names = written if isinstance(written, list) else []
         for path in [*self.path.iterdir()]:
@@ -129,7 +129,7 @@ class RunDirectory:
 
     @property
     def is_finished(self) -> bool:
-        """Whether the training in this folder has finished."""
+        """Whether the training run in this folder has finished."""
         return self.status.is_file() and read_object(self.status).get("status") == "finished"
 
     def wait_for_others(self, longest_s: float) -> None:
@@ -141,8 +141,9 @@ class RunDirectory:
     def chosen_by(cls, evaluations: Sequence[Mapping[str, Any]], harm_count: HarmCount, prefix: str = "") -> str:
         """Return the name of the metric that is smallest for the best policy.
 
-        The metric is ``objective`` if every evaluation has an entry ``objective``. If not, the metric is the harm of
-        the line (``first_impact_harm`` or ``total_harm``, as ``harm_count`` says).
+        The metric is ``objective`` if every evaluation has an entry ``objective``. If an evaluation has no entry
+        ``objective``, the metric is the harm of the line (``first_impact_harm`` or ``total_harm``, as ``harm_count``
+        says).
 
         Args:
             evaluations: evaluations of a training run (``TrainResult.evaluations``), or rows of ``progress.csv``.
@@ -171,5 +172,7 @@ class RunDirectory:
         return {int(steps): float(spent) for steps, spent in recorded.items()}
 
     def column(self, name: str) -> dict[int, float]:
-        """Return a column of ``progress.csv``: number of decisions so far -> value. Missing values are omitted."""
+        """Return a column of ``progress.csv``: number of decisions so far -> value. Rows without a value in this column
+        are omitted.
+        """
         return {int(row["steps"]): float(row[name]) for row in self.rows() if row.get(name)}

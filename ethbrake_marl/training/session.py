@@ -67,7 +67,7 @@ class TrainResult:
 
     @property
     def metrics(self) -> Mapping[str, float] | None:
-        """Metrics of the policy ``trained`` on the fixed list of worlds; None if nothing was measured."""
+        """Metrics of the policy ``trained`` on the fixed list of worlds; None if the policies were not measured."""
         return next((each for each in self.evaluations if each["steps"] == self.trained.steps), None)
 
     @property
@@ -114,8 +114,8 @@ def train(
 
     Ctrl-C stops the training after the current update (status ``interrupted``); a second Ctrl-C raises
     ``KeyboardInterrupt``. After Ctrl-C or an error, ``policy/`` contains the best policy so far, and ``policy-last/``
-    the last policy with finite weights. ``resume`` continues a stopped training. The same recipe, scenario and seed
-    give exactly the same policy on the same machine.
+    the latest policy whose weights are finite. ``resume`` continues a stopped training run. The same recipe, scenario
+    and seed give exactly the same policy on the same machine.
 
     Args:
         recipe: a recipe, its name, or the path of its file.
@@ -123,7 +123,7 @@ def train(
         directory: the new folder of the run.
         scheme: how several learners train together; None: the recipe's scheme.
         turns: number of turns of each independent learner (docs/train.md); None: the recipe's number.
-        seed: seed of the training; None: the recipe's seed.
+        seed: seed of the training run; None: the recipe's seed.
         steps: number of decisions of all learners together; None: the recipe's number. The training ends with a whole
             update, so the learners may make a few more decisions.
         force: whether to replace an earlier run in ``directory``.
@@ -158,11 +158,12 @@ def resume(
     on_progress: Told = "show",
     other_versions: bool = False,
 ) -> TrainResult:
-    """Continue a training run that was stopped or killed. The policies are exactly the same as without the stop.
+    """Continue a training run that was stopped or killed. The policies are exactly the same as without the
+    interruption.
 
-    The training continues from the newest undamaged checkpoint, or from the beginning if there is no such checkpoint.
-    Log rows that were written after this checkpoint are dropped. Earlier results and reports of ``ethbrake run`` are
-    deleted.
+    The training run continues from the newest undamaged checkpoint, or from the beginning if there is no such
+    checkpoint. Log rows that were written after this checkpoint are dropped. Earlier results and reports of ``ethbrake
+    run`` are deleted.
 
     Args:
         directory: the folder of the run.
@@ -171,9 +172,9 @@ def resume(
             ``stop_at`` again.
         on_progress: the same argument as in ``train``.
         other_versions: whether to accept a checkpoint that other versions of packages wrote. The resulting policies may
-            then differ from the policies of an uninterrupted training.
+            then differ from the policies of an uninterrupted training run.
 
-    Raises ``InvalidInput`` if the folder contains no training or a finished training, if another process is training in
+    Raises ``InvalidInput`` if the folder contains no training run or a finished one, if another process is training in
     the folder, if ``config.json`` was edited after the checkpoint was written, or if other versions of packages wrote
     the checkpoint.
 
@@ -193,8 +194,7 @@ def resume(
 def build(
     training: Training, run: RunDirectory, measure: Measure | None, stop_at: StopAt | None, on_progress: Told
 ) -> Iterator[RunCallback]:
-    """Context manager that builds environment and model of a training run, and yields the callback to pass to
-    ``learn``.
+    """Context manager: build environment and model of a training run, and yield the callback for ``learn``.
 
     Inside the ``with`` block, Ctrl-C stops the training after the current update. At the end of the ``with`` block, the
     environment is closed, and the global random generators are restored.
@@ -222,7 +222,7 @@ def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[st
     Args:
         callback: callback from ``build``, which contains the model and measures the model's policies during the
             training.
-        state: checkpoint from which the training continues; None: a new training begins.
+        state: checkpoint from which the training run continues; None: a new training run begins.
         notes: messages for the user, passed to ``on_progress`` when the training begins.
 
     """
@@ -268,7 +268,7 @@ def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[st
 
 
 def save(callback: RunCallback, status: RunStatus, reason: str | None) -> None:
-    """Save the best policy and the last policy with finite weights, and record in ``run.json`` how the run ended.
+    """Save the best policy and the last policy whose weights are finite; record in ``run.json`` how the run ended.
 
     The checkpoints of a finished run are deleted.
 
@@ -300,7 +300,7 @@ def save(callback: RunCallback, status: RunStatus, reason: str | None) -> None:
 
 
 def _check_unfinished(run: RunDirectory, training: Training) -> None:
-    """Raise ``InvalidInput`` if the training has finished, even if ``ethbrake run`` has not evaluated it yet."""
+    """Raise ``InvalidInput`` if the training run has finished, even if ``ethbrake run`` has not evaluated it yet."""
     status = read_object(run.status)
     resumable = any(run.checkpoints.glob("step_*"))
     if status["status"] == "finished" or (status.get("stage") is not None and not resumable):
@@ -315,7 +315,7 @@ def _newest_checkpoint(
 ) -> tuple[TrainingState | None, list[str]]:
     """Return the newest undamaged checkpoint (or None), and error messages about damaged newer checkpoints.
 
-    Raises ``InvalidInput`` if the checkpoint belongs to another training, or if other versions of packages wrote it
+    Raises ``InvalidInput`` if the checkpoint belongs to another training run, or if other versions of packages wrote it
     (unless ``other_versions`` is true).
     """
     remove_unfinished(run.path)

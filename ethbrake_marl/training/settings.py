@@ -29,8 +29,8 @@ class Settings(NamedTuple):
 
         Args:
             recipe: the recipe to change.
-            tell: function that is called with a note for the user if ``gamma`` and ``reward.shaping_discount``, which
-                should be equal, differ because only one of them was set.
+            tell: function that is called with a note for the user if ``gamma`` and ``reward.shaping_discount`` differ
+                because only one of them was set (they should be equal).
 
         """
         own = [override for override in self.recipe if override.top in type(recipe).model_fields]

@@ -93,8 +93,8 @@ def load_team(
         folder: folder of the run.
         scenario: scenario to drive in, or its name or path.
         name: name of the team.
-        vehicles: indices (0 = front) of the vehicles to drive; None: the scenario's learners. The team omits other
-            learners of the run.
+        vehicles: indices (0 = front) of the vehicles to drive; None: the scenario's learners. The team does not contain
+            the policies of the run's other learners.
 
     Raises ``InvalidInput`` if the folder has no ``team.json``, if the team is for a line of another length, or if the
     team has no policy for one of the vehicles. Raises ``CorruptBundle`` if ``team.json`` is damaged.

@@ -100,7 +100,7 @@ class Training:
     def config(self, settings: Sequence[str] = ()) -> dict[str, Any]:
         """Return the content of ``config.json``: recipe, scenario, seeds, versions and settings.
 
-        ``settings`` are texts ``KEY=VALUE`` that say how recipe and scenario differ from their files.
+        loss_begins: probability p that a burst of losses begins in one message period.
         """
         recipe = self.recipe
         return {
@@ -159,7 +159,7 @@ def recorded_training(run: RunDirectory, config: Mapping[str, Any]) -> Training:
 
 
 def check_same_training(run: RunDirectory, training: Training) -> None:
-    """Raise ``InvalidInput`` if recipe or scenario of a run differ from ``training``; the message names the keys."""
+    """Raise ``InvalidInput`` if the run's recipe or scenario differs from ``training``; the message names the keys."""
     recorded = recorded_training(run, read_object(run.config))
     if recorded.identity == training.identity:
         return
