@@ -1,4 +1,4 @@
-"""Nondominated points of a set, and the volume of the region that the points dominate."""
+"""Find the points of a set that no other point dominates, and compute the volume that the points dominate."""
 
 from __future__ import annotations
 

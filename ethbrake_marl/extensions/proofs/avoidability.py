@@ -70,8 +70,8 @@ def drive_before_braking(
 
     The results are the duration of the drive (s), the time at which the gap becomes 0 (s), and whether both vehicles
     still move at that time. If both vehicles still move when the gap becomes 0, then ``a_f > a_l`` and both have the
-    same speed. If they do not both move at that time, the follower comes to rest behind the leader, which is already at
-    rest. The duration and the time are infinite if the follower never moves.
+    same speed. If at least one vehicle is at rest when the gap becomes 0, the follower comes to rest behind the leader,
+    which is already at rest. The first two results are infinite if the follower never moves.
 
     Args:
         gap: gap to the leader, m.
@@ -159,7 +159,7 @@ def lowest_while_coasting(gap: float, v_f: float, v_r: float, a_r: float, onset_
 
 @compiled
 def met(gap: float, closing: float) -> bool:
-    """Return whether a pair with this gap (m) and closing speed (m/s) has had an impact, or has one at this moment."""
+    """Return whether a pair with the present gap ``gap`` (m) and closing speed ``closing`` (m/s) has or had an impact."""
     return gap < -ROUNDING_M or (gap <= 0.0 and closing > BOUND.TOUCH_SPEED_MPS)
 
 
@@ -359,10 +359,10 @@ class Avoidability:
     ``margin_m`` is minus the missing gap; if the reason is *early*, ``margin_m`` is minus the overlap before the
     vehicle may act.
 
-    ``switch_s`` and ``command_mps2`` are times and commands that show how to avoid contact: in a simulation they cause
-    no impact. Each command applies from its time (s after the alert) until the time of the next command. An infinite
-    time means that the command never applies. ``switch_s`` and ``command_mps2`` are NaN in worlds where contact is
-    unavoidable.
+    ``command_mps2`` and ``switch_s`` are commands that show how to avoid contact, and their times: in a simulation
+    these commands cause no impact. Each command applies from its time (s after the alert) until the time of the next
+    command. A command whose time in ``switch_s`` is infinite never applies. ``switch_s`` and ``command_mps2`` are NaN
+    in worlds where contact is unavoidable.
     """
 
     # [n] 0: contact is avoidable. 1, early: a pair has contact before the controlled vehicle may act. 2, front: even
@@ -398,9 +398,9 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
             ``Scenario.roles``. The only script allowed is full_brake. If ``scripts`` is None, all vehicles that are not
             controlled brake fully.
 
-    Raises ``InvalidInput`` for lines and scripts that are not allowed. The function also raises ``InvalidInput`` if the
-    front vehicle may brake only after the controlled vehicle may act, if a vehicle moves backward, or if vehicle_1
-    could reach an obstacle (``obstacle_gap_m``) before any contact.
+    Raises ``InvalidInput`` for a line other than those described above, and for a script other than full_brake. The
+    function also raises ``InvalidInput`` if the front vehicle may brake only after the controlled vehicle may act, if a
+    vehicle moves backward, or if vehicle_1 could reach an obstacle (``obstacle_gap_m``) before any contact.
 
     """
     worlds.refuse_build_up("avoidability")

@@ -7,7 +7,7 @@ again; ``flights.largest_lead`` bounds the difference. docs/internals/proofs/low
 
 Each function computes one bound for all first contacts between the times ``early`` and ``late``, from the state at
 ``early``. From ``late`` to ``end`` (the end of the decision step) the command of the earlier decision still applies.
-This command differs from the extreme command by at least ``lack`` (m/s2).
+The command of the earlier decision differs from the extreme command by at least ``lack`` (m/s2).
 """
 
 from __future__ import annotations
@@ -61,11 +61,11 @@ def least_closing(
     Args:
         start: closing speed, at the time of the first contact, of the second neighbour relative to the centre of mass
             of the controlled vehicle and its first neighbour, m/s.
-        slope: rate at which this closing speed (``start``) changes from the first contact on, m/s2.
+        slope: rate at which the closing speed, which begins with ``start``, changes from the first contact on, m/s2.
         turn: time at which the rate of change of the closing speed (``slope``) increases by ``bend``, s.
-        bend: increase of the rate of change of the closing speed at the time ``turn``, m/s2; may be negative.
-        other_turn: time at which the rate of change of the closing speed increases by ``other_bend``, s.
-        other_bend: increase of the rate of change of the closing speed at the time ``other_turn``, m/s2; may be
+        bend: increase of ``slope`` (rate of change of the closing speed) at the time ``turn``, m/s2; may be negative.
+        other_turn: time at which the rate of change of the closing speed (``slope``) increases by ``other_bend``, s.
+        other_bend: increase of ``slope`` (rate of change of the closing speed) at the time ``other_turn``, m/s2; may be
             negative.
         share: mass of the first neighbour, divided by the total mass of this neighbour and the controlled vehicle, 0 to
             1.
@@ -112,8 +112,9 @@ def pushed_by_leader(
         late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         closing: largest closing speed that the first contact may have, m/s.
         end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
-        lack: smallest possible difference between the command that applies until ``end`` and the best command after the
-            first contact, m/s2.
+        lack: smallest amount, m/s2, by which the controlled vehicle's command until ``end`` differs from the extreme
+            command (full drive after a first contact with the front vehicle, full braking after one with the rear
+            vehicle).
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
@@ -214,8 +215,9 @@ def after_front(
         late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         closing: largest closing speed that the first contact may have, m/s.
         end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
-        lack: smallest possible difference between the command that applies until ``end`` and the best command after the
-            first contact, m/s2.
+        lack: smallest amount, m/s2, by which the controlled vehicle's command until ``end`` differs from the extreme
+            command (full drive after a first contact with the front vehicle, full braking after one with the rear
+            vehicle).
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
@@ -270,7 +272,7 @@ def braking_after(
 ) -> float:
     """Return the smallest squared closing speed (m2/s2) at which a braking vehicle reaches the vehicle in front.
 
-    The vehicle brakes with at most ``a_f``; the vehicle in front brakes fully. The result is 0 if no contact is
+    The vehicle brakes with at most ``a_f``; the vehicle in front brakes fully. The result is 0 if contact is not
     certain.
 
     Args:
@@ -310,8 +312,9 @@ def pushed_by_rear(
         late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         closing: largest closing speed that the first contact may have, m/s.
         end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
-        lack: smallest possible difference between the command that applies until ``end`` and the best command after the
-            first contact, m/s2.
+        lack: smallest amount, m/s2, by which the controlled vehicle's command until ``end`` differs from the extreme
+            command (full drive after a first contact with the front vehicle, full braking after one with the rear
+            vehicle).
         gap: gap to the front vehicle at ``early``, m.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.

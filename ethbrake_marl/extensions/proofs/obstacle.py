@@ -1,8 +1,9 @@
 """Compute lower bounds on the harm that must follow a first contact if an obstacle is ahead of the front vehicle.
 
-``beyond`` is the squared speed (m2/s2) at which the leader (front vehicle) hits the obstacle. This speed limits how far
-ahead the leader can be at any time. Position 0 is the place of the controlled vehicle at the moment at which it may
-act. Masses are in units of the controlled vehicle's mass. docs/internals/proofs/lower-bound-obstacle.md has the proofs.
+``beyond`` is the squared speed (m2/s2) at which the leader (front vehicle) hits the obstacle. The leader's speed at the
+obstacle limits how far ahead the leader can be at any time. Position 0 is the place of the controlled vehicle at the
+moment at which it may act. Masses are in units of the controlled vehicle's mass.
+docs/internals/proofs/lower-bound-obstacle.md has the proofs.
 """
 
 from __future__ import annotations
@@ -159,7 +160,7 @@ def stopped_there(
 
     The distance (m) is the vehicle's largest distance from the obstacle; it is infinite if no limit is known. The speed
     (m/s) is the vehicle's largest backward speed. The time (s) is the longest time that the vehicle can spend near the
-    obstacle.
+    obstacle before the rear vehicle arrives.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -371,8 +372,9 @@ def after_rear(
         late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         closing: largest closing speed that the first contact may have, m/s.
         end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
-        lack: smallest possible difference between the command that applies until ``end`` and the best command after the
-            first contact, m/s2.
+        lack: smallest amount, m/s2, by which the controlled vehicle's command until ``end`` differs from the extreme
+            command (full drive after a first contact with the front vehicle, full braking after one with the rear
+            vehicle).
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
@@ -405,8 +407,8 @@ def after(
     kind: int, at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats,
     other: Floats,
 ) -> float:  # fmt: skip
-    """Return the smallest harm (m2/s2) with the second neighbour (and at an obstacle) after a first contact with the
-    other neighbour.
+    """Return the smallest harm (m2/s2) that must follow a first contact: the harm of the contact with the second
+    neighbour and, if there is an obstacle, the harm at the obstacle.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
@@ -417,8 +419,9 @@ def after(
         late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         closing: largest closing speed that the first contact may have, m/s.
         end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
-        lack: smallest possible difference between the command that applies until ``end`` and the best command after the
-            first contact, m/s2.
+        lack: smallest amount, m/s2, by which the controlled vehicle's command until ``end`` differs from the extreme
+            command (full drive after a first contact with the front vehicle, full braking after one with the rear
+            vehicle).
         plan: working memory for the motion of one vehicle, an array from ``empty_plan`` (with brake build-up from
             ``empty_legs``); overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.

@@ -1,7 +1,7 @@
 """``team_bound``: a proven lower bound on the harm of every world, whatever several controlled vehicles do.
 
-If Vehicle 2 is the first controlled vehicle, one bound covers the harm of the first three vehicles together. If Vehicle
-1 is controlled and an obstacle is ahead, the obstacle is treated as an immovable first vehicle of the line.
+If Vehicle 2 is controlled and Vehicle 1 is not, one bound covers the harm of the first three vehicles together. If
+Vehicle 1 is controlled and an obstacle is ahead, the obstacle is treated as an immovable first vehicle of the line.
 docs/internals/proofs/team-bound.md has the proofs.
 """
 
