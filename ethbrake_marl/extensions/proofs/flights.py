@@ -18,7 +18,7 @@ from ethbrake_marl.physics.jit import compiled
 @compiled
 def flight_lead(share: float, press: float, reach: float, opening: float, flight: float) -> float:
     """Return the *lead* of a flight: the speed (m/s) that the controlled vehicle gains by the flight, minus the speed
-    that the flight costs.
+    that it must give up for the flight.
 
     A *flight* is a period in which the controlled vehicle and the neighbour of its first contact are not in contact.
     The gain is the speed of the controlled vehicle minus the speed of the centre of mass of this vehicle and this
@@ -201,7 +201,7 @@ def widest_flight(
     """Return the largest value of ``sqrt(p^2 + 2 press s)`` (m/s) during the flights of the controlled vehicle and a
     partner that brakes harder than this vehicle. Here p is the speed (m/s) at which vehicle and partner separate, and s
     is the gap (m) between them. A *flight* is a period in which the controlled vehicle and the neighbour of its first
-    contact are not in contact. The result is infinite if no bound is known.
+    contact are not in contact. The result is infinite if no bound of this value is known.
 
     Args:
         share: mass of the partner (the neighbour of the first contact), divided by the total mass of the partner and
@@ -214,7 +214,7 @@ def widest_flight(
         bounce: coefficient of restitution.
         closing: closing speed of the first impact, m/s.
         back: backward speed of the controlled vehicle after the first impact, m/s.
-        time: duration for which the bound holds, s.
+        time: duration for which the result holds, s.
 
     """
     if not slack > 0.0 or not bounce * bounce * press < slack:

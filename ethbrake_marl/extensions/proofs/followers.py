@@ -99,7 +99,8 @@ def least_closing(
 def pushed_by_leader(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the smallest closing speed (m/s) at the rear pair after a first contact with the front vehicle (leader).
+    """Return the smallest closing speed (m/s) of the rear pair (controlled and rear vehicle) after a first contact with
+    the front vehicle (leader).
 
     The bound uses the centre of mass of the leader and the controlled vehicle. The result is 0 if nothing is proven. If
     the leader is at rest at ``early``, a later first contact leads to the same motion at a later time, so the function
@@ -150,7 +151,8 @@ def pushed_by_leader(
 
 @compiled(apart=True)
 def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: Floats, other: Floats) -> float:
-    """Return the smallest closing speed (m/s) at the rear pair after a first contact with a leader that brakes harder.
+    """Return the smallest closing speed (m/s) of the rear pair (controlled and rear vehicle) after a first contact with
+    a leader that brakes harder than the controlled vehicle.
 
     The leader is the front vehicle. The controlled vehicle stays near the leader, because the leader brakes harder. The
     result is 0 if nothing is proven.
@@ -203,10 +205,11 @@ def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: 
 def after_front(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the smallest squared closing speed (m2/s2) at the rear pair after a first contact with the front vehicle.
+    """Return the smallest squared closing speed (m2/s2) of the rear pair (controlled and rear vehicle) after the
+    controlled vehicle's first contact, which is with the front vehicle.
 
-    The result is the largest of several bounds. If an obstacle may throw the vehicles back, the bounds that use the
-    centre of mass of the front and the controlled vehicle do not hold, and are left out.
+    The result is the largest of several lower bounds. If an obstacle may throw the vehicles back, the bounds that use
+    the centre of mass of the front and the controlled vehicle do not hold, and are left out.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -300,7 +303,8 @@ def pushed_by_rear(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, gap: float, plan: Floats,
     other: Floats,
 ) -> float:  # fmt: skip
-    """Return the smallest closing speed (m/s) at the front pair after the rear vehicle has hit the controlled one.
+    """Return the smallest closing speed (m/s) of the front pair (front and controlled vehicle) after the rear vehicle
+    has hit the controlled vehicle.
 
     The bound uses the centre of mass of the controlled vehicle and the rear vehicle. The braking capacity of the
     controlled vehicle must be at least the braking capacity of the rear vehicle.
@@ -342,7 +346,8 @@ def pushed_by_rear(
 
 @compiled(apart=True)
 def slowed_by_rear(at: Floats, early: float, closing: float, gap: float, plan: Floats, other: Floats) -> float:
-    """Return the smallest closing speed (m/s) at the front pair after the rear vehicle has hit the controlled one.
+    """Return the smallest closing speed (m/s) of the front pair (front and controlled vehicle) after the rear vehicle
+    has hit the controlled vehicle.
 
     The bound follows from the fact that the controlled vehicle stays ahead of the rear vehicle. The braking capacity of
     the controlled vehicle must be at least the braking capacity of the rear vehicle. The result is 0 if the closing

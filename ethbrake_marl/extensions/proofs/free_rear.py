@@ -65,7 +65,8 @@ def behind_full_braking(at: Floats, early: float, late: float) -> float:
     """Return the gap (m) between the controlled vehicle's position at ``early`` (s) and the rear vehicle's position at
     ``late`` (s) if both brake fully.
 
-    A negative gap is an overlap: the rear vehicle would be that far ahead of the controlled vehicle.
+    A negative gap means an overlap: the rear vehicle's position at ``late`` is ahead of the controlled vehicle's
+    position at ``early`` by this distance.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -109,7 +110,8 @@ def after_behind(
     at: Floats, early: float, late: float, near: float, far: float, hard: float, faster: float, moved: Floats,
     plan: Floats, other: Floats,
 ) -> float:  # fmt: skip
-    """Return the smallest squared closing speed (m2/s2) at the front pair after a first contact with the rear vehicle.
+    """Return the smallest squared closing speed (m2/s2) of the front pair (front and controlled vehicle) after the
+    controlled vehicle's first contact, which is with the rear vehicle.
 
     The bound is computed for one motion of the controlled vehicle, which starts from a state at ``early``. After every
     first contact in the given ranges, the controlled vehicle is at every time at least as far ahead and at least as

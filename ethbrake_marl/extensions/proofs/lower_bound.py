@@ -61,8 +61,8 @@ _PARTS = 8  # number of parts into which the times of soft contacts are divided
 
 @compiled
 def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
-    """Return the smallest squared closing speed (m2/s2) at the rear pair's first contact, and the latest time of this
-    contact (s).
+    """Return the smallest squared closing speed (m2/s2) at the first contact of the rear pair (controlled and rear
+    vehicle), and the latest time (s) of this contact.
 
     If the controlled vehicle drives fully, the first contact of the rear pair happens exactly at the returned time with
     the returned squared closing speed. The returned time is infinite if full drive avoids this contact.
@@ -83,8 +83,8 @@ def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
 
 @compiled(apart=True)
 def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
-    """Return whether the gentlest first contact (smallest closing speed) with one neighbour at ``time`` comes before
-    any contact with the other neighbour.
+    """Return whether the gentlest first contact (smallest closing speed) with the neighbour ``kind`` at ``time`` comes
+    before any contact with the other neighbour.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST``.
@@ -101,8 +101,8 @@ def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) ->
 
 @compiled(apart=True)
 def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, other: Floats) -> float:
-    """Return the latest time (s) of a first contact with one neighbour that comes before any contact with the other
-    neighbour.
+    """Return the latest time (s) at which a contact with the neighbour ``kind`` can come before any contact with the
+    other neighbour.
 
     The function finds this time by bisection: the later the first contact, the nearer is the other neighbour. The later
     the contact with the front vehicle, the shorter the controlled vehicle drives, so the rear vehicle comes nearer. The
@@ -132,8 +132,8 @@ def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, o
 
 @compiled(apart=True)
 def last_meeting(at: Floats, first: float, plan: Floats, other: Floats) -> tuple[float, float, bool]:
-    """Return the latest time (s) of a contact with the front vehicle, and the latest time (s) of such a contact before
-    the rear vehicle arrives.
+    """Return the latest time (s) of a contact with the front vehicle, and the latest time (s) at which a contact with
+    the front vehicle can come before the rear vehicle arrives.
 
     The third result is True if the first contact with the front vehicle may come arbitrarily late and at any closing
     speed.
@@ -315,8 +315,8 @@ def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
 
 @compiled(apart=True)
 def last_rest(at: Floats) -> tuple[float, float]:
-    """Return the time (s) by which all harm in the combined bound has happened, and the time (s) at which the rear
-    vehicle comes to rest if it brakes fully and no other vehicle pushes it.
+    """Return the time (s) by which all harm that the combined bound counts has happened, and the time (s) at which the
+    rear vehicle comes to rest if it brakes fully and no other vehicle pushes it.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.

@@ -56,9 +56,10 @@ def all_three(at: Floats) -> tuple[float, float, float, float]:
 
 @compiled
 def leader_pushed(at: Floats, early: float, beyond: float) -> tuple[float, float]:
-    """Return the speed (m/s) of the front vehicle after a push, and the time (s) at which it then hits the obstacle.
+    """Return the speed (m/s) of the front vehicle after a push, and the time (s) at which the front vehicle hits the
+    obstacle after this push.
 
-    The push is just strong enough that the front vehicle hits the obstacle with the speed ``sqrt(beyond)``.
+    The push is just strong enough that the front vehicle hits the obstacle with the speed ``sqrt(beyond)`` (m/s).
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -203,7 +204,8 @@ def behind_leader(
     at: Floats, early: float, late: float, soft: float, hard: float, beyond: float, place: float, speed: float,
     plan: Floats, other: Floats,
 ) -> float:  # fmt: skip
-    """Return the smallest squared closing speed (m2/s2) at the rear pair after a first contact with the front vehicle.
+    """Return the smallest squared closing speed (m2/s2) of the rear pair (controlled and rear vehicle) after the
+    controlled vehicle's first contact, which is with the front vehicle.
 
     The function assumes that the front vehicle hits the obstacle with at most ``sqrt(beyond)`` m/s, and that no vehicle
     passes the front vehicle or the obstacle. The result is LARGE (a huge number) if these assumptions contradict each
@@ -290,8 +292,8 @@ def behind_leader(
 def after_at_obstacle(
     at: Floats, early: float, late: float, soft: float, hard: float, follows: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the smallest harm (m2/s2) at the rear pair and at the obstacle together after a first contact with the
-    front vehicle.
+    """Return the smallest sum (m2/s2) of the harm of the rear pair (controlled and rear vehicle) and the harm at the
+    obstacle, after a first contact with the front vehicle.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -300,7 +302,7 @@ def after_at_obstacle(
         late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         soft: smallest closing speed that the first contact may have, m/s.
         hard: largest closing speed that the first contact may have, m/s.
-        follows: known lower bound on the harm of the rear pair, m2/s2.
+        follows: known lower bound on the harm of the rear pair (controlled and rear vehicle), m2/s2.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
@@ -362,8 +364,8 @@ def beyond_rear(
 def after_rear(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the smallest harm (m2/s2) at the front pair and at the obstacle together after a first contact with the
-    rear vehicle.
+    """Return the smallest sum (m2/s2) of the harm of the front pair (front and controlled vehicle) and the harm at the
+    obstacle, after a first contact with the rear vehicle.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.

@@ -76,7 +76,7 @@ def time_to_limit(v: float, u: float, limit: float) -> float:
 
 @compiled
 def fill_drive_then_brake(plan: Floats, v: float, u: float, limit: float, drive: float, braking: float) -> None:
-    """Write a plan: drive for ``drive`` seconds, at most up to the speed limit, then brake to rest.
+    """Write a plan: drive for ``drive`` seconds (without exceeding the speed limit), then brake to rest.
 
     Args:
         plan: [2, PIECES] array into which the function writes the motion.

@@ -309,8 +309,8 @@ def after_ramped(
 
 @compiled(apart=True)
 def is_first_ramped(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
-    """Return whether a first contact with one neighbour at ``time`` or later is possible before the other neighbour
-    arrives.
+    """Return whether a first contact with the neighbour ``kind`` at ``time`` or later is possible before the other
+    neighbour arrives.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
@@ -340,7 +340,7 @@ def is_first_ramped(kind: int, at: Floats, time: float, plan: Floats, other: Flo
 def meet_ramped(kind: int, at: Floats, sign: float, plan: Floats, other: Floats) -> tuple[float, float, float]:
     """Return time (s) and closing speed (m/s) of the contact with a neighbour under full drive or full braking.
 
-    Brakes build up at finite rates. The time is infinite and the closing speed 0 if there is no contact. The third
+    Brakes build up at finite rates. If there is no contact, the time is infinite and the closing speed is 0. The third
     result is the smallest closing speed (m/s) of the contact over all motions of the pair in which the gap is never
     larger than in the motion under full drive or full braking.
 

@@ -29,7 +29,7 @@ _MEETING_HALVINGS = 30
 
 @compiled
 def empty_legs() -> Floats:
-    """Return an uninitialised plan, [3, LEGS]. The three rows of the plan are for the end (s), the initial acceleration
+    """Return an uninitialised plan, [3, LEGS]. The three rows of a plan contain the end (s), the initial acceleration
     (m/s2) and the jerk (m/s3) of each interval of constant jerk.
     """
     return np.empty((3, LEGS))
@@ -143,8 +143,8 @@ def speed_after(v: float, u: float, jerk: float, step: float, reached: float) ->
     """Return the speed (m/s) after ``step`` seconds of constant ``jerk`` (m/s3), from the initial acceleration ``u``
     (m/s2).
 
-    ``v`` is the speed at the start (m/s). ``reached`` is the speed after these ``step`` seconds if it is known already,
-    and NaN if not.
+    ``v`` is the speed at the start (m/s). ``reached`` is the speed (m/s) after ``step`` seconds if this speed is
+    already known, and NaN if it is not known.
     """
     return max(v + (u + 0.5 * jerk * step) * step, 0.0) if math.isnan(reached) else reached
 
@@ -182,7 +182,8 @@ def force_of(plan: Floats, now: float) -> float:
 
 @compiled(apart=True)
 def least_on_cubic(constant: float, pressing: float, jerk: float, since: float, until: float) -> float:
-    """Return the smallest ``(constant / t) + (pressing * t / 2) + (jerk * t^2 / 3)`` for t from ``since`` to ``until``.
+    """Return the smallest value of ``(constant / t) + (pressing * t / 2) + (jerk * t^2 / 3)`` for t from ``since`` to
+    ``until``.
 
     The result is -inf if this expression falls without bound as t approaches 0.
     """
