@@ -112,12 +112,12 @@ def search_front(
 ) -> Front:
     """Search every world for the commands with the least weighted harm, for every choice of weights.
 
-    For each choice of weights, the result in a world is at least as good as each of ``CONSTANTS`` constant commands,
-    and as the results for all other choices of weights. With one learner, the result is also at least as good as the
-    profile that is shipped for this world, as each of ``agents``, and as every shipped policy that can drive the
-    learner. The result for a world depends neither on ``threads`` nor on the other worlds. Raises the exceptions of
-    ``checked_weights``, ``best_harm`` and ``make_agents``, and ``InvalidInput`` if ``agents`` are given but the
-    scenario has several learners.
+    For each choice of weights, the weighted harm of the result in a world is at most the weighted harm of each of
+    ``CONSTANTS`` constant commands, and of the results for all other choices of weights. With one learner, the result
+    also has at most the weighted harm of the shipped profile of this world, of each of ``agents``, and of every shipped
+    policy that can drive the learner. The result for a world depends neither on ``threads`` nor on the other worlds.
+    Raises the exceptions of ``checked_weights``, ``best_harm`` and ``make_agents``, and ``InvalidInput`` if ``agents``
+    are given but the scenario has several learners.
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.extensions.fronts.front import search_front
@@ -243,8 +243,8 @@ def _searched(
 ) -> Front:
     """Search ``worlds`` for every choice of weights, and return the front.
 
-    There are two searches for each choice of weights. For each world, the second search starts from the best one of the
-    profiles that the first searches for all choices of weights have found.
+    There are two searches for each choice of weights. For each world and choice of weights, the second search starts
+    from the profile with the least weighted harm among all profiles that have already been tried in this world.
 
     Args:
         worlds: worlds at t = 0, [n].
@@ -252,7 +252,7 @@ def _searched(
         weights: weights of the vehicles' harm, [W, N].
         effort: keyword arguments ``budget``, ``seed`` and ``threads`` of ``search_profiles``.
         preferring: for each of the W choices of weights, the scenario with these weights and agents for this scenario.
-        tell: function that is called after each search; its argument is the number of worlds that were searched.
+        tell: function that is called after each search with the number of worlds that this search covered.
 
     """
     problem, pool = task_problem(worlds, task), Pool()
@@ -318,7 +318,7 @@ class Pool:
     def choice(self, weights: Floats, harm_count: HarmCount) -> Ints:
         """Return, for each world, the number of the profile with the least weighted harm, [n].
 
-        The profiles are numbered in the order in which they were added.
+        The profiles are numbered from 0 in the order in which they were added to the pool.
 
         Among profiles with equal weighted harm, the profile with the least unweighted harm of the line is chosen.
         ``weights`` [N] are the weights of the vehicles' harm, and ``harm_count`` is the count of harm that is weighted.
@@ -344,7 +344,8 @@ class Pool:
         """Choose the profile with the least weighted harm in each world, for each of W choices of weights.
 
         The first result is a dictionary from the harm count to the harm of each vehicle under the chosen profiles, [W,
-        n, N] m2/s2. The second result contains the chosen profiles, [n], for each choice of weights.
+        n, N] m2/s2. The second result is a tuple with the chosen profiles of the n worlds, one element for each choice
+        of weights.
 
         ``weights`` [W, N] are the choices of weights, and ``harm_count`` is the count of harm that is weighted.
         """

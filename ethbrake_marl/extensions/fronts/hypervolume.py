@@ -1,4 +1,4 @@
-"""Nondominated points of a set, and the volume of the region that the points dominate."""
+"""Find the points of a set that no other point dominates, and compute the volume that the points dominate."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ def nondominated(points: Floats) -> Bools:
     """Return a mask [..., Q]: True for each of Q points that is *nondominated*, which means that no other point
     dominates it.
 
-    Smaller coordinates are better. Point A dominates point B if no coordinate of A is larger than that coordinate of B,
-    and at least one is smaller. ``points`` [..., Q, N] contains the N coordinates of the Q points.
+    Smaller coordinates are better. Point A dominates point B if no coordinate of A is larger than the same coordinate
+    of B, and at least one coordinate of A is smaller than the same coordinate of B. ``points`` [..., Q, N] contains the
+    N coordinates of the Q points.
     """
     one, other = points[..., :, np.newaxis, :], points[..., np.newaxis, :, :]
     beaten = (other <= one).all(axis=-1) & (other < one).any(axis=-1)

@@ -163,8 +163,9 @@ def full_braking(scenario: Scenario, sample: Sample) -> Borne:
 def front_sheet(results: Json) -> Sheet:
     """Return a table with one row for each choice of weights, and one for each further result, such as full braking.
 
-    A row contains the mean harm of each vehicle. The row of a choice of weights also contains the ``ratio`` of each
-    agent. ``results`` is the content of ``front.json``.
+    A row contains the mean harm of each vehicle. The row of a choice of weights also contains, for each agent, its
+    ``ratio``: the agent's mean weighted harm divided by the mean weighted harm of the front. ``results`` is the content
+    of ``front.json``.
     """
     count = results["harm_count"]
     columns: list[Column | str] = [

@@ -21,9 +21,8 @@ SLIGHT = 1e-4  # weight of the other vehicles in a corner; their harm decides be
 def weight_grid(vehicles: int, steps: int = STEPS) -> Floats:
     """Return W evenly spaced choices of weights, [W, N]. In each choice the weights of the N vehicles sum to 1.
 
-    From one choice to the next, the weight of one vehicle rises by 1 / ``steps``, and the weight of another vehicle
-    falls by 1 / ``steps``. Raises ``InvalidInput`` if ``steps`` is below 1, or if there would be more than ``MOST``
-    choices.
+    From each row to the next, the weight of one vehicle rises by 1 / ``steps``, and the weight of another vehicle falls
+    by 1 / ``steps``. Raises ``InvalidInput`` if ``steps`` is below 1, or if there would be more than ``MOST`` choices.
 
     >>> from ethbrake_marl.extensions.fronts.weights import weight_grid
     >>> weight_grid(3, 1).tolist()
@@ -55,10 +54,10 @@ def weight_grid(vehicles: int, steps: int = STEPS) -> Floats:
 
 
 def corners(vehicles: int) -> Floats:
-    """Return one choice of weights for each of the N vehicles, [N, N]: in row i, vehicle i has the weight 1.
+    """Return one choice of weights for each of the N vehicles, [N, N], with almost all weight on this vehicle.
 
-    In row i, all other vehicles have the weight ``SLIGHT``. The harm of the other vehicles decides only between
-    commands under which vehicle i has almost the same harm.
+    In row i, vehicle i has the weight 1, and every other vehicle has the weight ``SLIGHT``. The harm of the other
+    vehicles decides only between commands under which vehicle i has almost the same harm.
     """
     return np.where(np.eye(vehicles) == 1.0, 1.0, SLIGHT)
 

@@ -1,13 +1,13 @@
 """Decide whether the controlled vehicle can avoid contact with both neighbours.
 
 One trajectory decides. The *largest trajectory* of the controlled vehicle is farther ahead at every time than any other
-trajectory that stays behind the front vehicle. Contact with the rear vehicle can be avoided exactly if the rear vehicle
-stays behind the largest trajectory.
+trajectory that stays behind the front vehicle. Contact with the rear vehicle can be avoided if and only if the rear
+vehicle stays behind the largest trajectory.
 
 Symbols: the index l marks the front vehicle (leader), f the controlled vehicle (follower), r the rear vehicle. A gap is
 in m, a speed v in m/s, a braking capacity a > 0 and a driving capacity u >= 0 in m/s2. Time 0 is the moment at which
-the controlled vehicle may act; the leader already brakes then. docs/internals/proofs/avoidable-contact.md derives every
-formula. The formulas use only + - * / and sqrt, so they give the same bits on every machine.
+the controlled vehicle may act; the leader already brakes at time 0. docs/internals/proofs/avoidable-contact.md derives
+every formula. The formulas use only + - * / and sqrt, so they give the same bits on every machine.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ def drive_before_braking(
 
     The results are the duration of the drive (s), the time at which the gap becomes 0 (s), and whether both vehicles
     still move at that time. If both vehicles still move when the gap becomes 0, then ``a_f > a_l`` and both have the
-    same speed. If they do not both move at that time, the follower comes to rest behind the leader, which is already at
-    rest. The duration and the time are infinite if the follower never moves.
+    same speed. If at least one vehicle is at rest when the gap becomes 0, the follower comes to rest behind the leader,
+    which is already at rest. The first two results are infinite if the follower never moves.
 
     Args:
         gap: gap to the leader, m.
@@ -159,7 +159,7 @@ def lowest_while_coasting(gap: float, v_f: float, v_r: float, a_r: float, onset_
 
 @compiled
 def met(gap: float, closing: float) -> bool:
-    """Return whether a pair with this gap (m) and closing speed (m/s) has had an impact, or has one at this moment."""
+    """Return whether a pair with the given ``gap`` (m) and closing speed ``closing`` (m/s) has or had an impact."""
     return gap < -ROUNDING_M or (gap <= 0.0 and closing > BOUND.TOUCH_SPEED_MPS)
 
 
@@ -168,10 +168,10 @@ def leader_at_onset(
     gap: float, v_l: float, a_l: float, onset_l: float, v_f: float, start: float
 ) -> tuple[float, float]:
     """Return the gap to the leader (m) and the speed of the leader (m/s) at ``start``, if the follower coasts until
-    then.
+    ``start``.
 
     The leader brakes from the time ``onset_l`` on; ``onset_l`` must not be after ``start``. Until ``start`` the gap is
-    a concave function of time: if it is not negative at ``start``, it was not negative before.
+    a concave function of time: if the gap is not negative at ``start``, the gap was not negative at any earlier time.
 
     Args:
         gap: present gap between the two vehicles, m.
@@ -251,7 +251,7 @@ def plan_behind(
 
 @compiled
 def meets_rear_early(gap: Floats, speed: Floats, onset: Floats, braking: Floats, i: int, out: Floats) -> bool:
-    """Return whether the vehicle behind vehicle ``i`` has contact with it before vehicle ``i`` may act.
+    """Return whether the vehicle behind vehicle ``i`` has contact with vehicle ``i`` before vehicle ``i`` may act.
 
     Args:
         gap: [P] gap of each pair, m.
@@ -356,13 +356,13 @@ class Avoidability:
     stays behind the front vehicle. ``margin_m`` is the smallest gap between the largest trajectory and the rear
     vehicle. If the controlled vehicle has no rear vehicle, ``margin_m`` is the part of the gap to the front vehicle
     that remains under full braking. ``margin_m`` is negative if contact is unavoidable. If the reason is *front*,
-    ``margin_m`` is minus the missing gap; if the reason is *early*, ``margin_m`` is minus the overlap before the
-    vehicle may act.
+    ``margin_m`` is minus the distance by which the gap to the front vehicle is too short for full braking. If the
+    reason is *early*, ``margin_m`` is minus the overlap before the vehicle may act.
 
-    ``switch_s`` and ``command_mps2`` are times and commands that show how to avoid contact: in a simulation they cause
-    no impact. Each command applies from its time (s after the alert) until the time of the next command. An infinite
-    time means that the command never applies. ``switch_s`` and ``command_mps2`` are NaN in worlds where contact is
-    unavoidable.
+    ``command_mps2`` and ``switch_s`` are commands that show how to avoid contact, and their times: in a simulation
+    these commands cause no impact. Each command applies from its time (s after the alert) until the time of the next
+    command. A command whose time in ``switch_s`` is infinite never applies. ``switch_s`` and ``command_mps2`` are NaN
+    in worlds where contact is unavoidable.
     """
 
     # [n] 0: contact is avoidable. 1, early: a pair has contact before the controlled vehicle may act. 2, front: even
@@ -398,9 +398,9 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
             ``Scenario.roles``. The only script allowed is full_brake. If ``scripts`` is None, all vehicles that are not
             controlled brake fully.
 
-    Raises ``InvalidInput`` for lines and scripts that are not allowed. The function also raises ``InvalidInput`` if the
-    front vehicle may brake only after the controlled vehicle may act, if a vehicle moves backward, or if vehicle_1
-    could reach an obstacle (``obstacle_gap_m``) before any contact.
+    Raises ``InvalidInput`` for a line other than those described above, and for a script other than full_brake. The
+    function also raises ``InvalidInput`` if the front vehicle may brake only after the controlled vehicle may act, if a
+    vehicle moves backward, or if vehicle_1 could reach an obstacle (``obstacle_gap_m``) before any contact.
 
     """
     worlds.refuse_build_up("avoidability")

@@ -79,8 +79,8 @@ def decision_around(at: Floats, early: float, late: float) -> tuple[float, float
 
 @compiled(apart=True)
 def lacking(kind: int, at: Floats, early: float, late: float, softest: float, hard: float, begin: float) -> float:
-    """Return a lower bound (m/s2) on the difference between the command during a first contact and the best command
-    after this contact.
+    """Return a lower bound (m/s2) on the amount by which the controlled vehicle's command at a first contact differs
+    from the command that leads to the least harm after this contact.
 
     If the first contact is with the front vehicle, braking before this contact makes it gentle, and driving after this
     contact softens a later impact from behind. If the first contact is with the rear vehicle, driving is best before
@@ -274,8 +274,8 @@ def least_harm(
         last: latest time of the first contact, in s from the moment at which the controlled vehicle may act.
         floor: known lower bound on the harm of the other pair (the pair that does not have the first contact), m2/s2.
         best: smallest harm that the search has reached so far, m2/s2.
-        enough: lower bound that is already proven in another way, m2/s2; the function returns 0 if the bound of some
-            first contact is not above ``enough``.
+        enough: lower bound on the harm that is already proven in another way, m2/s2; the function returns 0 if the harm
+            that it proves for some first contact is not above ``enough``.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan`` (with brake build-up from
             ``empty_legs``); overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
@@ -311,7 +311,7 @@ def next_split(kind: int, at: Floats, time: float, last: float) -> float:
     """Return the next time (s) after ``time`` at which a decision is due or the front vehicle comes to rest; at most
     ``last``.
 
-    With brake build-up, the result is at most ``_PART_S`` (0.05 s) later than ``time``.
+    With brake build-up, the result is at most 0.05 s (``_PART_S``) later than ``time``.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake

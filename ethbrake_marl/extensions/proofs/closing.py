@@ -1,9 +1,9 @@
 """Compute the smallest possible closing speed of a pair's first contact, whatever the vehicles do.
 
-The bound compares every motion of the pair with two extreme motions. The leader (front vehicle) goes as far ahead as it
-can: it drives fully if it is controlled, and brakes fully otherwise. The follower brakes fully, so it stays as far
-behind as it can. If the extreme motions lead to contact, every other motion of the pair leads to contact at the same
-time or earlier. docs/internals/proofs/team-bound.md has the proof.
+The bound compares every motion of the pair with one extreme motion of each vehicle. The leader (front vehicle) goes as
+far ahead as it can: it drives fully if it is controlled, and brakes fully otherwise. The follower brakes fully, so it
+stays as far behind as it can. If the extreme motions lead to contact, every other motion of the pair leads to contact
+at the same time or earlier. docs/internals/proofs/team-bound.md has the proof.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ def least_on_piece(constant: float, pressing: float, since: float, until: float)
 @compiled(apart=True)
 def least_before(at: Floats, met: float, squared: float) -> float:
     """Return the smallest closing speed (m/s) of a pair's first contact until ``met``, for a leader that follows a
-    script. If the contact happens at the time t (s), its closing speed is at least ``c(t) + (g(t) / t)``. Here c(t) and
-    g(t) are the closing speed (m/s) and the gap (m) at the time t if both vehicles brake fully. ``g(t) / t`` is the
-    additional speed that the follower needs to close the gap g(t) by the time t.
+    script. If the first contact happens at the time t (s), its closing speed is at least ``c(t) + (g(t) / t)``. Here
+    c(t) and g(t) are the closing speed (m/s) and the gap (m) at the time t if both vehicles brake fully. ``g(t) / t``
+    is the additional speed that the follower needs to close the gap g(t) by the time t.
 
     Args:
         at: [PAIR_WIDTH] values of one pair, in the order ``PAIR_GAP`` to ``FOLLOWER_A``.
@@ -78,7 +78,7 @@ def least_before(at: Floats, met: float, squared: float) -> float:
 def least_closing_of_pair(at: Floats, until: float, plan: Floats, other: Floats) -> tuple[float, float]:
     """Return the smallest closing speed (m/s) of a pair's first contact, and the latest time of that contact (s).
 
-    The results are 0 and infinity if no contact is certain.
+    The results are 0 and infinity if contact is not certain.
 
     Args:
         at: [PAIR_WIDTH] values of one pair, in the order ``PAIR_GAP`` to ``FOLLOWER_A``.

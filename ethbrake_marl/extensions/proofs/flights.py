@@ -18,14 +18,15 @@ from ethbrake_marl.physics.jit import compiled
 @compiled
 def flight_lead(share: float, press: float, reach: float, opening: float, flight: float) -> float:
     """Return the *lead* of a flight: the speed (m/s) that the controlled vehicle gains by the flight, minus the speed
-    that the flight costs.
+    that it must give up for the flight.
 
     A *flight* is a period in which the controlled vehicle and the neighbour of its first contact are not in contact.
-    The gain is the speed of the controlled vehicle minus the speed of the centre of mass of these two vehicles. For a
-    flight that lasts L seconds and begins with the opening speed o (m/s), the lead is ``share (press L - o) - G``. G is
-    the speed (m/s) that the controlled vehicle must give up so that the two vehicles stay apart for the time L: the
-    smallest G with ``G L - G^2 / (2 reach) >= (press L^2 / 2) - o L``. In each second the controlled vehicle can give
-    up at most ``reach`` m/s. The result is -inf if no command keeps the vehicles apart for the time L.
+    The gain is the speed of the controlled vehicle minus the speed of the centre of mass of this vehicle and this
+    neighbour. For a flight that lasts L seconds and begins with the opening speed o (m/s), the lead is
+    ``share (press L - o) - G``. G is the speed (m/s) that the controlled vehicle must give up so that the two vehicles
+    stay apart for the time L: the smallest G with ``G L - G^2 / (2 reach) >= (press L^2 / 2) - o L``. In each second
+    the controlled vehicle can give up at most ``reach`` m/s. The result is -inf if no command keeps the vehicles apart
+    for the time L.
 
     Args:
         share: mass of the partner (the neighbour of the first contact), divided by the total mass of the partner and
@@ -100,7 +101,8 @@ def lead(
         opening: largest speed at which the two vehicles of the pair may separate at the start of the flight, m/s.
         shortest: smallest duration of the flight, s.
         longest: largest duration of the flight, s.
-        lost: speed that the controlled vehicle loses in any case, because it cannot change its command at once, m/s.
+        lost: speed that the controlled vehicle loses because it cannot change its command right after the first
+            contact, m/s.
 
     """
     if press > 0.0:
@@ -118,9 +120,9 @@ def lead(
 
 @compiled
 def decays(share: float, press: float, reach: float, bounce: float) -> bool:
-    """Return True if the vehicle cannot gain speed in the following way: accelerate less now, and therefore bounce more
-    strongly off its partner later. If the result is True, ``reach`` limits the speed that the vehicle can gain in any
-    flight (period without contact).
+    """Return False if the controlled vehicle may gain speed in the following way: it accelerates less now, and
+    therefore bounces more strongly off its partner (the neighbour of its first contact) later. If the result is True,
+    ``reach`` limits the speed that the vehicle can gain in any flight (period without contact).
 
     Args:
         share: mass of the partner (the neighbour of the first contact), divided by the total mass of the partner and
@@ -150,9 +152,9 @@ def largest_lead(
     pair.
 
     The pair is the controlled vehicle and the neighbour of its first contact. The motion of the centre of mass is
-    computed as if the controlled vehicle executed the best command from the first contact on. In reality, the command
-    from before the contact still applies in the *window* (the rest of the decision step). In the window the controlled
-    vehicle loses the speed ``lost`` (m/s).
+    computed as if the controlled vehicle executed the extreme command (full drive or full braking) from the first
+    contact on. In reality, the command of the earlier decision still applies in the *window* (the rest of the decision
+    step of the first contact). In the window the controlled vehicle loses the speed ``lost`` (m/s).
 
     A *flight* is a period in which the two vehicles of the pair are not in contact. The bound is the maximum over three
     cases: the last flight before the contact with the neighbour outside the pair begins with the first impact, begins
@@ -166,7 +168,7 @@ def largest_lead(
         reach: largest amount by which a command other than the extreme command can lower the acceleration ``press``,
             m/s2; infinite if no limit is known.
         bounce: coefficient of restitution.
-        opening: speed at which the pair separates after the first contact, m/s.
+        opening: speed at which the two vehicles of the pair separate after the first contact, m/s.
         lost: speed that the controlled vehicle loses in the window (the rest of the decision step), m/s.
         late: start of the window (the rest of the decision step of the first contact), s.
         end: end of the window (the rest of the decision step of the first contact), s.
@@ -196,10 +198,10 @@ def largest_lead(
 def widest_flight(
     share: float, slack: float, press: float, drive: float, bounce: float, closing: float, back: float, time: float
 ) -> float:
-    """Return the largest value of ``sqrt(p^2 + 2 press s)`` (m/s) in the flights of a vehicle and a partner that brakes
-    harder. Here p is the speed at which the two vehicles separate (m/s), and s is the gap between them (m). A *flight*
-    is a period in which the controlled vehicle and the neighbour of its first contact are not in contact. The result is
-    infinite if no bound is known.
+    """Return the largest value of ``sqrt(p^2 + 2 press s)`` (m/s) during the flights of the controlled vehicle and a
+    partner that brakes harder than this vehicle. Here p is the speed (m/s) at which vehicle and partner separate, and s
+    is the gap (m) between them. A *flight* is a period in which the controlled vehicle and the neighbour of its first
+    contact are not in contact. The result is infinite if no bound of this value is known.
 
     Args:
         share: mass of the partner (the neighbour of the first contact), divided by the total mass of the partner and
@@ -208,11 +210,11 @@ def widest_flight(
             controlled vehicle, m/s2.
         press: acceleration, m/s2, of the controlled vehicle and the neighbour of its first contact towards each other,
             under the extreme command (full drive or full braking).
-        drive: largest acceleration that the vehicle can command, m/s2.
+        drive: largest acceleration that the controlled vehicle can command, m/s2.
         bounce: coefficient of restitution.
         closing: closing speed of the first impact, m/s.
-        back: backward speed of the vehicle after the first impact, m/s.
-        time: duration for which the bound holds, s.
+        back: backward speed of the controlled vehicle after the first impact, m/s.
+        time: duration for which the result holds, s.
 
     """
     if not slack > 0.0 or not bounce * bounce * press < slack:

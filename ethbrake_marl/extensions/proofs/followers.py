@@ -7,7 +7,7 @@ again; ``flights.largest_lead`` bounds the difference. docs/internals/proofs/low
 
 Each function computes one bound for all first contacts between the times ``early`` and ``late``, from the state at
 ``early``. From ``late`` to ``end`` (the end of the decision step) the command of the earlier decision still applies.
-This command differs from the extreme command by at least ``lack`` (m/s2).
+The command of the earlier decision differs from the extreme command by at least ``lack`` (m/s2).
 """
 
 from __future__ import annotations
@@ -61,11 +61,11 @@ def least_closing(
     Args:
         start: closing speed, at the time of the first contact, of the second neighbour relative to the centre of mass
             of the controlled vehicle and its first neighbour, m/s.
-        slope: rate at which this closing speed (``start``) changes from the first contact on, m/s2.
+        slope: rate at which the closing speed, which begins with ``start``, changes from the first contact on, m/s2.
         turn: time at which the rate of change of the closing speed (``slope``) increases by ``bend``, s.
-        bend: increase of the rate of change of the closing speed at the time ``turn``, m/s2; may be negative.
-        other_turn: time at which the rate of change of the closing speed increases by ``other_bend``, s.
-        other_bend: increase of the rate of change of the closing speed at the time ``other_turn``, m/s2; may be
+        bend: increase of ``slope`` (rate of change of the closing speed) at the time ``turn``, m/s2; may be negative.
+        other_turn: time at which the rate of change of the closing speed (``slope``) increases by ``other_bend``, s.
+        other_bend: increase of ``slope`` (rate of change of the closing speed) at the time ``other_turn``, m/s2; may be
             negative.
         share: mass of the first neighbour, divided by the total mass of this neighbour and the controlled vehicle, 0 to
             1.
@@ -99,7 +99,8 @@ def least_closing(
 def pushed_by_leader(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the smallest closing speed (m/s) at the rear pair after a first contact with the front vehicle (leader).
+    """Return the smallest closing speed (m/s) of the rear pair (controlled and rear vehicle) after a first contact with
+    the front vehicle (leader).
 
     The bound uses the centre of mass of the leader and the controlled vehicle. The result is 0 if nothing is proven. If
     the leader is at rest at ``early``, a later first contact leads to the same motion at a later time, so the function
@@ -112,8 +113,9 @@ def pushed_by_leader(
         late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         closing: largest closing speed that the first contact may have, m/s.
         end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
-        lack: smallest possible difference between the command that applies until ``end`` and the best command after the
-            first contact, m/s2.
+        lack: smallest amount, m/s2, by which the controlled vehicle's command until ``end`` differs from the extreme
+            command (full drive after a first contact with the front vehicle, full braking after one with the rear
+            vehicle).
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
@@ -149,7 +151,8 @@ def pushed_by_leader(
 
 @compiled(apart=True)
 def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: Floats, other: Floats) -> float:
-    """Return the smallest closing speed (m/s) at the rear pair after a first contact with a leader that brakes harder.
+    """Return the smallest closing speed (m/s) of the rear pair (controlled and rear vehicle) after a first contact with
+    a leader that brakes harder than the controlled vehicle.
 
     The leader is the front vehicle. The controlled vehicle stays near the leader, because the leader brakes harder. The
     result is 0 if nothing is proven.
@@ -202,10 +205,11 @@ def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: 
 def after_front(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the smallest squared closing speed (m2/s2) at the rear pair after a first contact with the front vehicle.
+    """Return the smallest squared closing speed (m2/s2) of the rear pair (controlled and rear vehicle) after the
+    controlled vehicle's first contact, which is with the front vehicle.
 
-    The result is the largest of several bounds. If an obstacle may throw the vehicles back, the bounds that use the
-    centre of mass of the front and the controlled vehicle do not hold, and are left out.
+    The result is the largest of several lower bounds. If an obstacle may throw the vehicles back, the bounds that use
+    the centre of mass of the front and the controlled vehicle do not hold, and are left out.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -214,8 +218,9 @@ def after_front(
         late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         closing: largest closing speed that the first contact may have, m/s.
         end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
-        lack: smallest possible difference between the command that applies until ``end`` and the best command after the
-            first contact, m/s2.
+        lack: smallest amount, m/s2, by which the controlled vehicle's command until ``end`` differs from the extreme
+            command (full drive after a first contact with the front vehicle, full braking after one with the rear
+            vehicle).
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
@@ -270,7 +275,7 @@ def braking_after(
 ) -> float:
     """Return the smallest squared closing speed (m2/s2) at which a braking vehicle reaches the vehicle in front.
 
-    The vehicle brakes with at most ``a_f``; the vehicle in front brakes fully. The result is 0 if no contact is
+    The vehicle brakes with at most ``a_f``; the vehicle in front brakes fully. The result is 0 if contact is not
     certain.
 
     Args:
@@ -298,7 +303,8 @@ def pushed_by_rear(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, gap: float, plan: Floats,
     other: Floats,
 ) -> float:  # fmt: skip
-    """Return the smallest closing speed (m/s) at the front pair after the rear vehicle has hit the controlled one.
+    """Return the smallest closing speed (m/s) of the front pair (front and controlled vehicle) after the rear vehicle
+    has hit the controlled vehicle.
 
     The bound uses the centre of mass of the controlled vehicle and the rear vehicle. The braking capacity of the
     controlled vehicle must be at least the braking capacity of the rear vehicle.
@@ -310,8 +316,9 @@ def pushed_by_rear(
         late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         closing: largest closing speed that the first contact may have, m/s.
         end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
-        lack: smallest possible difference between the command that applies until ``end`` and the best command after the
-            first contact, m/s2.
+        lack: smallest amount, m/s2, by which the controlled vehicle's command until ``end`` differs from the extreme
+            command (full drive after a first contact with the front vehicle, full braking after one with the rear
+            vehicle).
         gap: gap to the front vehicle at ``early``, m.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
@@ -339,7 +346,8 @@ def pushed_by_rear(
 
 @compiled(apart=True)
 def slowed_by_rear(at: Floats, early: float, closing: float, gap: float, plan: Floats, other: Floats) -> float:
-    """Return the smallest closing speed (m/s) at the front pair after the rear vehicle has hit the controlled one.
+    """Return the smallest closing speed (m/s) of the front pair (front and controlled vehicle) after the rear vehicle
+    has hit the controlled vehicle.
 
     The bound follows from the fact that the controlled vehicle stays ahead of the rear vehicle. The braking capacity of
     the controlled vehicle must be at least the braking capacity of the rear vehicle. The result is 0 if the closing

@@ -41,14 +41,15 @@ _SHORT_S = 1e-3  # smallest time in a denominator
 
 @compiled
 def gained(near: float, time: float, since: float, power: float) -> float:
-    """Return the smallest speed (m/s) by which the rear vehicle is faster at ``time`` than under its own full braking.
+    """Return the smallest possible difference (m/s) between the rear vehicle's speed at ``time`` and the lower speed
+    that this vehicle would have at ``time`` under full braking.
 
     Args:
         near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m.
         time: time at which the rear vehicle's speed is compared with its speed under full braking, s.
         since: time from which on the rear vehicle may brake less than fully, s.
-        power: largest difference between the rear vehicle's acceleration and its acceleration under full braking, m/s2;
-            infinite if other vehicles may push the rear vehicle.
+        power: largest possible value of the rear vehicle's acceleration minus its acceleration under full braking,
+            m/s2; infinite if other vehicles may push the rear vehicle.
 
     """
     if near <= 0.0 or time <= since:
@@ -64,7 +65,8 @@ def behind_full_braking(at: Floats, early: float, late: float) -> float:
     """Return the gap (m) between the controlled vehicle's position at ``early`` (s) and the rear vehicle's position at
     ``late`` (s) if both brake fully.
 
-    A negative gap is an overlap: the rear vehicle would be that far ahead of the controlled vehicle.
+    A negative gap means an overlap: the rear vehicle's position at ``late`` is ahead of the controlled vehicle's
+    position at ``early`` by this distance.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -92,8 +94,8 @@ def soft_behind(at: Floats, early: float, late: float, near: float, far: float, 
         near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m.
         far: largest distance by which the rear vehicle is farther ahead than if it braked fully, m.
         since: time from which on the rear vehicle may brake less than fully, s.
-        power: largest difference between the rear vehicle's acceleration and its acceleration under full braking, m/s2;
-            infinite if other vehicles may push the rear vehicle.
+        power: largest possible value of the rear vehicle's acceleration minus its acceleration under full braking,
+            m/s2; infinite if other vehicles may push the rear vehicle.
 
     """
     faster = gained(near, late, since, power)
@@ -108,10 +110,12 @@ def after_behind(
     at: Floats, early: float, late: float, near: float, far: float, hard: float, faster: float, moved: Floats,
     plan: Floats, other: Floats,
 ) -> float:  # fmt: skip
-    """Return the smallest squared closing speed (m2/s2) at the front pair after a first contact with the rear vehicle.
+    """Return the smallest squared closing speed (m2/s2) of the front pair (front and controlled vehicle) after the
+    controlled vehicle's first contact, which is with the rear vehicle.
 
-    The bound is computed for one motion, which starts from a state at ``early``. After every first contact in the given
-    ranges, the controlled vehicle is at every time at least as far ahead and at least as fast as in this motion.
+    The bound is computed for one motion of the controlled vehicle, which starts from a state at ``early``. After every
+    first contact in the given ranges, the controlled vehicle is at every time at least as far ahead and at least as
+    fast as in the motion for which the bound is computed.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -121,7 +125,7 @@ def after_behind(
         near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m.
         far: largest distance by which the rear vehicle is farther ahead than if it braked fully, m.
         hard: largest closing speed that the first contact may have, m/s.
-        faster: smallest difference between the rear vehicle's speed and its speed under full braking, m/s.
+        faster: smallest possible value of the rear vehicle's speed minus its speed under full braking, m/s.
         moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
@@ -168,9 +172,10 @@ def put_behind(
         far: largest distance by which the rear vehicle is farther ahead than if it braked fully, m.
         soft: smallest closing speed that the first contact may have, m/s.
         hard: largest closing speed that the first contact may have, m/s.
-        search: four numbers that the search needs, [SEARCH]. ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of the
-            function ``gained``. ``FLOOR`` is the lower bound on the harm of the front pair alone (m2/s2). ``BEST`` is
-            the smallest harm that the search has reached so far (m2/s2).
+        search: four numbers that the search needs, [SEARCH]. ``search[SINCE]`` (s) and ``search[POWER]`` (m/s2) are the
+            arguments ``since`` and ``power`` of the function ``gained``. ``search[FLOOR]`` is the lower bound on the
+            harm of the front pair alone (m2/s2). ``search[BEST]`` is the smallest harm that the search has reached so
+            far (m2/s2).
         count: number of cells (ranges of first contacts) on the heap.
         moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
@@ -210,10 +215,10 @@ def try_behind(
         near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m; the function uses
             a larger distance if no contact at ``time`` is possible with the distance ``near``.
         far: largest distance by which the rear vehicle is farther ahead than if it braked fully, m.
-        search: four numbers that the search needs, [SEARCH]. ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of the
-            function ``gained``. ``FLOOR`` is the lower bound on the harm of the front pair alone (m2/s2). ``BEST`` is
-            the smallest harm that the search has reached so far (m2/s2). The function lowers ``BEST`` if it reaches a
-            smaller harm.
+        search: four numbers that the search needs, [SEARCH]. ``search[SINCE]`` (s) and ``search[POWER]`` (m/s2) are the
+            arguments ``since`` and ``power`` of the function ``gained``. ``search[FLOOR]`` is the lower bound on the
+            harm of the front pair alone (m2/s2). ``search[BEST]`` is the smallest harm that the search has reached so
+            far (m2/s2); the function lowers ``search[BEST]`` if it reaches a smaller harm.
         moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
@@ -239,10 +244,10 @@ def divide_behind(
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        search: four numbers that the search needs, [SEARCH]. ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of the
-            function ``gained``. ``FLOOR`` is the lower bound on the harm of the front pair alone (m2/s2). ``BEST`` is
-            the smallest harm that the search has reached so far (m2/s2). The function lowers ``BEST`` if it reaches a
-            smaller harm.
+        search: four numbers that the search needs, [SEARCH]. ``search[SINCE]`` (s) and ``search[POWER]`` (m/s2) are the
+            arguments ``since`` and ``power`` of the function ``gained``. ``search[FLOOR]`` is the lower bound on the
+            harm of the front pair alone (m2/s2). ``search[BEST]`` is the smallest harm that the search has reached so
+            far (m2/s2); the function lowers ``search[BEST]`` if it reaches a smaller harm.
         count: number of cells (ranges of first contacts) on the heap.
         moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
@@ -285,10 +290,10 @@ def meetings_behind(
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         last: latest time of the first contact, in s from the moment at which the controlled vehicle may act.
-        search: four numbers that the search needs, [SEARCH]. ``SINCE`` (s) and ``POWER`` (m/s2) are arguments of the
-            function ``gained``. ``FLOOR`` is the lower bound on the harm of the front pair alone (m2/s2). ``BEST`` is
-            the smallest harm that the search has reached so far (m2/s2). The function lowers ``BEST`` if it reaches a
-            smaller harm.
+        search: four numbers that the search needs, [SEARCH]. ``search[SINCE]`` (s) and ``search[POWER]`` (m/s2) are the
+            arguments ``since`` and ``power`` of the function ``gained``. ``search[FLOOR]`` is the lower bound on the
+            harm of the front pair alone (m2/s2). ``search[BEST]`` is the smallest harm that the search has reached so
+            far (m2/s2); the function lowers ``search[BEST]`` if it reaches a smaller harm.
         moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.

@@ -1,9 +1,9 @@
 """Lower bound on the harm of three vehicles: Vehicle 1 is scripted, Vehicle 2 controlled, Vehicle 3 may do anything.
 
 For first contacts with the leader, the module uses ``lower_bound.front_first``, the bound for one controlled vehicle.
-This bound assumes that the rear vehicle brakes fully. The bound also holds for a rear vehicle that may do anything,
-because a rear vehicle that arrives earlier never lowers the harm. For first contacts with the rear vehicle there is a
-separate search (``free_rear.meetings_behind``). docs/internals/proofs/team-bound.md has the proofs.
+This bound assumes that the rear vehicle brakes fully. The bound for full braking also holds for a rear vehicle that may
+do anything, because a rear vehicle that arrives earlier never lowers the harm. For first contacts with the rear vehicle
+there is a separate search (``free_rear.meetings_behind``). docs/internals/proofs/team-bound.md has the proofs.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ def all_at_once(at: Floats, first: float, last: float, pair: Floats, plan: Float
     """Return the smallest harm (m2/s2) of a contact of all three vehicles at the same time; infinite if such a contact
     is impossible.
 
-    Let W be the smallest closing speed that the rear vehicle can have relative to the front vehicle at such a contact.
-    The closing speeds of the two pairs add up to at least W. The closing speed of the front pair is at least the
-    smallest closing speed of any first contact with the front vehicle.
+    Let W be the smallest closing speed that the rear vehicle can have relative to the front vehicle at a contact of all
+    three vehicles. The closing speeds of the two pairs add up to at least W. The closing speed of the front pair is at
+    least the smallest closing speed of any first contact with the front vehicle.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -71,8 +71,8 @@ def late_meetings(at: Floats, first: float, stand: float, plan: Floats, other: F
     ``stand``.
 
     Code 0: the first contact of these two vehicles cannot come after ``stand``. Code 1: this contact can come after
-    ``stand``, but its harm is in this case at least as large as the harm of some first contact with the front vehicle.
-    Code 2: this contact can come after ``stand``, and nothing is proven about its harm.
+    ``stand``; if it does, its harm is at least as large as the harm of some first contact with the front vehicle. Code
+    2: this contact can come after ``stand``, and nothing is proven about its harm.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -104,7 +104,7 @@ def combined_bound_of_team(
     """Return a lower bound (m2/s2) on the harm of the first three vehicles in a world with unavoidable contact.
 
     The bound covers first contacts with the front vehicle and first contacts with the rear vehicle. The result is 0 if
-    some of the harm may come after ``until``.
+    some of the harm that the bound counts may come after ``until``.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -112,7 +112,8 @@ def combined_bound_of_team(
         front: lower bound on the harm of the front pair (front and controlled vehicle) alone, m2/s2.
         rear: lower bound on the harm of the rear pair (controlled and rear vehicle) alone, m2/s2.
         since: time from which on the rear vehicle may brake less than fully, s.
-        power: largest difference between the rear vehicle's acceleration and its acceleration under full braking, m/s2.
+        power: largest possible value of the rear vehicle's acceleration minus its acceleration under full braking,
+            m/s2.
         pair: working memory for the values of one pair, [PAIR_WIDTH]; overwritten.
         moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
@@ -160,7 +161,7 @@ def bound_threes(states: Floats, until: Floats, pairs: Floats, since: Floats, po
         until: [n] horizon, s; later harm does not count.
         pairs: [n, 2] lower bounds on the harm of the first two pairs, each pair alone, m2/s2.
         since: [n] time from which on the rear vehicle may brake less than fully, s.
-        power: [n] largest difference between the rear vehicle's acceleration and its acceleration under full braking,
+        power: [n] largest possible value of the rear vehicle's acceleration minus its acceleration under full braking,
             m/s2.
         out: [n] array into which the function writes the bounds, m2/s2.
 

@@ -1,5 +1,5 @@
-"""Columns of the arrays that describe worlds in the proofs, and the motion of front and rear vehicle if nothing pushes
-them.
+"""Columns of the arrays that describe worlds in the proofs, and the motion of a front or rear vehicle that nothing
+pushes.
 """
 
 from __future__ import annotations

@@ -61,11 +61,11 @@ _PARTS = 8  # number of parts into which the times of soft contacts are divided
 
 @compiled
 def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
-    """Return the smallest squared closing speed (m2/s2) at the rear pair's first contact, and the latest time of this
-    contact (s).
+    """Return the smallest squared closing speed (m2/s2) at the first contact of the rear pair (controlled and rear
+    vehicle), and the latest time (s) of this contact.
 
-    If the controlled vehicle drives fully, the first contact of the rear pair has exactly the returned squared closing
-    speed and time. The time is infinite if full drive avoids contact.
+    If the controlled vehicle drives fully, the first contact of the rear pair happens exactly at the returned time with
+    the returned squared closing speed. The returned time is infinite if full drive avoids this contact.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -83,8 +83,8 @@ def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
 
 @compiled(apart=True)
 def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
-    """Return whether the gentlest first contact (smallest closing speed) with one neighbour at ``time`` comes before
-    any contact with the other neighbour.
+    """Return whether the gentlest first contact (smallest closing speed) with the neighbour ``kind`` at ``time`` comes
+    before any contact with the other neighbour.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST``.
@@ -101,13 +101,13 @@ def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) ->
 
 @compiled(apart=True)
 def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, other: Floats) -> float:
-    """Return the latest time (s) of a first contact with one neighbour that comes before any contact with the other
-    neighbour.
+    """Return the latest time (s) at which a contact with the neighbour ``kind`` can come before any contact with the
+    other neighbour.
 
-    The function finds this time by bisection: the later the first contact, the nearer is the other neighbour. For a
-    later contact with the front vehicle the controlled vehicle drives for a shorter time, so the rear vehicle comes
-    nearer. For a later contact with the rear vehicle the controlled vehicle brakes for a shorter time, so the
-    controlled vehicle comes nearer to the front vehicle.
+    The function finds this time by bisection: the later the first contact, the nearer is the other neighbour. The later
+    the contact with the front vehicle, the shorter the controlled vehicle drives, so the rear vehicle comes nearer. The
+    later the contact with the rear vehicle, the shorter the controlled vehicle brakes, so the controlled vehicle comes
+    nearer to the front vehicle.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST``.
@@ -132,8 +132,8 @@ def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, o
 
 @compiled(apart=True)
 def last_meeting(at: Floats, first: float, plan: Floats, other: Floats) -> tuple[float, float, bool]:
-    """Return the latest time (s) of a contact with the front vehicle, and the latest time (s) of such a contact before
-    the rear vehicle arrives.
+    """Return the latest time (s) of a contact with the front vehicle, and the latest time (s) at which a contact with
+    the front vehicle can come before the rear vehicle arrives.
 
     The third result is True if the first contact with the front vehicle may come arbitrarily late and at any closing
     speed.
@@ -165,15 +165,15 @@ def front_first(
     The result is at most ``best``, the smallest harm that the search has reached. In a contact of all three vehicles at
     once, the closing speeds of the two pairs add up to W, the closing speed of the rear vehicle relative to the front
     vehicle. The closing speed of the front pair is at least the smallest closing speed that is possible at the time of
-    this contact. The result covers a contact of all three vehicles only if a first contact with the front vehicle is
-    possible at the same time.
+    this contact. The result covers a contact of all three vehicles at a time t only if a first contact with the front
+    vehicle is possible at the time t.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         floor: known lower bound on the harm of the other pair (the pair that does not have the first contact), m2/s2.
         best: smallest harm that the search has reached so far, m2/s2.
-        enough: lower bound that is already proven in another way, m2/s2; the function returns 0 if the bound of some
-            first contact is not above ``enough``.
+        enough: lower bound on the harm that is already proven in another way, m2/s2; the function returns 0 if the harm
+            that it proves for some first contact is not above ``enough``.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
         heap: working memory for the search, [CELLS, NEAR]: one row for each cell (range of first contacts).
@@ -249,8 +249,8 @@ def rear_first(
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
         floor: known lower bound on the harm of the other pair (the pair that does not have the first contact), m2/s2.
         best: smallest harm that the search has reached so far, m2/s2.
-        enough: lower bound that is already proven in another way, m2/s2; the function returns 0 if the bound of some
-            first contact is not above ``enough``.
+        enough: lower bound on the harm that is already proven in another way, m2/s2; the function returns 0 if the harm
+            that it proves for some first contact is not above ``enough``.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
         heap: working memory for the search, [CELLS, NEAR]: one row for each cell (range of first contacts).
@@ -288,9 +288,9 @@ def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
     """Return a time (s) after which no first contact with the rear vehicle is possible.
 
     Until its first contact, the rear vehicle passes neither the front vehicle nor the controlled vehicle. Suppose that
-    the rear vehicle brakes harder than the controlled vehicle, by b (m/s2). In this case, t seconds before the contact,
-    the rear vehicle was faster than the controlled vehicle by at least ``b t`` (m/s), if the rear vehicle already
-    braked at that time.
+    the rear vehicle brakes harder than the controlled vehicle, by b (m/s2). If the rear vehicle already braked at the
+    time t seconds before the contact, the rear vehicle was faster at that time than the controlled vehicle by at least
+    ``b t`` (m/s).
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -315,8 +315,8 @@ def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
 
 @compiled(apart=True)
 def last_rest(at: Floats) -> tuple[float, float]:
-    """Return the time (s) by which all harm in the combined bound has happened, and the time (s) at which the rear
-    vehicle comes to rest if it brakes fully and no other vehicle pushes it.
+    """Return the time (s) by which all harm that the combined bound counts has happened, and the time (s) at which the
+    rear vehicle comes to rest if it brakes fully and no other vehicle pushes it.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -335,8 +335,8 @@ def combined_bound(
 ) -> float:
     """Return a lower bound (m2/s2) on the harm of a world with unavoidable contact.
 
-    The first contact may be with the front or the rear vehicle. The result is 0 if some of this harm may come after
-    ``until``.
+    The first contact may be with the front or the rear vehicle. The result is 0 if some of the harm that the bound
+    counts may come after ``until``.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -428,10 +428,11 @@ def lower_bound(
         horizon_s: time until which harm counts, s after the alert.
         scripts: maps the index of each vehicle that is not controlled to the name of its script. The only script
             allowed is full_brake. If ``scripts`` is None, all vehicles that are not controlled brake fully.
-        time_step_s: time between two decisions, s. If ``time_step_s`` is a number, the bound is larger, but it holds
-            only for commands that change at decisions. The first decision comes when the vehicle may act, and the next
-            ones every ``time_step_s`` after it, as for every agent. With a time step the computation takes ten times as
-            long as with None. If ``time_step_s`` is None, commands may change at any time.
+        time_step_s: time between two decisions, s. If ``time_step_s`` is a number, the bound is larger than for None,
+            but it holds only for commands that change at decisions. The first decision comes when the vehicle may act,
+            and the next ones every ``time_step_s`` after it, as for every agent. If ``time_step_s`` is a number, the
+            computation takes ten times as long as for None. If ``time_step_s`` is None, commands may change at any
+            time.
 
     Raises ``InvalidInput`` for lines that ``avoidability`` does not cover, for an unknown ``harm_count``, for a time
     step below ``LEAST_TIME_STEP_S``, and for a horizon that is not finite or lies before the vehicle may act.

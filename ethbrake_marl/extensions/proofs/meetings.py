@@ -125,7 +125,7 @@ def gentlest(kind: int, at: Floats, time: float) -> tuple[float, float]:
     """Return the smallest closing speed (m/s) of a first contact at ``time``, and how long (s) the controlled vehicle
     drives or brakes first.
 
-    With brake build-up, the duration of this driving or braking is returned as 0.
+    With brake build-up, the second result (the duration) is always 0.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake

@@ -1,8 +1,9 @@
 """Compute lower bounds on the harm that must follow a first contact if an obstacle is ahead of the front vehicle.
 
-``beyond`` is the squared speed (m2/s2) at which the leader (front vehicle) hits the obstacle. This speed limits how far
-ahead the leader can be at any time. Position 0 is the place of the controlled vehicle at the moment at which it may
-act. Masses are in units of the controlled vehicle's mass. docs/internals/proofs/lower-bound-obstacle.md has the proofs.
+``beyond`` is the squared speed (m2/s2) at which the leader (front vehicle) hits the obstacle. The leader's speed at the
+obstacle limits how far ahead the leader can be at any time. Position 0 is the place of the controlled vehicle at the
+moment at which it may act. Masses are in units of the controlled vehicle's mass.
+docs/internals/proofs/lower-bound-obstacle.md has the proofs.
 """
 
 from __future__ import annotations
@@ -55,9 +56,10 @@ def all_three(at: Floats) -> tuple[float, float, float, float]:
 
 @compiled
 def leader_pushed(at: Floats, early: float, beyond: float) -> tuple[float, float]:
-    """Return the speed (m/s) of the front vehicle after a push, and the time (s) at which it then hits the obstacle.
+    """Return the speed (m/s) of the front vehicle after a push, and the time (s) at which the front vehicle hits the
+    obstacle after this push.
 
-    The push is just strong enough that the front vehicle hits the obstacle with the speed ``sqrt(beyond)``.
+    The push is just strong enough that the front vehicle hits the obstacle with the speed ``sqrt(beyond)`` (m/s).
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -159,7 +161,7 @@ def stopped_there(
 
     The distance (m) is the vehicle's largest distance from the obstacle; it is infinite if no limit is known. The speed
     (m/s) is the vehicle's largest backward speed. The time (s) is the longest time that the vehicle can spend near the
-    obstacle.
+    obstacle before the rear vehicle arrives.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -202,7 +204,8 @@ def behind_leader(
     at: Floats, early: float, late: float, soft: float, hard: float, beyond: float, place: float, speed: float,
     plan: Floats, other: Floats,
 ) -> float:  # fmt: skip
-    """Return the smallest squared closing speed (m2/s2) at the rear pair after a first contact with the front vehicle.
+    """Return the smallest squared closing speed (m2/s2) of the rear pair (controlled and rear vehicle) after the
+    controlled vehicle's first contact, which is with the front vehicle.
 
     The function assumes that the front vehicle hits the obstacle with at most ``sqrt(beyond)`` m/s, and that no vehicle
     passes the front vehicle or the obstacle. The result is LARGE (a huge number) if these assumptions contradict each
@@ -289,8 +292,8 @@ def behind_leader(
 def after_at_obstacle(
     at: Floats, early: float, late: float, soft: float, hard: float, follows: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the smallest harm (m2/s2) at the rear pair and at the obstacle together after a first contact with the
-    front vehicle.
+    """Return the smallest sum (m2/s2) of the harm of the rear pair (controlled and rear vehicle) and the harm at the
+    obstacle, after a first contact with the front vehicle.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -299,7 +302,7 @@ def after_at_obstacle(
         late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         soft: smallest closing speed that the first contact may have, m/s.
         hard: largest closing speed that the first contact may have, m/s.
-        follows: known lower bound on the harm of the rear pair, m2/s2.
+        follows: known lower bound on the harm of the rear pair (controlled and rear vehicle), m2/s2.
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
@@ -361,8 +364,8 @@ def beyond_rear(
 def after_rear(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the smallest harm (m2/s2) at the front pair and at the obstacle together after a first contact with the
-    rear vehicle.
+    """Return the smallest sum (m2/s2) of the harm of the front pair (front and controlled vehicle) and the harm at the
+    obstacle, after a first contact with the rear vehicle.
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -371,8 +374,9 @@ def after_rear(
         late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         closing: largest closing speed that the first contact may have, m/s.
         end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
-        lack: smallest possible difference between the command that applies until ``end`` and the best command after the
-            first contact, m/s2.
+        lack: smallest amount, m/s2, by which the controlled vehicle's command until ``end`` differs from the extreme
+            command (full drive after a first contact with the front vehicle, full braking after one with the rear
+            vehicle).
         plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
 
@@ -405,8 +409,8 @@ def after(
     kind: int, at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats,
     other: Floats,
 ) -> float:  # fmt: skip
-    """Return the smallest harm (m2/s2) with the second neighbour (and at an obstacle) after a first contact with the
-    other neighbour.
+    """Return the smallest harm (m2/s2) that must follow a first contact: the harm of the contact with the second
+    neighbour and, if there is an obstacle, the harm at the obstacle.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
@@ -417,8 +421,9 @@ def after(
         late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
         closing: largest closing speed that the first contact may have, m/s.
         end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
-        lack: smallest possible difference between the command that applies until ``end`` and the best command after the
-            first contact, m/s2.
+        lack: smallest amount, m/s2, by which the controlled vehicle's command until ``end`` differs from the extreme
+            command (full drive after a first contact with the front vehicle, full braking after one with the rear
+            vehicle).
         plan: working memory for the motion of one vehicle, an array from ``empty_plan`` (with brake build-up from
             ``empty_legs``); overwritten.
         other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.

@@ -2,8 +2,8 @@
 
 A *plan* is the motion of one vehicle, an array [2, PIECES]. A *piece* is a time interval of constant acceleration. Row
 ENDS has the end of each piece (in s from now; the last piece never ends). Row ACCELERATIONS has the acceleration in
-each piece (m/s2). A vehicle that brakes to rest stays at rest. No time steps are needed, because the motion in each
-piece has a closed form.
+each piece (m/s2). A vehicle that brakes to rest stays at rest. The simulation needs no time steps, because the motion
+in each piece has a closed form.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ def fill_plan(
 ) -> None:
     """Write a plan with four constant accelerations (m/s2), one after the other.
 
-    The acceleration is ``u_0`` until ``end_0``, ``u_1`` until ``end_1``, ``u_2`` until ``end_2``, and ``u_3``
-    afterwards. ``plan`` [2, PIECES] is overwritten.
+    The acceleration is ``u_0`` until ``end_0``, ``u_1`` until ``end_1``, ``u_2`` until ``end_2``, and ``u_3`` after
+    ``end_2``. ``plan`` [2, PIECES] is overwritten.
     """
     plan[ENDS, 0], plan[ENDS, 1], plan[ENDS, 2], plan[ENDS, 3] = end_0, end_1, end_2, math.inf
     plan[ACCELERATIONS, 0], plan[ACCELERATIONS, 1] = u_0, u_1
@@ -54,10 +54,10 @@ def fill_braking(plan: Floats, onset: float, braking: float) -> None:
 
 @compiled
 def fill_window(plan: Floats, u: float, late: float, end: float, change: float, turn: float, step: float) -> None:
-    """Write a plan with the acceleration ``u`` (m/s2). From ``turn`` on, ``step`` is added to the acceleration; from
-    ``late`` to ``end``, ``change`` is added to it.
+    """Write a plan: the acceleration is ``u``, increased by ``step`` from the time ``turn`` on, and increased by
+    ``change`` from the time ``late`` to the time ``end``.
 
-    ``step`` and ``change`` are in m/s2, the times in s. ``plan`` [2, PIECES] is overwritten.
+    ``u``, ``step`` and ``change`` are in m/s2, the times in s. ``plan`` [2, PIECES] is overwritten.
     """
     first, second, third = min(turn, late), min(max(turn, late), end), max(turn, end)
     u_1 = u + step if turn < late else u + change
@@ -76,7 +76,7 @@ def time_to_limit(v: float, u: float, limit: float) -> float:
 
 @compiled
 def fill_drive_then_brake(plan: Floats, v: float, u: float, limit: float, drive: float, braking: float) -> None:
-    """Write a plan: drive for ``drive`` seconds, at most up to the speed limit, then brake to rest.
+    """Write a plan: drive for ``drive`` seconds (without exceeding the speed limit), then brake to rest.
 
     Args:
         plan: [2, PIECES] array into which the function writes the motion.

@@ -100,7 +100,8 @@ def switch_for(
     reaches ``place`` at ``time``.
 
     The *switch* is the time at which ``sign`` times the vehicle's force stops rising and begins to fall; a *force* is
-    an acceleration. The third result is the speed (m/s) at ``time`` if the switch is at the earlier of the two times.
+    an acceleration. The third result is the speed (m/s) that the vehicle has at ``time`` if the switch happens at the
+    first result (the time just before the switch).
 
     Args:
         at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
@@ -167,11 +168,11 @@ def gentlest_ramped(kind: int, at: Floats, time: float) -> float:
 def slack_of(
     kind: int, at: Floats, early: float, late: float, v: float, hard: float, plan: Floats
 ) -> tuple[float, float]:
-    """Return the largest possible distance (m) to the neighbour at ``early``, and the largest possible excess of the
-    closing speed (m/s) at ``early``.
+    """Return, for the time ``early``, the largest possible distance (m) to the neighbour and the largest possible
+    *excess* (m/s).
 
-    The excess (m/s) is the closing speed at ``early`` minus ``hard``. The first contact comes between ``early`` and
-    ``late``.
+    The excess is the closing speed (m/s) of controlled vehicle and neighbour at ``early`` minus ``hard``. The first
+    contact comes between ``early`` and ``late``.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
@@ -308,8 +309,8 @@ def after_ramped(
 
 @compiled(apart=True)
 def is_first_ramped(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
-    """Return whether a first contact with one neighbour at ``time`` or later is possible before the other neighbour
-    arrives.
+    """Return whether a first contact with the neighbour ``kind`` at ``time`` or later is possible before the other
+    neighbour arrives.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
@@ -339,9 +340,9 @@ def is_first_ramped(kind: int, at: Floats, time: float, plan: Floats, other: Flo
 def meet_ramped(kind: int, at: Floats, sign: float, plan: Floats, other: Floats) -> tuple[float, float, float]:
     """Return time (s) and closing speed (m/s) of the contact with a neighbour under full drive or full braking.
 
-    Brakes build up at finite rates. The time is infinite and the closing speed 0 if there is no contact. The third
-    result is the smallest closing speed (m/s) over all motions of the pair in which the gap is never larger than in the
-    motion under full drive or full braking.
+    Brakes build up at finite rates. If there is no contact, the time is infinite and the closing speed is 0. The third
+    result is the smallest closing speed (m/s) of the contact over all motions of the pair in which the gap is never
+    larger than in the motion under full drive or full braking.
 
     Args:
         kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
@@ -401,9 +402,9 @@ def at_onset_of(
 ) -> tuple[Worlds, Floats, Floats, Bools]:
     """Simulate worlds until the first of ``vehicles`` may act.
 
-    Returns the worlds at the moment when the first of ``vehicles`` may act, the time of this moment ([n], s), the harm
-    before this moment ([n], m2/s2), and a boolean mask of pairs, [n, P]. The mask is True for pairs whose next impact
-    counts and whose vehicles move forward.
+    The *start* is the moment when the first of ``vehicles`` may act. Returns the worlds at the start, the time of the
+    start ([n], s after the alert), the harm before the start ([n], m2/s2), and a boolean mask [n, P]. The mask is True
+    for each pair whose next impact counts and whose vehicles move forward.
 
     Args:
         where: name of the calling function, with which error messages begin.
@@ -434,7 +435,7 @@ def check_asked(where: str, harm_count: str, horizon_s: object, time_step_s: obj
     Args:
         where: name of the calling function, with which the error message begins.
         harm_count: must be ``first`` or ``total``.
-        horizon_s: time until which harm counts; must be a number of seconds.
+        horizon_s: time until which harm counts, s; must be a number.
         time_step_s: must be None or a number of at least ``LEAST_TIME_STEP_S``.
 
     """

@@ -4,8 +4,8 @@ Here *force* means force per mass, which is an acceleration (m/s2). A *plan* is 
 LEGS]. A *leg* is a time interval of constant jerk. Row ENDS of the plan has the time at which each leg ends, in s from
 now (infinite for the last leg). Row FORCES has the force at the start of each leg (m/s2). Row JERKS has the rate at
 which the force changes in each leg (m/s3). A vehicle at rest stays there until its force is above 0. A vehicle at its
-speed limit keeps that speed until its force is below 0. No time steps are needed, because the gap is piecewise a cubic
-polynomial of time.
+speed limit keeps that speed until its force is below 0. The simulation needs no time steps, because the gap is
+piecewise a cubic polynomial of time.
 docs/internals/proofs/lower-bound-cases.md has the proof, under "Brakes that build up".
 """
 
@@ -29,7 +29,7 @@ _MEETING_HALVINGS = 30
 
 @compiled
 def empty_legs() -> Floats:
-    """Return an uninitialised plan, [3, LEGS]. The three rows of the plan are for the end (s), the initial acceleration
+    """Return an uninitialised plan, [3, LEGS]. The three rows of a plan contain the end (s), the initial acceleration
     (m/s2) and the jerk (m/s3) of each interval of constant jerk.
     """
     return np.empty((3, LEGS))
@@ -109,7 +109,7 @@ def leg_at(plan: Floats, now: float, v: float, limit: float) -> tuple[float, flo
         plan: [3, LEGS] motion of the vehicle: end (s), initial acceleration (m/s2) and jerk (m/s3) of each interval of
             constant jerk.
         now: present time, s.
-        v: present speed, m/s.
+        v: speed of the vehicle at ``now``, m/s.
         limit: speed limit of the vehicle, m/s.
 
     """
@@ -143,8 +143,8 @@ def speed_after(v: float, u: float, jerk: float, step: float, reached: float) ->
     """Return the speed (m/s) after ``step`` seconds of constant ``jerk`` (m/s3), from the initial acceleration ``u``
     (m/s2).
 
-    ``v`` is the speed at the start (m/s). ``reached`` is the speed after these ``step`` seconds if it is known already,
-    and NaN if not.
+    ``v`` is the speed at the start (m/s). ``reached`` is the speed (m/s) after ``step`` seconds if this speed is
+    already known, and NaN if it is not known.
     """
     return max(v + (u + 0.5 * jerk * step) * step, 0.0) if math.isnan(reached) else reached
 
@@ -156,9 +156,9 @@ def travel(plan: Floats, v: float, limit: float, until: float) -> tuple[float, f
     Args:
         plan: [3, LEGS] motion of the vehicle: end (s), initial acceleration (m/s2) and jerk (m/s3) of each interval of
             constant jerk.
-        v: speed at the start, m/s.
+        v: speed of the vehicle at the start of ``plan``, m/s.
         limit: speed limit of the vehicle, m/s.
-        until: end of the motion, s.
+        until: time at which speed and distance are computed, s.
 
     """
     now, way = 0.0, 0.0
@@ -182,7 +182,8 @@ def force_of(plan: Floats, now: float) -> float:
 
 @compiled(apart=True)
 def least_on_cubic(constant: float, pressing: float, jerk: float, since: float, until: float) -> float:
-    """Return the smallest ``(constant / t) + (pressing * t / 2) + (jerk * t^2 / 3)`` for t from ``since`` to ``until``.
+    """Return the smallest value of ``(constant / t) + (pressing * t / 2) + (jerk * t^2 / 3)`` for t from ``since`` to
+    ``until``.
 
     The result is -inf if this expression falls without bound as t approaches 0.
     """
@@ -214,11 +215,12 @@ def meeting(
     """Return the time (s) of two vehicles' first contact, its closing speed (m/s), and the *forced closing speed*
     (m/s).
 
-    The results are inf, 0, 0 if there is no contact. The forced closing speed is the smallest value of ``w + (gap -
-    slack) / t`` until the contact. Here w is the closing speed (m/s) and gap the gap (m) at the time t (s) after
-    ``since``. The forced closing speed is also a lower bound on the closing speed of another motion of the pair if two
-    conditions hold. First, at ``since`` the gap of the other motion is smaller than the gap of this motion by at most
-    ``slack``. Second, the other motion's closing speed minus the closing speed of this motion never decreases.
+    The results are inf, 0, 0 if there is no contact. The forced closing speed is the smallest value of
+    ``w + (gap - slack) / t`` until the contact. Here w is the closing speed (m/s) and gap is the gap (m) in the given
+    motion, t seconds after ``since``. The forced closing speed is also a lower bound on the closing speed of another
+    motion of the pair if two conditions hold. First, at ``since`` the gap in the other motion is smaller than the gap
+    in the given motion by at most ``slack``. Second, the closing speed in the other motion minus the closing speed in
+    the given motion never decreases.
 
     Args:
         gap: gap at ``since``, m.

@@ -1,7 +1,7 @@
 """``team_bound``: a proven lower bound on the harm of every world, whatever several controlled vehicles do.
 
-If Vehicle 2 is the first controlled vehicle, one bound covers the harm of the first three vehicles together. If Vehicle
-1 is controlled and an obstacle is ahead, the obstacle is treated as an immovable first vehicle of the line.
+If Vehicle 2 is controlled and Vehicle 1 is not, one bound covers the harm of the first three vehicles together. If
+Vehicle 1 is controlled and an obstacle is ahead, the obstacle is treated as an immovable first vehicle of the line.
 docs/internals/proofs/team-bound.md has the proofs.
 """
 
@@ -137,7 +137,7 @@ def team_bound(
     controlled, ``combined`` covers the obstacle, Vehicle 1 and Vehicle 2: ``harm = early + max((obstacle + pairs[:,
     0]), combined) + pairs[:, 1:].sum(axis=1)``. Harm that may come only after ``horizon_s`` counts as 0.
 
-    All other vehicles brake fully from their latencies on. With a single controlled vehicle, ``lower_bound`` gives
+    All other vehicles brake fully from their latencies on. For a single controlled vehicle, ``lower_bound`` returns
     larger bounds for the lines that it covers.
 
     Args:
@@ -228,7 +228,7 @@ def team_bound(
 
 
 def _pair_bound(columns: Mapping[int, Floats | float], until: Floats, counts: Bools) -> Floats:
-    """Return the bound on the harm of one pair alone, [n] m2/s2; 0 in worlds where the pair's next impact does not
+    """Return a lower bound on the harm of one pair alone, [n] m2/s2; 0 in worlds where the pair's next impact does not
     count.
 
     Args:
