@@ -210,9 +210,9 @@ TOUCH_WIDTH = 9
 class Forces(NamedTuple):
     """Accelerations while brakes or engines build up gradually: affine forms for every vehicle and time interval.
 
-    On the second axis of an array, index 0 belongs to the time from the alert to the first piece (time interval of
-    constant command), and index j + 1 belongs to piece j. Impacts do not change the accelerations, so the arrays are
-    the same for every sequence of impacts.
+    On the second axis of an array, index 0 belongs to the time from the alert to the start of the first piece (time
+    interval of constant command), and index j + 1 belongs to piece j. Impacts do not change the accelerations, so the
+    arrays are the same for every sequence of impacts.
     """
 
     mean: Floats  # [N, J + 1, W] mean acceleration of the piece, m/s2

@@ -65,7 +65,8 @@ def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
         path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
             interval of constant command).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        of_gap: if True, return the change of the gap, m; if False, the change of the relative speed, m/s.
+        of_gap: if True, return the change of the gap of pair ``p``, m; if False, return the change of the relative
+            speed of pair ``p``, m/s.
 
     """
     P, most = cell.gap.shape[0], 0.0

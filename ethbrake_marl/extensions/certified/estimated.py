@@ -75,8 +75,8 @@ class Told(NamedTuple):
     def heard(self) -> Floats:
         """Amount of information about each vehicle, [n, N].
 
-        The number 0 means that nothing is known about the vehicle. The number 1 means that something is known, but not
-        both position and speed. The number 2 means that position and speed are known.
+        The amount is 0 if nothing is known about the vehicle. The amount is 1 if something is known about the vehicle,
+        but not both its position and its speed. The amount is 2 if position and speed of the vehicle are known.
         """
         return self.pieces.any(axis=2).astype(np.float64) + self.known
 
@@ -203,8 +203,8 @@ class Ranges:
 
         Args:
             share: for some pairs (quantity, vehicle index), the position of the value in its range: 0 is the smallest
-                value, 1 the largest. A vehicle without such a position gets the median. If ``share`` is None, all
-                vehicles get the median.
+                value, 1 the largest. A vehicle whose index is in no pair with the quantity ``key`` gets the median. If
+                ``share`` is None, all vehicles get the median.
             key: name of the quantity; must be a key of ``middle``.
 
         """

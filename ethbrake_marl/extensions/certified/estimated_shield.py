@@ -45,8 +45,8 @@ def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
     """After a restart of the shield in the episodes ``rows``, restore the harm so far, and replace each new plan by the
     rest of the old plan if this rest is at least as good.
 
-    ``shield`` has just been restarted; the function changes it in place. ``before`` is a copy of the shield from before
-    the restart.
+    ``shield`` has just been restarted; the function changes ``shield`` in place. ``before`` is a copy of the shield
+    from before the restart.
     """
     (running, backup), (old, held) = shield.memory[:2], before.memory[:2]
     assert running is not None and old is not None
@@ -173,8 +173,8 @@ class EstimatedShield:
         """Return the certified actions, [n], from -1 (full braking) to 1; the action is 0 until the vehicle's latency
         has elapsed.
 
-        A repeated call at the same time of the episodes returns the same actions. Raises ``InvalidInput`` for an
-        episode that was not started with ``begin``.
+        If ``decide`` is called again at the same time of an episode, it returns the same action for this episode.
+        Raises ``InvalidInput`` for an episode that was not started with ``begin``.
 
         Args:
             worlds: the true worlds; only the information that the vehicle received is read.
@@ -308,8 +308,8 @@ class EstimatedShield:
         self._totals = totals.copy()
 
     def _is_surprised(self, estimated: Worlds, heard: Bools) -> Bools:
-        """Return a mask [n]: True for each world in which the state of a vehicle is outside the range of its predicted
-        states.
+        """Return a mask [n]: True for each world in which the estimated state of at least one vehicle is outside the
+        range of the states that the shield predicted for this vehicle.
 
         Args:
             estimated: the estimated worlds at the present time, [n].

@@ -122,8 +122,8 @@ def branch(
     return the largest harm recorded so far.
 
     If no other impact can follow, the harm in the worlds with the impact is final and is recorded. If another impact
-    can follow, these worlds become a new path on the stack. If the new path cannot be simulated, a rough bound on its
-    harm (``rough_harm``) is recorded instead.
+    can follow, the worlds with the impact become a new path on the stack. If the new path cannot be simulated, a rough
+    bound on its harm (``rough_harm``) is recorded instead.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -381,8 +381,8 @@ def touch_only(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, len
     contact.
 
     With brake build-up the pair may separate and have its first impact within the piece. Worlds in which the pair
-    separates and has this impact belong to the path just below the second path on the stack. Returns False if the stack
-    has no room for the second path.
+    separates and has its first impact belong to the path that lies directly below the second path on the stack. Returns
+    False if the stack has no room for the second path.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -453,8 +453,8 @@ def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
         stack: memory that the search overwrites; it stores the paths (sets of worlds with the same impacts so far).
         motion: memory that the function overwrites; it stores the motion of each vehicle in the present piece.
-        out: [W]; the function writes the affine form of the largest harm into it. The bound is the largest value of
-            this form.
+        out: [W]; the function writes the affine form of the largest harm into it. The bound is the largest value of the
+            affine form in ``out``.
         most: the search stops as soon as the harm of some world may exceed this number, m2/s2.
 
     """
@@ -550,8 +550,9 @@ def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out
     """Move the pairs in contact through the present piece, and pass the worlds in which a pair has an impact to
     ``branch``.
 
-    The vehicles of a pair in contact move as one body, or separate. ``branch`` records the harm in the worlds with an
-    impact, or puts these worlds on the stack as a new path. Returns the largest harm recorded so far, m2/s2.
+    In the present piece, the vehicles of a pair in contact either move as one body or separate. ``branch`` records the
+    harm in the worlds with an impact, or adds these worlds as a new path to the stack of paths that still have to be
+    simulated. Returns the largest harm recorded so far, m2/s2.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.

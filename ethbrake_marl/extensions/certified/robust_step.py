@@ -100,11 +100,11 @@ class RobustShield(StepShield):
         reported world and the corners of its box), and the function returns None instead of boxes.
 
         Args:
-            possible: [m * M] members of the new worlds, M consecutive members for each world.
+            possible: [m * M] members (possible worlds) of the new worlds: M consecutive members for each new world.
             problem: table with one row for each world in ``possible``.
             rows: [m] indices of the new episodes.
             plan: [m, L] action of the shielded vehicle at each decision, for each new world.
-            harm: [m] largest harm of each world's plan in any member of this world, m2/s2.
+            harm: [m] harm of each world's plan, m2/s2: the largest harm over the members of this world.
 
         """
         if possible.n == len(rows) or self.robust != INTERIOR:

@@ -55,8 +55,8 @@ def rough_harm(cell: Cell, path: Path, hit: int) -> float:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
         path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
             interval of constant command).
-        hit: index of one more pair whose first impact is treated as past, in addition to the pairs marked in the path;
-            -1: no more pairs.
+        hit: index of one more pair that is treated as if its first impact had already happened, in addition to the
+            pairs marked in the path; -1: no such pair.
 
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
@@ -83,7 +83,7 @@ def rough_rest(cell: Cell, own: Floats, backwards: float, since: float, path: Pa
         backwards: largest backward speed of any vehicle at the time ``since``, m/s.
         since: present time, s after the first decision.
         path: worlds of the box with the same impacts so far; the function reads only which pairs have had an impact.
-        hit: index of one more pair whose first impact is treated as past; -1: no more pairs.
+        hit: index of one more pair that is treated as if its first impact had already happened; -1: no such pair.
 
     """
     P, e = cell.gap.shape[0], cell.restitution

@@ -108,9 +108,10 @@ def stray(cell: Cell, touch: Floats, p: int) -> float:
     form.
 
     The result is above 0 only if one of the two vehicles may stand or move backwards. Let c be ``touch[CREEP]``, the
-    largest speed of the rear vehicle in worlds in which a vehicle stands or moves backwards. The speed in the affine
-    form lies between 0 and c. The rear vehicle's speed lies between ``-backwards(cell, p) * c`` and c. The front
-    vehicle's speed lies between 0 and ``faster(cell, p) * c``. (An impact never makes the rear vehicle faster.)
+    largest speed of the rear vehicle in worlds in which a vehicle stands or moves backwards. The speed of the centre of
+    mass in its affine form lies between 0 and c. The rear vehicle's speed lies between ``-backwards(cell, p) * c`` and
+    c. The front vehicle's speed lies between 0 and ``faster(cell, p) * c``. An impact never makes the rear vehicle
+    faster.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -368,17 +369,17 @@ def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length:
 def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: float, most: float) -> None:
     """Start a new phase of a contact, because the closing acceleration of the pair has changed.
 
-    The recorded range of closing accelerations covers the old and the new phase if, with this range, the relative speed
-    still decreases from impact to impact. If the relative speed does not decrease, the recorded range covers only the
-    new phase.
+    The recorded range of closing accelerations covers both the old and the new phase of the contact, if with this range
+    the relative speed still decreases from impact to impact. If the relative speed does not decrease from impact to
+    impact, the recorded range covers only the new phase.
 
     Args:
         touch: [TOUCH_WIDTH] state of the pair in contact (a row of ``Path.touch``); the function changes it in place.
         e: coefficient of restitution.
-        softest: smallest closing acceleration in the old and the new phase, m/s2.
-        hardest: largest closing acceleration in the old and the new phase, m/s2.
-        least: smallest closing acceleration of the new phase, m/s2.
-        most: largest closing acceleration of the new phase, m/s2.
+        softest: smallest closing acceleration in the old and the new phase of the contact, m/s2.
+        hardest: largest closing acceleration in the old and the new phase of the contact, m/s2.
+        least: smallest closing acceleration of the new phase of the contact, m/s2.
+        most: largest closing acceleration of the new phase of the contact, m/s2.
 
     """
     if not e * math.sqrt(hardest / softest) < 1.0:

@@ -229,7 +229,7 @@ def parse_uncertainty(text: str) -> Uncertainty:
 
     A half-width is a number in the quantity's unit, or a percentage of its value. ``.vehicle_2`` or ``.pair_1`` after
     the quantity limits the entry to one vehicle or pair. Blanks around an entry and around its ``=`` are ignored.
-    Raises ``InvalidInput`` for any other text.
+    Raises ``InvalidInput`` if ``text`` does not have this form.
     """
     entries = [entry.strip() for entry in text.split(",")]
     if "" in entries:
@@ -251,8 +251,9 @@ def parse_uncertainty(text: str) -> Uncertainty:
 
 
 def _values(worlds: Worlds, quantity: str) -> Floats:
-    """Return the reported values of one of ``QUANTITIES``. The shape of the result is [n, P] for gaps, [n, 1] for
-    friction, and [n, N] for every other quantity. The returned capacities are those on a dry road.
+    """Return the reported values of the quantity ``quantity``, which is one of ``QUANTITIES``. The shape of the result
+    is [n, P] for gaps, [n, 1] for friction, and [n, N] for every other quantity. The returned capacities are those on a
+    dry road.
     """
     if quantity.endswith("_rate_mps3"):
         return np.asarray(getattr(worlds.vehicles, quantity), np.float64)

@@ -58,12 +58,12 @@ def best_harm(
 ) -> BestHarmTable:
     """Search for the profile with the least harm in each world and under each count. Return the profiles as a table.
 
-    With two harm counts, there are two searches; the table stores for each count the better of the two profiles. The
-    harm in the table is at most the harm in ``known`` and, with one controlled vehicle, the harm of the best constant
-    deceleration. With several controlled vehicles, the harm is also at most the result of the same search for one of
-    these vehicles while the others brake fully. The result for a world does not depend on ``threads`` or on the other
-    worlds. Raises ``InvalidInput`` if ``vehicles`` or ``counts`` is empty, if the command
-    of a script is not fixed at the alert, or if ``budget`` is below 1.
+    With two harm counts, there are two searches; for each count, the table stores the profile with the least harm under
+    this count. The harm in the table is at most the harm in ``known`` and, with one controlled vehicle, the harm of the
+    best constant deceleration. With several controlled vehicles, the harm is also at most the result of the same search
+    for one of these vehicles while the others brake fully. The result for a world does not depend on ``threads`` or on
+    the other worlds. Raises ``InvalidInput`` if ``vehicles`` or ``counts`` is empty, if the command of a script is not
+    fixed at the alert, or if ``budget`` is below 1.
 
     Args:
         scenario: scenario of the worlds.
@@ -224,7 +224,8 @@ def _kept_or_searched(
 
 
 def chunks_left(scenario: Scenario, sample: Sample, *, budget: int, chunks: Path) -> tuple[int, list[Path]]:
-    """Return the number of worlds that ``search_list`` still has to search, and the paths of damaged files.
+    """Return the number of worlds that ``search_list`` still has to search, and the paths of the damaged files in the
+    folder ``chunks``.
 
     Args:
         scenario: scenario of the worlds.

@@ -197,7 +197,9 @@ class Planner:
 
 
 def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
-    """Return the agent ``planner`` or ``planner:CANDIDATES``. ``argument`` is CANDIDATES as text, or None."""
+    """Return the agent ``planner`` or ``planner:CANDIDATES``. ``argument`` is the number of profiles that are simulated
+    in each world at each decision, as text; None means the default number.
+    """
     return Planner(
         argument, harm_count=settings.harm_count, horizon_s=settings.horizon_s,
         most_candidates=settings.most_candidates, time_step_s=settings.time_step_s,
@@ -209,7 +211,8 @@ def make_estimating_planner(argument: str | None, settings: AgentSettings) -> Ag
     """Return the agent ``planner:estimated`` or ``planner:CANDIDATES:estimated``, which searches in the world as it is
     estimated from messages and sights.
 
-    ``argument`` is CANDIDATES as text, or None.
+    ``argument`` is the number of profiles that are simulated in each world at each decision, as text; None means the
+    default number.
     """
     return Estimating(make_planner(argument, settings), settings.needed_scenario(), shows=True)
 

@@ -373,7 +373,9 @@ def is_among(value: float, values: Floats) -> bool:
 
 @compiled
 def largest(values: Floats) -> int:
-    """Return the index of the largest value. If several values are equally large, return the first index."""
+    """Return the index of the largest number in ``values``. If several numbers are equally large, return the index of
+    the first of them.
+    """
     place = 0
     for k in range(values.shape[0]):
         if values[k] > values[place]:
@@ -429,7 +431,7 @@ def select_stepwise(
         seed_commands: commands of the starting profiles, [Q, K, C] m/s2.
         states: [K + 1, S] state of the world at the start of each phase; row 0: state at the first decision;
             overwritten.
-        field: profiles that the search improves; the first profile is overwritten.
+        field: profiles that the search improves; the function overwrites the first profile with the result.
 
     """
     world.episode.clock[CLOCK.STEPWISE] = 1.0

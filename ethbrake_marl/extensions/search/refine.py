@@ -1,4 +1,4 @@
-"""Compiled random search around the commands of an episode.
+"""Compiled random search that improves the commands of an episode.
 
 The search improves two sequences of commands by random changes of a few neighbouring steps. The caller gives the first
 sequence. The second sequence is the best of some random *templates*; it is needed because small changes of the caller's
@@ -149,7 +149,7 @@ def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[
 
     Args:
         world: world to simulate, with the commands of the other vehicles.
-        plan: commands to simulate, with the state at step ``begin``.
+        plan: commands to simulate; ``plan`` also contains the state at step ``begin``.
         begin: first step to simulate.
         bound: harm at which the simulation stops, m2/s2.
 

@@ -50,7 +50,8 @@ class Regrets:
         """Return a mask [n]: True for worlds in which an agent does less harm than the best harm known before the
         evaluation.
 
-        The agent's harm must be smaller by more than ``TOLERANCE``, under at least one of the two harm counts.
+        True means that the agent's harm is smaller by more than ``TOLERANCE``, under at least one of the two harm
+        counts.
         """
         first, total = self.limits.first_impact_harm, self.limits.total_harm
         return (outcome.first_impact_harm < first - TOLERANCE) | (outcome.total_harm < total - TOLERANCE)

@@ -154,9 +154,9 @@ class BestHarmTable:
         """Return a copy of the table in which smaller values from ``harm`` replace the old values, and a mask [m]: True
         for the changed worlds.
 
-        A value in ``harm`` must be smaller than the value in the table by more than ``TOLERANCE``. Worlds that are not
-        in the table are ignored. Raises ``InvalidInput`` if the table does not contain ``harm_count``, or if ``harm``
-        and ``identity`` have different shapes.
+        A value in ``harm`` replaces the value in the table only if the value in ``harm`` is smaller by more than
+        ``TOLERANCE``. Worlds that are not in the table are ignored. Raises ``InvalidInput`` if the table does not
+        contain ``harm_count``, or if ``harm`` and ``identity`` have different shapes.
 
         Args:
             identity: hash of each world, [m].
