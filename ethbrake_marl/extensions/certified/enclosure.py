@@ -210,7 +210,7 @@ def ramp(
     Let d be the difference (acceleration minus ``wanted``) at the start, e this difference at the end, t the duration,
     and m the time during which the acceleration changes. The changes of speed and distance are those of the constant
     acceleration ``wanted``, plus ``m (d + e) / 2`` for the speed and ``m t (d + e) / 2 - m^2 (d + 2 e) / 6`` for the
-    distance. Returns True if the acceleration equals ``wanted`` at the end in every world of the box.
+    distance. Returns True if the acceleration equals ``wanted`` at the end of ``duration`` in every world of the box.
 
     Args:
         force: acceleration at the start as an affine form [W] (centre, slopes, remainder), m/s2; the function replaces

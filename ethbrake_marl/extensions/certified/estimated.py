@@ -2,17 +2,19 @@
 
 A vehicle is *known* if its message has arrived or it is in sight. The estimate combines these sources:
 
-* A known vehicle: its capacities, mass and own latency, and the newest state that was received from it. The estimate
-  extrapolates this state to the present. If a command was in force at the time of this state, the vehicle is assumed to
-  follow its script from the time of the state on. If no command was in force, the vehicle is assumed to coast until the
-  time at which it is expected to react.
-* The scenario, for a vehicle that is not known. Each quantity of an unknown vehicle is the median of its distribution,
-  or a chosen value of its range. An unknown vehicle is assumed to follow its script from the alert on.
-* The scenario, for each quantity that the messages of a known vehicle lack (``v2x: tells``). A received position is
-  used only if the speed was received, too. A received command is used only if position and speed were received, too. A
-  received intent (announced command) is not used, because the script already predicts what the vehicle does.
-* The estimating vehicle itself: measurements of its own state, its distance since the alert, and its impacts with known
-  neighbours.
+* A known vehicle is the source of its capacities, its mass, its own latency, and the newest state that was received
+  from it. The estimate extrapolates the newest received state to the present. If a command was in force at the time of
+  the newest received state, the vehicle is assumed to follow its script from that time on. If no command was in force
+  at the time of the newest received state, the vehicle is assumed to coast until the time at which it is expected to
+  react.
+* The scenario is the source for a vehicle that is not known. Each quantity of an unknown vehicle is the median of its
+  distribution, or a chosen value of its range. An unknown vehicle is assumed to follow its script from the alert on.
+* The scenario is also the source for each quantity that the messages of a known vehicle lack (``v2x: tells``). The
+  received position of a vehicle is used only if its speed was received, too. The received command of a vehicle is used
+  only if its position and speed were received, too. A received intent (announced command) is not used, because the
+  script already predicts what the vehicle does.
+* The estimating vehicle itself is a source, too: it measures its own state, its distance since the alert, and its
+  impacts with known neighbours.
 
 The estimate reads nothing else of the true world, so information that was not received cannot change the estimate.
 """

@@ -4,8 +4,9 @@ The module ``estimated`` explains the *estimated world*. Mode ``step`` certifies
 the world in which every unknown quantity has its median. Mode ``step`` promises nothing about the true world. Mode
 ``robust`` also certifies every action in the corners: the estimated worlds in which every unknown quantity has its
 smallest or largest value. If the true world is one of the corners, the harm in the true world up to the horizon is at
-most the bound at the first decision. The reason is that a later message only removes corners that contradict the
-message, and a new plan replaces the present plan only if the new plan is better in the remaining corners.
+most the bound at the first decision. This bound holds for two reasons: a later message only removes corners that
+contradict the message, and a new plan replaces the present plan only if the new plan is better in the remaining
+corners.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ SURPRISE = 1e-6  # largest difference (m, m/s) between a measurement and its pre
 
 def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
     """After a restart of the shield in the episodes ``rows``, restore the harm so far, and replace each new plan by the
-    rest of the old plan if this rest is at least as good.
+    rest of the old plan if the predicted harm of this rest is at most the predicted harm of the new plan.
 
     ``shield`` has just been restarted; the function changes ``shield`` in place. ``before`` is a copy of the shield
     from before the restart.
@@ -69,9 +70,10 @@ class EstimatedShield:
 
     The shield starts at the first decision. The shield restarts when its vehicle learns of a further vehicle, learns
     that another vehicle reacts, or sees a vehicle move otherwise than predicted. After a restart, the shield keeps the
-    rest of the previous plan if this rest is at least as good as the new plan. At the first decision,
-    ``predicted_harm`` [n] is set to the present bound on harm; later decisions do not change it. ``predicted_harm`` is
-    infinite if the vehicle had an impact before the first decision, because the harm of that impact is unknown.
+    rest of the previous plan if the predicted harm of this rest is at most the predicted harm of the new plan. At the
+    first decision, ``predicted_harm`` [n] is set to the present bound on harm; later decisions do not change it.
+    ``predicted_harm`` is infinite if the vehicle had an impact before the first decision, because the harm of that
+    impact is unknown.
 
     Args:
         scenario: the scenario of the worlds; a mixture of scenarios raises ``InvalidInput``.
@@ -181,7 +183,7 @@ class EstimatedShield:
             proposed: [n] actions that the policy proposes.
             proposer: the policy and its memory. If no other plan certifies a proposed action, the shield also tries the
                 policy's rollout (simulated episode) in the estimated worlds. If ``proposer`` is None, the shield does
-                not try this rollout.
+                not try the policy's rollout.
             only: [n] True for worlds in which the vehicle decides now; None means all worlds.
 
         """
@@ -273,8 +275,9 @@ class EstimatedShield:
     def _keeps(self, received: Told, time_s: Floats) -> Bools:
         """Return a mask [n, N]: True for each vehicle whose predicted state replaces its received state.
 
-        The mask is True if a vehicle is unknown, or if its last message is older than its last predicted impact or
-        contact. ``received`` is the information that the vehicle has received; ``time_s`` [n] is the present time.
+        The mask is True for a vehicle that is unknown, and for a vehicle whose last message is older than the vehicle's
+        last predicted impact or contact. ``received`` is the information that the vehicle has received; ``time_s`` [n]
+        is the present time.
         """
         running = self.shield.memory.running
         if running is None:

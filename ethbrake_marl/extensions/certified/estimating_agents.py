@@ -56,7 +56,8 @@ class Estimating(AgentAround):
         policy: agent that controls the vehicle; any agent that reads the state of the line is possible.
         scenario: the scenario, which declares the ranges of all unknown quantities; a mixture of scenarios raises
             ``InvalidInput``.
-        shows: if True, the policy sees the estimated world at every decision; if False, only when the policy starts.
+        shows: if True, the policy sees the estimated world at every decision; if False, the policy sees the estimated
+            world only when the policy starts.
 
     """
 

@@ -31,7 +31,7 @@ class RobustGuard(StepGuard):
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
         """Return the infos of a step, as a mapping from names to values. The info ``members`` is the number of possible
-        worlds in which an action is certified for each true world.
+        worlds that represent each true world; an action is certified in all of these possible worlds.
 
         Args:
             memory: the shield and the policies as they are after the step.

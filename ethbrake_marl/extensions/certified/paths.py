@@ -182,7 +182,7 @@ def keep_with(harm: Floats, rest: float, worst: float, out: Floats) -> float:
 
 @compiled(apart=True)
 def closing_after(cell: Cell, path: Path, motion: Motion, p: int, speed: Floats, time: Floats, length: float) -> Floats:
-    """Return the closing speed (m/s) of the other pair at an impact that may follow the impact of pair ``p`` in the
+    """Return the closing speed (m/s) of an impact of the other pair that may follow the impact of pair ``p`` in the
     same piece.
 
     The function is for a line of three vehicles, which has two pairs. The result is an affine form [W] (centre, slopes,
@@ -343,7 +343,8 @@ def may_turn(cell: Cell, motion: Motion, p: int, piece: int) -> bool:
     """Return whether accelerations that build up gradually may press the vehicles of pair ``p`` together harder within
     a piece.
 
-    This is possible if the front vehicle's acceleration may fall, or if the rear vehicle's acceleration may rise.
+    The vehicles may press together harder if the front vehicle's acceleration may fall, or if the rear vehicle's
+    acceleration may rise.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.

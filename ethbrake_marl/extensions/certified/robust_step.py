@@ -133,12 +133,12 @@ class RobustShield(StepShield):
         return decision if boxes is None else certify_inside(boxes, now, memory.backup, budget, decision, asked)
 
     def _leaves_range(self, running: Running) -> Bools:
-        """Return a mask [n]: True for each reported world whose box may have a world that leaves the range between the
-        members. The members are the reported world and the corners of its box; ``running`` contains the states of the
-        members. The mask is True where the method of the same name in ``StepShield`` returns True. In interior mode the
-        mask is also True where the latency of the shielded vehicle is uncertain, because the worlds of a box then have
-        their decisions at different times. If one uncertain number (friction) changes several quantities, the mask is
-        True for all worlds.
+        """Return a mask [n]: True for each reported world whose box may contain a world outside the range of the
+        members (possible worlds). The members are the reported world and the corners of its box; ``running`` contains
+        the states of the members. The mask is True where the method of the same name in ``StepShield`` returns True. In
+        interior mode the mask is also True where the latency of the shielded vehicle is uncertain, because the worlds
+        of a box then have their decisions at different times. If the friction is uncertain, so that one uncertain
+        number changes several quantities, the mask is True for all worlds.
         """
         leaves, boxes = super()._leaves_range(running), self.boxes
         if boxes is not None:

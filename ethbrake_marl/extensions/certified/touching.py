@@ -5,9 +5,9 @@ The state of a pair in contact is the motion of its centre of mass, as affine fo
 vehicles deviate from this motion. While both vehicles move forward, only their commands act on the pair. The centre of
 mass then follows the commands alone, no matter how often the two vehicles collide.
 
-A world *creeps* as soon as one of the two vehicles of the pair stands or moves backwards. The brakes of this vehicle
-then hold the vehicle itself, instead of slowing the pair. For a world that creeps, the state of the pair contains only
-limits on the speeds. A *flight* is the time between two impacts of the pair.
+A world *creeps* as soon as one of the two vehicles of the pair stands or moves backwards. The brakes of the vehicle
+that stands or moves backwards then hold this vehicle itself, instead of slowing the pair. For a world that creeps, the
+state of the pair contains only limits on the speeds. A *flight* is the time between two impacts of the pair.
 """
 
 from __future__ import annotations
@@ -84,9 +84,9 @@ def apart(touch: Floats) -> float:
 
 @compiled(apart=True)
 def faster(cell: Cell, p: int) -> float:
-    """Return the largest possible ratio v / u, for an impact of pair ``p``: v is the front vehicle's speed after the
-    impact, and u is the rear vehicle's speed before the impact. The returned ratio is at least 1. ``cell`` contains the
-    coefficient of restitution and each vehicle's share of the pair's mass.
+    """For an impact of pair ``p``, return the largest possible ratio v / u, where v is the front vehicle's speed after
+    the impact, and u is the rear vehicle's speed before the impact. The returned ratio is at least 1. ``cell`` contains
+    the coefficient of restitution and each vehicle's share of the pair's mass.
     """
     return float(max(1.0, (1.0 + cell.restitution) * high(cell.share[p, 0])))
 
@@ -199,8 +199,8 @@ def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float)
 @compiled(apart=True)
 def dip_of(cell: Cell, vague: float, length: float) -> float:
     """Return by how much (m/s) a vehicle's speed within a piece may fall below the smaller one of its speeds at the
-    start and at the end of the piece. The speed can fall below both of these speeds only if the vehicle's acceleration
-    changes its sign within the piece.
+    start and at the end of the piece. The speed can fall below both the speed at the start and the speed at the end
+    only if the vehicle's acceleration changes its sign within the piece.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -423,7 +423,7 @@ def is_blurred(path: Path, motion: Motion, N: int, p: int, length: float) -> boo
     """Return whether the gap of pair ``p`` is too uncertain to simulate a further impact of the pair in this piece.
 
     The gap is too uncertain if its uncertainty exceeds the largest distance by which the gap can shrink within the
-    piece. A pair with such a gap is treated as in contact from the start of the piece.
+    piece. A pair whose gap is too uncertain is treated as in contact from the start of the piece.
 
     Args:
         path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time

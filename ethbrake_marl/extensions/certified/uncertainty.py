@@ -130,8 +130,8 @@ class Uncertainty:
     def moves_together(self) -> bool:
         """True if the friction is uncertain, so that one uncertain number changes several quantities.
 
-        If this property is true, the largest and smallest gaps and speeds may occur in worlds that are not corners of
-        the box.
+        If the friction is uncertain, the largest and smallest gaps and speeds may occur in worlds that are not corners
+        of the box.
         """
         return any(each.quantity == "friction" and each.half_width > 0.0 for each in self.intervals)
 
@@ -266,11 +266,11 @@ def _of(quantity: str, place: int) -> str:
 
 
 def _placed(worlds: Worlds, sides: list[_Side], share: Callable[[int], Floats | float]) -> Worlds:
-    """Return the worlds with each uncertain number at a given position in its interval.
+    """Return the reported worlds, changed so that each uncertain number has a given position in its interval.
 
-    Without a V2X channel, a changed latency changes both when the vehicle reacts and when a message arrives. With a V2X
-    channel, a changed latency changes only when the vehicle reacts. An uncertain friction limits the capacities of all
-    vehicles together.
+    Without a V2X channel, a changed latency changes both the time at which the vehicle reacts and the time at which a
+    message arrives. With a V2X channel, a changed latency changes the time at which the vehicle reacts, but not the
+    time at which a message arrives. An uncertain friction limits the capacities of all vehicles together.
 
     Args:
         worlds: the reported worlds, [n].

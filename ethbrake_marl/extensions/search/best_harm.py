@@ -196,7 +196,8 @@ def _kept_or_searched(
     """Return the table of best known harm for one chunk (at most ``CHUNK`` worlds of the list).
 
     If ``file`` contains a table of the chunk's worlds that was made with the same options, this table is returned. If
-    ``file`` contains no such table, the worlds are searched, and the new table is written to ``file``.
+    ``file`` contains no table of these worlds with these options, the worlds are searched, and the new table is written
+    to ``file``.
 
     Args:
         task: scenario and controlled vehicles.
@@ -360,7 +361,8 @@ def starting_profiles(
 
 
 def startable(profiles: Profiles) -> Profiles:
-    """Return the profiles with at most ``MOST_PHASES`` phases (intervals of constant command), the most for a search.
+    """Return the profiles in a form from which a search can start: with at most ``MOST_PHASES`` phases (intervals of
+    constant command).
 
     A profile with more than ``MOST_PHASES`` phases is replaced by its first command for the whole episode.
     """

@@ -148,8 +148,8 @@ def fill_extreme(
         world: world of the profile, with the bounds of the commands and the time step.
         kind: the first command: ``FRONT_FIRST`` for full drive, ``REAR_FIRST`` for full braking.
         change: time at which the command first changes, s.
-        meeting: time of the second change of the command, s.
-        early: how many time steps before ``meeting`` the command changes for the second time.
+        meeting: time of the second change of the command if ``early`` is 0, s.
+        early: number of time steps by which the second change of the command comes before the time ``meeting``.
         share: the command of the time step between the second command and the return to the first command is a weighted
             mean of the two commands; ``share`` is the weight of the first command in this mean, from 0 to 1.
         ends: output: time step at which each phase ends, [5].

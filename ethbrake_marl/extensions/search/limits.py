@@ -170,7 +170,9 @@ def _uneven_because(worlds: Worlds) -> str:
 
 
 def _is_team(task: Task) -> bool:
-    """Return whether several vehicles are controlled, or one vehicle in a line of more than three vehicles."""
+    """Return True if several vehicles are controlled, or if one vehicle is controlled in a line of more than three
+    vehicles.
+    """
     return len(task.vehicles) > 1 or (len(task.vehicles) == 1 and task.scenario.vehicles > _VEHICLES)
 
 

@@ -53,8 +53,8 @@ class Outlook(NamedTuple):
     def due(self, worlds: Worlds, planned_s: Floats) -> Ints:
         """Return the indices of worlds that need a new plan.
 
-        A world needs a new plan if a vehicle moves, the horizon is not reached, and time has passed since the last
-        plan. ``planned_s`` [n] is the time of the last plan, s.
+        A world needs a new plan if a vehicle moves, the horizon is not reached, and the last plan was made before the
+        present time. ``planned_s`` [n] is the time at which the last plan was made, s.
         """
         moving = (worlds.speeds_mps != 0.0).any(axis=1)
         return np.flatnonzero((worlds.time_s > planned_s) & (worlds.time_s < self.horizon_s) & moving)

@@ -177,8 +177,8 @@ def search_world(
 ) -> int:
     """Search for the best profile of one world, and write the profile to ``ends`` and ``commands``.
 
-    Returns the number of phases of the best profile; 0 if the physics could simulate no profile. The best profile is
-    never worse than any starting profile.
+    Returns the number of phases of the best profile; 0 if the physics could simulate no profile. The harm of the best
+    profile is at most the harm of each starting profile.
 
     Args:
         world: world to simulate, with the bounds of the commands and a random stream.

@@ -99,7 +99,7 @@ def _refine_worlds(
         random: initial state of each world's random stream, [n].
         budget: number of candidates (sequences of commands) that are simulated in each world.
         commands: command of each step, [n, T] m/s2; changed in place.
-        value: output: harm of the improved commands, as ``problem`` counts it, [n] m2/s2.
+        value: output: for the improved commands, the harm that ``problem`` minimises, [n] m2/s2.
         failed: output: True for worlds in which the physics cannot simulate the commands, [n].
 
     """
@@ -173,7 +173,8 @@ def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[
 
 @compiled(apart=True)
 def climb(world: SearchWorld, plan: Plan, room: Plan, value: float, reached: int, budget: int) -> tuple[float, int]:
-    """Improve ``plan`` in place by random changes, and return its harm (m2/s2) and its number of steps.
+    """Improve ``plan`` in place by random changes; return the harm (m2/s2) of the improved plan and the number of steps
+    of its episode.
 
     Most changes add an amount to the commands of some neighbouring steps; the others replace these commands. If adding
     an amount lowers the harm, the next change adds twice this amount to the commands of the same steps.
