@@ -250,7 +250,7 @@ class Cell(NamedTuple):
 
 
 class Path(NamedTuple):
-    """Set of those worlds of a box (``Cell``) that had the same impacts and contacts so far, with their present state.
+    """Those worlds of a box (``Cell``) that had the same impacts and contacts so far, with their present state.
 
     An affine form [W] represents a number that differs from world to world: a centre, a slope for each uncertain number
     of the box, and a remainder.

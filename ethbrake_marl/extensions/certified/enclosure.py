@@ -213,8 +213,8 @@ def ramp(
     distance. Returns True if the acceleration equals ``wanted`` at the end of ``duration`` in every world of the box.
 
     Args:
-        force: acceleration at the start as an affine form [W] (centre, slopes, remainder), m/s2; the function replaces
-            it by the acceleration at the end.
+        force: acceleration at the start of ``duration`` as an affine form [W] (centre, slopes, remainder), m/s2; the
+            function replaces it by the acceleration at the end of ``duration``.
         wanted: acceleration that the vehicle commands, as an affine form [W], m/s2.
         duration: time during which the command acts, as an affine form [W], s.
         longest: upper limit of ``duration``, s.
@@ -397,9 +397,9 @@ def bound_of(
 def bound_box(
     low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, enough: float, cells: int, only_enough: bool
 ) -> tuple[float, int]:
-    """Return an upper bound (m2/s2) on the harm of a plan in all worlds of a box, and how many parts of the box were
-    examined. The function repeatedly halves the part with the largest bound, until the bound of the whole box is at
-    most ``enough``, or ``cells`` parts were examined.
+    """Return an upper bound (m2/s2) on the harm of a plan in all worlds of a box, and the number of parts of the box
+    that were examined. The function repeatedly halves the part with the largest bound, until the bound of the whole box
+    is at most ``enough``, or ``cells`` parts were examined.
 
     Args:
         low_: [Q] smallest value in the box for each of the Q numbers of a world.
@@ -574,12 +574,13 @@ class Boxes(NamedTuple):
         return self._replace(**arrays)
 
     def at_alert(self, plans: Floats, harm: Floats) -> Floats:
-        """Return, for each world at the alert, an upper bound on the harm of the world's plan, [n] m2/s2.
+        """Return, for each world at the alert, an upper bound on the harm of the world's plan in all worlds of its box,
+        [n] m2/s2.
 
         Args:
             plans: [n, L] action of the shielded vehicle at each decision, for each world.
-            harm: [n] largest harm of each world's plan in any corner of the world's box, m2/s2; the search stops when
-                the upper bound that it has computed is close to this harm.
+            harm: [n] harm of each world's plan, m2/s2: the largest harm over the corners of the world's box. The search
+                stops when its upper bound is close to this harm.
 
         """
         return self.bound(np.arange(len(plans)), plans, NEAR * harm + NEARLY_NOTHING, CELLS_AT_ALERT)

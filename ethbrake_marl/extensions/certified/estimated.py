@@ -168,7 +168,7 @@ class Ranges:
 
         ``others`` contains the scripts of the other vehicles; the keys are vehicle indices. If ``others`` is None, the
         scripts of the scenario are used. Raises ``InvalidInput`` for a mixture of scenarios, because an unknown vehicle
-        could belong to any of them.
+        could belong to any scenario of the mixture.
         """
         if scenario.members:
             names = ", ".join(member.name for member in scenario.members)

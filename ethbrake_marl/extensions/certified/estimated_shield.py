@@ -294,8 +294,8 @@ class EstimatedShield:
         return keeps
 
     def _note_impacts(self, worlds: Worlds) -> None:
-        """Store the present time as the time of the last impact for each vehicle that, in any possible world, had an
-        impact since the last decision.
+        """For each vehicle that had an impact since the last decision in at least one possible world, store the present
+        time as the time of the vehicle's last impact.
 
         ``worlds`` are the true worlds at the present time.
         """

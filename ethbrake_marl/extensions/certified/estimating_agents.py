@@ -80,7 +80,7 @@ class Estimating(AgentAround):
         Args:
             alert: the worlds at the alert, [n].
             vehicle: index of the agent's vehicle.
-            scripts: scripts of the other vehicles; not used.
+            scripts: scripts of the other vehicles; this agent does not use them.
 
         """
         return {

@@ -1,4 +1,5 @@
-"""Simulate all worlds of a box along paths: if a pair has an impact in some worlds only, these worlds form a new path.
+"""Simulate all worlds of a box along paths: if a pair has an impact in only some of the worlds, the worlds with the
+impact form a new path.
 
 A *path* is a set of worlds with the same sequence of impacts (``affine.Path``). A *cell* is a box (all worlds whose
 uncertain numbers lie in given intervals) together with the vehicles' commands over time.
@@ -122,8 +123,8 @@ def branch(
     return the largest harm recorded so far.
 
     If no other impact can follow, the harm in the worlds with the impact is final and is recorded. If another impact
-    can follow, the worlds with the impact become a new path on the stack. If the new path cannot be simulated, a rough
-    bound on its harm (``rough_harm``) is recorded instead.
+    can follow, the worlds with the impact become a new path on the stack. If this new path cannot be simulated, the
+    function records a rough bound on its harm (``rough_harm``) instead.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -381,9 +382,9 @@ def touch_only(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, len
     """Put a second path on the stack: the worlds in which pair ``p`` came into contact without an impact and stayed in
     contact.
 
-    With brake build-up the pair may separate and have its first impact within the piece. Worlds in which the pair
-    separates and has its first impact belong to the path that lies directly below the second path on the stack. Returns
-    False if the stack has no room for the second path.
+    With brake build-up the pair may separate after the contact, and then have its first impact within the same piece.
+    Worlds in which the pair separates and has its first impact belong to the path that lies directly below the second
+    path on the stack. Returns False if the stack has no room for the second path.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -485,8 +486,8 @@ def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float
 def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
     """Simulate a path (worlds with the same impacts so far) to its end; return the largest harm recorded so far, m2/s2.
 
-    The function records the harm of the path, and the harm in worlds that leave the path because of an impact and need
-    no further simulation.
+    The function records the harm of the path. It also records the harm in worlds that leave the path because of an
+    impact, if these worlds need no further simulation.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.

@@ -84,8 +84,8 @@ class RobustShield(StepShield):
 
     @property
     def boxes(self) -> Boxes | None:
-        """The boxes (smallest and largest value of every number of each world) in interior mode. The property is None
-        in corners mode, and before the first episode.
+        """The boxes (smallest and largest value of every number of each world) in interior mode. The property ``boxes``
+        is None in corners mode, and before the first episode.
         """
         boxes: Boxes | None = self.memory.enclosure
         return boxes

@@ -74,8 +74,8 @@ def rough_harm(cell: Cell, path: Path, hit: int) -> float:
 
 @compiled(apart=True)
 def rough_rest(cell: Cell, own: Floats, backwards: float, since: float, path: Path, hit: int) -> float:
-    """Return an upper bound (m2/s2) on the harm of all first impacts that are still to come: the sum of their squared
-    closing speeds.
+    """Return an upper bound (m2/s2) on the sum of the squared closing speeds of all first impacts that are still to
+    come.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.

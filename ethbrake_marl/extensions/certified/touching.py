@@ -326,10 +326,10 @@ def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length:
     acceleration that the commands cause. While the closing acceleration lies between b- (``least``) and b+ (``most``),
     and b- > 0, the relative speed does not grow. Consider a *flight* (the time between two impacts), with gap g and
     relative speed w at some moment. The gap in this flight is at most ``h = g + w^2 / (2 b-)``, and the flight ends
-    with a closing speed of at most ``sqrt(2 b+ h)``. The next flight starts with a relative speed of e times this
-    closing speed, where e is the restitution. So the relative speed decreases from flight to flight if ``e sqrt(b+ /
-    b-) < 1``. If one vehicle stands or moves backwards, its own brakes hold it, so that flights are shorter and the
-    relative speeds in them are smaller.
+    with a closing speed of at most ``sqrt(2 b+ h)``. The next flight starts with a relative speed of e times the
+    closing speed at the end of this flight, where e is the restitution. So the relative speed decreases from flight to
+    flight if ``e sqrt(b+ / b-) < 1``. If one vehicle stands or moves backwards, its own brakes hold it, so that flights
+    are shorter and the relative speeds in them are smaller.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -401,8 +401,8 @@ def settle(touch: Floats, e: float) -> None:
     Let the closing acceleration of the pair lie between ``b-`` and ``b+``, and let e be the restitution. A *flight*
     (the time between two impacts) that begins with separating speed s lasts at most ``2 s / b-``. This flight ends with
     a closing speed of at most ``s sqrt(b+ / b-)``, and the next flight begins with e times this closing speed. So all
-    flights together last at most ``2 s / (b- (1 - e sqrt(b+ / b-)))``. After the last flight, the two vehicles move as
-    one body, unless one stands or moves backwards.
+    flights of the pair together last at most ``2 s / (b- (1 - e sqrt(b+ / b-)))``. After the last flight, the two
+    vehicles move as one body, unless one stands or moves backwards.
 
     Args:
         touch: [TOUCH_WIDTH] state of the pair in contact (a row of ``Path.touch``); the function changes it in place.

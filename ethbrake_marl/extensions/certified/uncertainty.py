@@ -252,8 +252,8 @@ def parse_uncertainty(text: str) -> Uncertainty:
 
 def _values(worlds: Worlds, quantity: str) -> Floats:
     """Return the reported values of the quantity ``quantity``, which is one of ``QUANTITIES``. The shape of the result
-    is [n, P] for gaps, [n, 1] for friction, and [n, N] for every other quantity. The returned capacities are those on a
-    dry road.
+    is [n, P] for gaps, [n, 1] for friction, and [n, N] for every other quantity. Returned capacities are the capacities
+    on a dry road.
     """
     if quantity.endswith("_rate_mps3"):
         return np.asarray(getattr(worlds.vehicles, quantity), np.float64)

@@ -59,9 +59,9 @@ def search_profiles(problem: ProfileProblem, given: Profiles, *, budget: int, se
     """Search each world; return the best profile of each world, and its harm [n] (m2/s2) under each harm count.
 
     A profile has at most ``MOST_PHASES`` phases of constant command. The harm of the best profile is at most the harm
-    of each profile of ``given``. The harm is the quantity that ``problem`` minimises. Raises ``InvalidInput`` for
-    ``budget`` or ``threads`` below 1 or a negative seed, and ``PhysicsError``, which names the worlds in which the
-    physics could simulate no profile.
+    of each profile of ``given``. The harm is the quantity that ``problem`` minimises. Raises ``InvalidInput`` if
+    ``budget`` or ``threads`` is below 1, or if ``seed`` is negative. Raises ``PhysicsError``, which names the worlds in
+    which the physics could simulate no profile.
 
     Args:
         problem: n worlds, with the commands of the other vehicles and the harm to minimise.

@@ -301,7 +301,7 @@ def gather(
 ) -> None:
     """Fill the field (profiles to improve) with the best of the starting profiles and of ``drawn`` random profiles.
 
-    No two profiles of the field have the same harm.
+    No two profiles in the field have the same harm.
 
     Args:
         world: world to simulate, with the bounds of the commands and a random stream.

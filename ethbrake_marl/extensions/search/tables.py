@@ -290,6 +290,6 @@ def _read_best(arrays: Mapping[str, NDArray[Any]], harm_count: HarmCount) -> Bes
 def _used(ends: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the number of phases that each profile uses, [n]; 0 for a world without a profile.
 
-    ``ends`` [n, K] are the steps at which the phases end.
+    ``ends`` [n, K] are the time steps at which the phases of each profile end.
     """
     return np.where(ends[:, -1] > 0, np.argmax(ends == ends[:, -1:], axis=1) + 1, 0)

@@ -2,7 +2,8 @@
 
 A *template* is a random braking profile of three phases: one command, then another command for a short while, then full
 braking. From templates a policy can learn different ways to drive in a world. The best template is not improved by a
-search: a random template with little harm tolerates small errors of the commands, so a policy can imitate it.
+search: a random template with little harm tolerates small errors of the commands, so a policy can imitate this
+template.
 """
 
 from __future__ import annotations
