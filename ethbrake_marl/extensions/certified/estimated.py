@@ -16,7 +16,8 @@ A vehicle is *known* if its message has arrived or it is in sight. The estimate 
 * The estimating vehicle itself is a source, too: it measures its own state, its distance since the alert, and its
   impacts with known neighbours.
 
-The estimate reads nothing else of the true world, so information that was not received cannot change the estimate.
+Apart from these sources, the estimate reads nothing of the true world, so information that was not received cannot
+change the estimate.
 """
 
 from __future__ import annotations

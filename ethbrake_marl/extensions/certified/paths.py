@@ -420,8 +420,8 @@ def touch_only(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, len
 def thrown_back(cell: Cell, path: Path, motion: Motion, p: int, how: Approach, speed: Floats) -> bool:
     """Return whether the rear vehicle of pair ``p`` may move backwards after the impact of the pair and be hit again.
 
-    The result is False for the last vehicle of the line if it never drives: no vehicle is behind the last vehicle, so
-    its backward motion cannot lead to an impact.
+    The result is False for the last vehicle of the line if this vehicle never drives: no vehicle is behind the last
+    vehicle, so its backward motion cannot lead to an impact.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.

@@ -4,9 +4,9 @@ these intervals.
 The true value of a quantity with the reported value x lies in [x - h, x + h]. The half-width h is a number in the
 quantity's unit, or a share of x (such as 5 %). Impossible values are cut off from the interval of a quantity:
 latencies, speeds and gaps below 0, and speeds above the speed limit of the vehicle. The *box* of a world is the set of
-all combinations of values in its intervals. The *members* of a world are the reported world and every corner of its
-box: 2^d corners for d uncertain numbers. In shield mode ``robust`` the bound on the harm is proven for the members
-(``docs/internals/proofs/shield-corners.md``).
+all combinations of values in the intervals around the world's quantities. The *members* of a world are the reported
+world and every corner of its box: 2^d corners for d uncertain numbers. In shield mode ``robust`` the bound on the harm
+is proven for the members (``docs/internals/proofs/shield-corners.md``).
 """
 
 from __future__ import annotations
@@ -138,12 +138,12 @@ class Uncertainty:
     def members(self, worlds: Worlds) -> Worlds:
         """Return the members of worlds at the alert, [n * M]: each world followed by the corners of its box.
 
-        The *box* of a world is the set of all combinations of values in its intervals. The corners are in the order of
-        binary numbers, with the first interval as the lowest bit (0: smallest value, 1: largest value). An interval of
-        width 0 does not increase the number of corners. For friction, eight values replace the two ends of the
-        interval, because friction changes all capacities together and harm may rise or fall with it. Raises
-        ``InvalidInput`` if an interval names a vehicle that does not exist, if a capacity or mass may be 0, or if there
-        are more than ``MOST_CORNERS`` corners.
+        The *box* of a world is the set of all combinations of values in the intervals around the world's quantities.
+        The corners are in the order of binary numbers, with the first interval as the lowest bit (0: smallest value, 1:
+        largest value). An interval of width 0 does not increase the number of corners. For friction, eight values
+        replace the two ends of the interval, because friction changes all capacities together and harm may rise or fall
+        with it. Raises ``InvalidInput`` if an interval names a vehicle that does not exist, if a capacity or mass may
+        be 0, or if there are more than ``MOST_CORNERS`` corners.
         """
         sides = self._sides(worlds)
         ends = [_OF_FRICTION if name == "friction" else (0.0, 1.0) for name, *_ in reversed(sides)]
@@ -168,7 +168,7 @@ class Uncertainty:
         return Worlds.concatenate(parts).take(order)
 
     def draw(self, worlds: Worlds, rng: np.random.Generator, *, corners: bool = False) -> Worlds:
-        """For each of ``worlds`` [n], draw one world from the box of intervals around it.
+        """For each of ``worlds`` [n], draw one world from the box of intervals around this world.
 
         Args:
             worlds: the reported worlds, [n].

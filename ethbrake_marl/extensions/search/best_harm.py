@@ -306,7 +306,7 @@ def _searched(
     worlds: Worlds, task: Task, others: Floats, given: Sequence[Profiles], deciders: Sequence[int],
     effort: dict[str, int], aimed: Callable[[ProfileProblem], ProfileProblem],
 ) -> Found:  # fmt: skip
-    """Search each world, and return the best profiles and their harm under each harm count.
+    """Search each world; return the profiles with the least harm, and their harm under each harm count.
 
     With several controlled vehicles, the search also starts from the best profile of each controlled vehicle while the
     others brake fully.

@@ -124,8 +124,9 @@ class LimitMeasures(MeasureSet):
 
         ``known_best_share`` is the share of the worlds for which a best known harm existed before the evaluation.
         ``below_best_known`` is the number of worlds in which the agent does less harm than the best harm known before
-        the evaluation. ``best_known_warning`` is a warning text or None. ``impact_unproven`` describes the worlds in
-        which contact is proven unavoidable, but an impact is not proven unavoidable, with the fields of ``Between``.
+        the evaluation. ``best_known_warning`` is the warning that a table contains the best known harm of only some of
+        the worlds; None if there is no warning. ``impact_unproven`` describes the worlds in which contact is proven
+        unavoidable, but an impact is not proven unavoidable, with the fields of ``Between``.
 
         Args:
             tally: counts and means over the agent's episodes.

@@ -183,8 +183,8 @@ class Planner:
         return Profiles(ends, plan.commands_mps2)
 
     def _search(self, problem: ProfileProblem, plan: Profiles) -> tuple[Profiles, Floats]:
-        """Search each world, starting from ``plan`` and constant commands; return the best profile and its harm, [n]
-        m2/s2.
+        """Search each world, starting from ``plan`` and constant commands; return the profile with the least harm in
+        each world, and its harm, [n] m2/s2.
         """
         constants = problem.constant(problem.even_grid(15))
         n, K = plan.ends.shape  # [n * Q]: for each world its plan, then constants

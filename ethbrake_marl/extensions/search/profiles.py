@@ -1,4 +1,4 @@
-"""Compiled random search for the best profile of one world. Each world has its own random stream.
+"""Compiled random search for the profile with the least harm in one world. Each world has its own random stream.
 
 A *profile* has at most K phases (intervals of constant command). ``ends`` [K] are the time steps at which the phases
 end, and ``commands`` [K, C] are the commands of the C controlled vehicles in each phase (m/s2). ``bounds`` [C, 2] are
@@ -175,10 +175,10 @@ class Population(NamedTuple):
 def search_world(
     world: SearchWorld, start: Floats, seed_ends: Ints, seed_commands: Floats, budget: int, ends: Ints, commands: Floats
 ) -> int:
-    """Search for the best profile of one world, and write the profile to ``ends`` and ``commands``.
+    """Search for the profile with the least harm in one world, and write the profile to ``ends`` and ``commands``.
 
-    Returns the number of phases of the best profile; 0 if the physics could simulate no profile. The harm of the best
-    profile is at most the harm of each starting profile.
+    Returns the number of phases of the profile with the least harm; 0 if the physics could simulate no profile. This
+    harm is at most the harm of each starting profile.
 
     Args:
         world: world to simulate, with the bounds of the commands and a random stream.

@@ -135,7 +135,8 @@ class BestHarm:
         return self._outlook.command(worlds, memory), memory
 
     def _search(self, worlds: Worlds, vehicle: int, others: Floats) -> tuple[Floats, Floats]:
-        """Search each world; return the best command at each decision, [n, decisions] m/s2, and the harm, [n] m2/s2.
+        """Search each world; return the commands with the least harm, one for each decision, [n, decisions] m/s2, and
+        their harm, [n] m2/s2.
 
         ``others`` [n, N] are the commands of the other vehicles, m/s2.
         """

@@ -53,7 +53,8 @@ class Plan(NamedTuple):
 
 
 def refine(problem: ProfileProblem, commands_mps2: Floats, *, budget: int, seed: int = 0) -> tuple[Floats, Floats]:
-    """Improve given commands by a search. Return the best commands, [n, T] m/s2, and their harm, [n] m2/s2.
+    """Improve given commands by a search. Return the commands with the least harm, [n, T] m/s2, and their harm, [n]
+    m2/s2.
 
     The harm of the returned commands is at most the harm of the given commands. The harm is the quantity that
     ``problem`` minimises, and equals the harm that the engine computes. The result for a world does not depend on the
@@ -231,8 +232,8 @@ def draw_templates(world: SearchWorld, best: Plan, room: Plan, bound: float, num
     """Simulate random templates (braking profiles), and write the one with the least harm to ``best``.
 
     A *template* has three phases: one command, then another command for a short while, then full braking. Returns the
-    harm of the best template (m2/s2) and the number of steps of its episode. The number of steps is 0 if no template
-    does less harm than ``bound``.
+    harm of the template with the least harm (m2/s2), and the number of steps of the episode under this template. The
+    number of steps is 0 if no template does less harm than ``bound``.
 
     Args:
         world: world to simulate, with the bounds of the commands and a random stream.

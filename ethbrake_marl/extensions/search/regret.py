@@ -40,7 +40,7 @@ class Regrets:
         return self.first_impact_harm if harm_count == "first" else self.total_harm
 
     def regret(self, outcome: Outcome, harm_count: HarmCount) -> Floats:
-        """Return an agent's harm minus the best known harm, [n] m2/s2, never negative.
+        """Return an agent's harm minus the best known harm, [n] m2/s2; the result is never negative.
 
         ``outcome`` is the agent's outcome in these worlds; ``harm_count`` is ``first`` or ``total``.
         """

@@ -63,9 +63,9 @@ class BestHarmTable:
     def load(cls, path: Path) -> BestHarmTable:
         """Return the table that is stored in the file ``path``.
 
-        Raises ``InvalidInput`` if the file does not exist, and ``CorruptBundle`` if it is not a table. The names,
-        types, shapes and sizes of the arrays are checked before the file is unpacked. The stored harm is not checked
-        by simulation.
+        Raises ``InvalidInput`` if the file does not exist, and ``CorruptBundle`` if the file is not a table. The names,
+        types, shapes and sizes of the arrays are checked before the file is unpacked. The stored harm is not checked by
+        simulation.
         """
         if not os.path.exists(path):
             raise InvalidInput(f"{path}: there is no such file; give the file of a table of best known harm")
