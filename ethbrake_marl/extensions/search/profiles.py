@@ -177,8 +177,8 @@ def search_world(
 ) -> int:
     """Search for the profile with the least harm in one world, and write the profile to ``ends`` and ``commands``.
 
-    Returns the number of phases of the profile with the least harm; 0 if the physics could simulate no profile. This
-    harm is at most the harm of each starting profile.
+    Returns the number of phases of the profile with the least harm; 0 if the physics could simulate no profile. The
+    harm of the written profile is at most the harm of each starting profile.
 
     Args:
         world: world to simulate, with the bounds of the commands and a random stream.
