@@ -5,7 +5,7 @@ differs from world to world. An affine form is an array of W = K + 2 numbers for
 a centre c, one slope g_k for each uncertain number, and a remainder r. ``e_k`` in [-1, 1] is the position of a world in
 the interval of uncertain number k; all affine forms use the same ``e_k``. ``e`` in [-1, 1] is unknown, and each affine
 form has its own ``e``. In the difference of two affine forms, parts that depend on the same ``e_k`` cancel. The
-difference of two plain intervals would be wider than this difference.
+difference of two plain intervals would be wider than the difference of the two affine forms.
 
 The result of every operation on affine forms encloses the exact result: for each world of the box, some value of ``e``
 makes the form equal to the exact result. The operations ignore floating-point rounding; instead, the speeds and
@@ -181,8 +181,9 @@ def cut(x: Floats, least: float, most: float) -> Floats:
     """Return an affine form [W] (centre, slopes, remainder) that encloses ``x``, whose values are known to lie between
     ``least`` and ``most``.
 
-    If the limits ``least`` and ``most`` leave less than half of the interval of ``x``, the result encloses every number
-    of the part that they leave. If they leave at least half, the result is ``x`` itself.
+    If less than half of the interval of ``x`` lies between ``least`` and ``most``, the result encloses every number of
+    this interval that lies between the two limits. If at least half of the interval of ``x`` lies between ``least`` and
+    ``most``, the result is ``x`` itself.
     """
     inside_low, inside_high = max(low(x), least), min(high(x), most)
     if inside_high - inside_low < radius(x):
@@ -210,9 +211,9 @@ TOUCH_WIDTH = 9
 class Forces(NamedTuple):
     """Accelerations while brakes or engines build up gradually: affine forms for every vehicle and time interval.
 
-    On the second axis of an array, index 0 belongs to the time from the alert to the first piece (time interval of
-    constant command), and index j + 1 belongs to piece j. Impacts do not change the accelerations, so the arrays are
-    the same for every sequence of impacts.
+    On the second axis of an array, index 0 belongs to the time from the alert to the start of the first piece (time
+    interval of constant command), and index j + 1 belongs to piece j. Impacts do not change the accelerations, so the
+    arrays are the same for every sequence of impacts.
     """
 
     mean: Floats  # [N, J + 1, W] mean acceleration of the piece, m/s2
@@ -249,7 +250,7 @@ class Cell(NamedTuple):
 
 
 class Path(NamedTuple):
-    """Set of those worlds of a box (``Cell``) that had the same impacts and contacts so far, with their present state.
+    """Those worlds of a box (``Cell``) that had the same impacts and contacts so far, with their present state.
 
     An affine form [W] represents a number that differs from world to world: a centre, a slope for each uncertain number
     of the box, and a remainder.

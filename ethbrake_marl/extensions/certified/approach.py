@@ -57,15 +57,16 @@ class Approach(NamedTuple):
 
 @compiled(apart=True)
 def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
-    """Return the largest change, caused by bounces of the neighbouring pairs, of the relative speed or of the gap of
-    pair ``p``.
+    """Return the largest change of the gap or of the relative speed of pair ``p`` that bounces of the neighbouring
+    pairs can cause.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
         path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
             interval of constant command).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        of_gap: if True, return the change of the gap, m; if False, the change of the relative speed, m/s.
+        of_gap: if True, return the change of the gap of pair ``p``, m; if False, return the change of the relative
+            speed of pair ``p``, m/s.
 
     """
     P, most = cell.gap.shape[0], 0.0
@@ -78,9 +79,9 @@ def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
 
 @compiled(apart=True)
 def pressing(motion: Motion, p: int) -> tuple[float, float]:
-    """Return the smallest and the largest closing acceleration of pair ``p`` in a piece, m/s2. The two results are also
-    correct if a vehicle stops within the piece. ``motion`` contains the motion of all vehicles in the piece (time
-    interval of constant command).
+    """Return the smallest and the largest closing acceleration of pair ``p`` in a piece, m/s2. Both returned
+    accelerations are also correct if a vehicle stops within the piece. ``motion`` contains the motion of all vehicles
+    in the piece (time interval of constant command).
     """
     front_low, front_high = low(motion.pull[p]) - motion.vague[p], high(motion.pull[p]) + motion.vague[p]
     rear_low, rear_high = low(motion.pull[p + 1]) - motion.vague[p + 1], high(motion.pull[p + 1]) + motion.vague[p + 1]

@@ -71,7 +71,7 @@ def form_of(low_: Floats, high_: Floats, which: int, free: Ints) -> Floats:
     Args:
         low_: [Q] smallest value in the box for each of the Q numbers of a world.
         high_: [Q] largest value in the box for each of the Q numbers of a world.
-        which: index of the number among the Q numbers of a world.
+        which: index, among the Q numbers of a world, of the number to return as an affine form.
         free: [K] indices of the uncertain numbers; each of them has its own slope in the affine form.
 
     """
@@ -158,7 +158,7 @@ def build_up(cell: Cell, i: int, late: Floats, rates: Floats) -> None:
     Args:
         cell: the box of worlds and the vehicles' commands over time; the function changes only ``cell.forces``.
         i: index of the vehicle.
-        late: time from the alert to the first piece as an affine form [W] (centre, slopes, remainder), s.
+        late: time from the alert to the start of the first piece as an affine form [W] (centre, slopes, remainder), s.
         rates: [2, W] rates at which the brakes build up (index 0) and release (index 1), m/s3.
 
     """
@@ -204,16 +204,17 @@ def ramp(
     force: Floats, wanted: Floats, duration: Floats, longest: float, rates: Floats, rise: Floats, gain: Floats,
     swing: Floats,
 ) -> bool:  # fmt: skip
-    """Let an acceleration approach its target ``wanted`` during ``duration``, and add the effect on speed and distance.
+    """Let an acceleration approach its target ``wanted`` during ``duration``; add the resulting changes of speed and
+    distance to ``rise`` and ``gain``.
 
     Let d be the difference (acceleration minus ``wanted``) at the start, e this difference at the end, t the duration,
     and m the time during which the acceleration changes. The changes of speed and distance are those of the constant
     acceleration ``wanted``, plus ``m (d + e) / 2`` for the speed and ``m t (d + e) / 2 - m^2 (d + 2 e) / 6`` for the
-    distance. Returns True if the acceleration equals ``wanted`` at the end in every world of the box.
+    distance. Returns True if the acceleration equals ``wanted`` at the end of ``duration`` in every world of the box.
 
     Args:
-        force: acceleration at the start as an affine form [W] (centre, slopes, remainder), m/s2; the function replaces
-            it by the acceleration at the end.
+        force: acceleration at the start of ``duration`` as an affine form [W] (centre, slopes, remainder), m/s2; the
+            function replaces it by the acceleration at the end of ``duration``.
         wanted: acceleration that the vehicle commands, as an affine form [W], m/s2.
         duration: time during which the command acts, as an affine form [W], s.
         longest: upper limit of ``duration``, s.
@@ -254,11 +255,11 @@ def ramp(
 
 @compiled(apart=True)
 def wait(cell: Cell, late: Floats) -> bool:
-    """Advance the speeds and gaps of a cell (box of worlds) in place, from the alert to the first piece (time interval
-    of constant command).
+    """Advance the speeds and gaps of a cell (box of worlds) in place, from the alert to the start of the first piece
+    (time interval of constant command).
 
     Returns False if a contact, a stop, the speed limit or a command that takes effect may disturb the motion before the
-    first piece. ``late`` [W] is the time from the alert to the first piece, s.
+    first piece. ``late`` [W] is the time from the alert to the start of the first piece, s.
     """
     if high(late) <= 1e-12:
         return True
@@ -295,7 +296,7 @@ def early_pull(cell: Cell, i: int, late: Floats) -> tuple[Floats, bool]:
 
     The acceleration is an affine form [W] (centre, slopes, remainder) in m/s2; it is 0 for the shielded vehicle. The
     acceleration is uncertain if the vehicle's command may take effect before ``late``. ``cell`` is the box of worlds;
-    ``late`` [W] is the time from the alert to the first piece (time interval of constant command), s.
+    ``late`` [W] is the time from the alert to the start of the first piece (time interval of constant command), s.
     """
     pull = np.zeros_like(late)
     if i == cell.vehicle:
@@ -370,7 +371,7 @@ def bound_of(
         stack: memory that the search overwrites; it stores the paths (sets of worlds with the same impacts so far).
         motion: memory that the function overwrites; it stores the motion of each vehicle in the present piece.
         out: [K + 2]; the function writes the affine form of the largest harm into it. The bound is the largest value of
-            this form.
+            the affine form in ``out``.
         most: the search stops as soon as the harm of some world may exceed this number, m2/s2.
 
     """
@@ -396,9 +397,9 @@ def bound_of(
 def bound_box(
     low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, enough: float, cells: int, only_enough: bool
 ) -> tuple[float, int]:
-    """Return an upper bound (m2/s2) on the harm of a plan in all worlds of a box, and how many parts of the box were
-    examined. The function repeatedly halves the part with the largest bound, until the bound of the whole box is at
-    most ``enough``, or ``cells`` parts were examined.
+    """Return an upper bound (m2/s2) on the harm of a plan in all worlds of a box, and the number of parts of the box
+    that were examined. The function repeatedly halves the part with the largest bound, until the bound of the whole box
+    is at most ``enough``, or ``cells`` parts were examined.
 
     Args:
         low_: [Q] smallest value in the box for each of the Q numbers of a world.
@@ -506,7 +507,7 @@ class Boxes(NamedTuple):
     def of(
         cls, possible: Worlds, problem: ProfileProblem, n: int, scenario: Scenario, others: Mapping[int, Script]
     ) -> Boxes:
-        """Return the boxes around ``n`` reported worlds at the alert.
+        """Return the boxes (sets of possible worlds) around ``n`` reported worlds at the alert.
 
         Raises ``InvalidInput`` for worlds that interior mode cannot certify: an obstacle ahead, a vehicle whose command
         changes over time (profile), brakes that began to build up before the alert, or another vehicle whose command is
@@ -573,12 +574,13 @@ class Boxes(NamedTuple):
         return self._replace(**arrays)
 
     def at_alert(self, plans: Floats, harm: Floats) -> Floats:
-        """Return, for each world at the alert, an upper bound on the harm of the world's plan, [n] m2/s2.
+        """Return, for each world at the alert, an upper bound on the harm of the world's plan in all worlds of its box,
+        [n] m2/s2.
 
         Args:
             plans: [n, L] action of the shielded vehicle at each decision, for each world.
-            harm: [n] largest harm of each world's plan in any corner of the world's box, m2/s2; the search stops when
-                the upper bound that it has computed is close to this harm.
+            harm: [n] harm of each world's plan, m2/s2: the largest harm over the corners of the world's box. The search
+                stops when its upper bound is close to this harm.
 
         """
         return self.bound(np.arange(len(plans)), plans, NEAR * harm + NEARLY_NOTHING, CELLS_AT_ALERT)

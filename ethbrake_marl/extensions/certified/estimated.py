@@ -2,19 +2,22 @@
 
 A vehicle is *known* if its message has arrived or it is in sight. The estimate combines these sources:
 
-* A known vehicle: its capacities, mass and own latency, and the newest state that was received from it. The estimate
-  extrapolates this state to the present. If a command was in force at the time of this state, the vehicle is assumed to
-  follow its script from the time of the state on. If no command was in force, the vehicle is assumed to coast until the
-  time at which it is expected to react.
-* The scenario, for a vehicle that is not known. Each quantity of an unknown vehicle is the median of its distribution,
-  or a chosen value of its range. An unknown vehicle is assumed to follow its script from the alert on.
-* The scenario, for each quantity that the messages of a known vehicle lack (``v2x: tells``). A received position is
-  used only if the speed was received, too. A received command is used only if position and speed were received, too. A
-  received intent (announced command) is not used, because the script already predicts what the vehicle does.
-* The estimating vehicle itself: measurements of its own state, its distance since the alert, and its impacts with known
-  neighbours.
+* A known vehicle is the source of its capacities, its mass, its own latency, and the newest state that was received
+  from it. The estimate extrapolates the newest received state to the present. If a command was in force at the time of
+  the newest received state, the vehicle is assumed to follow its script from that time on. If no command was in force
+  at the time of the newest received state, the vehicle is assumed to coast until the time at which it is expected to
+  react.
+* The scenario is the source for a vehicle that is not known. Each quantity of an unknown vehicle is the median of its
+  distribution, or a chosen value of its range. An unknown vehicle is assumed to follow its script from the alert on.
+* The scenario is also the source for each quantity that the messages of a known vehicle lack (``v2x: tells``). The
+  received position of a vehicle is used only if its speed was received, too. The received command of a vehicle is used
+  only if its position and speed were received, too. A received intent (announced command) is not used, because the
+  script already predicts what the vehicle does.
+* The estimating vehicle itself is a source, too: it measures its own state, its distance since the alert, and its
+  impacts with known neighbours.
 
-The estimate reads nothing else of the true world, so information that was not received cannot change the estimate.
+Apart from these sources, the estimate reads nothing of the true world, so information that was not received cannot
+change the estimate.
 """
 
 from __future__ import annotations
@@ -75,8 +78,8 @@ class Told(NamedTuple):
     def heard(self) -> Floats:
         """Amount of information about each vehicle, [n, N].
 
-        The number 0 means that nothing is known about the vehicle. The number 1 means that something is known, but not
-        both position and speed. The number 2 means that position and speed are known.
+        The amount is 0 if nothing is known about the vehicle. The amount is 1 if something is known about the vehicle,
+        but not both its position and its speed. The amount is 2 if position and speed of the vehicle are known.
         """
         return self.pieces.any(axis=2).astype(np.float64) + self.known
 
@@ -166,7 +169,7 @@ class Ranges:
 
         ``others`` contains the scripts of the other vehicles; the keys are vehicle indices. If ``others`` is None, the
         scripts of the scenario are used. Raises ``InvalidInput`` for a mixture of scenarios, because an unknown vehicle
-        could belong to any of them.
+        could belong to any scenario of the mixture.
         """
         if scenario.members:
             names = ", ".join(member.name for member in scenario.members)
@@ -203,8 +206,8 @@ class Ranges:
 
         Args:
             share: for some pairs (quantity, vehicle index), the position of the value in its range: 0 is the smallest
-                value, 1 the largest. A vehicle without such a position gets the median. If ``share`` is None, all
-                vehicles get the median.
+                value, 1 the largest. A vehicle whose index is in no pair with the quantity ``key`` gets the median. If
+                ``share`` is None, all vehicles get the median.
             key: name of the quantity; must be a key of ``middle``.
 
         """

@@ -4,8 +4,9 @@ The module ``estimated`` explains the *estimated world*. Mode ``step`` certifies
 the world in which every unknown quantity has its median. Mode ``step`` promises nothing about the true world. Mode
 ``robust`` also certifies every action in the corners: the estimated worlds in which every unknown quantity has its
 smallest or largest value. If the true world is one of the corners, the harm in the true world up to the horizon is at
-most the bound at the first decision. The reason is that a later message only removes corners that contradict the
-message, and a new plan replaces the present plan only if the new plan is better in the remaining corners.
+most the bound at the first decision. This bound holds for two reasons: a later message only removes corners that
+contradict the message, and a new plan replaces the present plan only if the new plan is better in the remaining
+corners.
 """
 
 from __future__ import annotations
@@ -43,10 +44,10 @@ SURPRISE = 1e-6  # largest difference (m, m/s) between a measurement and its pre
 
 def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
     """After a restart of the shield in the episodes ``rows``, restore the harm so far, and replace each new plan by the
-    rest of the old plan if this rest is at least as good.
+    rest of the old plan if the predicted harm of this rest is at most the predicted harm of the new plan.
 
-    ``shield`` has just been restarted; the function changes it in place. ``before`` is a copy of the shield from before
-    the restart.
+    ``shield`` has just been restarted; the function changes ``shield`` in place. ``before`` is a copy of the shield
+    from before the restart.
     """
     (running, backup), (old, held) = shield.memory[:2], before.memory[:2]
     assert running is not None and old is not None
@@ -69,9 +70,10 @@ class EstimatedShield:
 
     The shield starts at the first decision. The shield restarts when its vehicle learns of a further vehicle, learns
     that another vehicle reacts, or sees a vehicle move otherwise than predicted. After a restart, the shield keeps the
-    rest of the previous plan if this rest is at least as good as the new plan. At the first decision,
-    ``predicted_harm`` [n] is set to the present bound on harm; later decisions do not change it. ``predicted_harm`` is
-    infinite if the vehicle had an impact before the first decision, because the harm of that impact is unknown.
+    rest of the previous plan if the predicted harm of this rest is at most the predicted harm of the new plan. At the
+    first decision, ``predicted_harm`` [n] is set to the present bound on harm; later decisions do not change it.
+    ``predicted_harm`` is infinite if the vehicle had an impact before the first decision, because the harm of that
+    impact is unknown.
 
     Args:
         scenario: the scenario of the worlds; a mixture of scenarios raises ``InvalidInput``.
@@ -173,15 +175,15 @@ class EstimatedShield:
         """Return the certified actions, [n], from -1 (full braking) to 1; the action is 0 until the vehicle's latency
         has elapsed.
 
-        A repeated call at the same time of the episodes returns the same actions. Raises ``InvalidInput`` for an
-        episode that was not started with ``begin``.
+        If ``decide`` is called again at the same time of an episode, it returns the same action for this episode.
+        Raises ``InvalidInput`` for an episode that was not started with ``begin``.
 
         Args:
             worlds: the true worlds; only the information that the vehicle received is read.
             proposed: [n] actions that the policy proposes.
             proposer: the policy and its memory. If no other plan certifies a proposed action, the shield also tries the
                 policy's rollout (simulated episode) in the estimated worlds. If ``proposer`` is None, the shield does
-                not try this rollout.
+                not try the policy's rollout.
             only: [n] True for worlds in which the vehicle decides now; None means all worlds.
 
         """
@@ -273,8 +275,9 @@ class EstimatedShield:
     def _keeps(self, received: Told, time_s: Floats) -> Bools:
         """Return a mask [n, N]: True for each vehicle whose predicted state replaces its received state.
 
-        The mask is True if a vehicle is unknown, or if its last message is older than its last predicted impact or
-        contact. ``received`` is the information that the vehicle has received; ``time_s`` [n] is the present time.
+        The mask is True for a vehicle that is unknown, and for a vehicle whose last message is older than the vehicle's
+        last predicted impact or contact. ``received`` is the information that the vehicle has received; ``time_s`` [n]
+        is the present time.
         """
         running = self.shield.memory.running
         if running is None:
@@ -291,8 +294,8 @@ class EstimatedShield:
         return keeps
 
     def _note_impacts(self, worlds: Worlds) -> None:
-        """Store the present time as the time of the last impact for each vehicle that, in any possible world, had an
-        impact since the last decision.
+        """For each vehicle that had an impact since the last decision in at least one possible world, store the present
+        time as the time of the vehicle's last impact.
 
         ``worlds`` are the true worlds at the present time.
         """
@@ -308,8 +311,8 @@ class EstimatedShield:
         self._totals = totals.copy()
 
     def _is_surprised(self, estimated: Worlds, heard: Bools) -> Bools:
-        """Return a mask [n]: True for each world in which the state of a vehicle is outside the range of its predicted
-        states.
+        """Return a mask [n]: True for each world in which the estimated state of at least one vehicle is outside the
+        range of the states that the shield predicted for this vehicle.
 
         Args:
             estimated: the estimated worlds at the present time, [n].

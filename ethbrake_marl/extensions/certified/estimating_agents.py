@@ -27,15 +27,15 @@ class Odometer(NamedTuple):
 
     @classmethod
     def begun(cls, alert: Worlds, vehicle: int) -> Odometer:
-        """Return an odometer for the vehicle with index ``vehicle`` at the start of episodes; ``alert`` [n] are the
-        worlds at the alert.
+        """Return the odometer (distance travelled since the alert) of the vehicle with index ``vehicle`` at the start
+        of episodes; ``alert`` [n] are the worlds at the alert.
         """
         return cls(np.zeros(alert.n), alert.time_s.copy(), alert.speeds_mps[:, vehicle].copy())
 
     def look(self, worlds: Worlds, vehicle: int) -> Odometer:
-        """Return a new odometer for the present time; ``worlds`` [n] are the present worlds. The method adds the
-        distance since the last decision: mean speed times time, or the stopping distance if a braking vehicle stopped.
-        The added distance is exact if the command was constant.
+        """Return a new odometer (distance travelled since the alert) for the present time; ``worlds`` [n] are the
+        present worlds. The method adds the distance since the last decision: mean speed times time, or the stopping
+        distance if a braking vehicle stopped. The added distance is exact if the command was constant.
         """
         speed, command, before = worlds.speeds_mps[:, vehicle], worlds.command_mps2[:, vehicle], self.speed_mps
         way = 0.5 * (before + speed) * (worlds.time_s - self.time_s)
@@ -56,7 +56,8 @@ class Estimating(AgentAround):
         policy: agent that controls the vehicle; any agent that reads the state of the line is possible.
         scenario: the scenario, which declares the ranges of all unknown quantities; a mixture of scenarios raises
             ``InvalidInput``.
-        shows: if True, the policy sees the estimated world at every decision; if False, only when the policy starts.
+        shows: if True, the policy sees the estimated world at every decision; if False, the policy sees the estimated
+            world only when the policy starts.
 
     """
 
@@ -79,7 +80,7 @@ class Estimating(AgentAround):
         Args:
             alert: the worlds at the alert, [n].
             vehicle: index of the agent's vehicle.
-            scripts: scripts of the other vehicles; not used.
+            scripts: scripts of the other vehicles; this agent does not use them.
 
         """
         return {
@@ -120,8 +121,8 @@ class Estimating(AgentAround):
 
         The first N columns contain the amount of information about each vehicle (``Told.heard``). The other N columns
         contain a 1 for each vehicle whose reaction was reported in a message but not predicted, and a 0 for all other
-        vehicles. The policy restarts in worlds in which this summary changes. ``worlds`` are the true worlds at the
-        present time.
+        vehicles. The policy restarts in worlds in which the returned summary changes. ``worlds`` are the true worlds at
+        the present time.
         """
         known = Told.to(worlds, vehicle)
         # a received latency predicts the reaction, unless a channel may delay the reaction

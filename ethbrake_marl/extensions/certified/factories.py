@@ -81,8 +81,8 @@ def shield_steps_as_estimated(policy: Driver, argument: str | None, settings: Ag
 
 
 def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
-    """Return the shield ``+episode:estimated`` or ``+episode:pairwise:estimated``: the paper's Algorithm 1 on
-    estimates.
+    """Return the shield ``+episode:estimated`` or ``+episode:pairwise:estimated``: the paper's Algorithm 1 in the
+    estimated world.
 
     At the first decision the shield predicts, in the estimated world, the harm of ``policy`` and of E-V2X-BM (the best
     constant deceleration). The policy or E-V2X-BM, whichever has less predicted harm, controls the vehicle for the
@@ -91,7 +91,7 @@ def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: 
     Raises ``InvalidInput`` if ``policy`` already decides on received information.
 
     Args:
-        policy: the agent to compare with E-V2X-BM.
+        policy: the agent that the shield compares with E-V2X-BM.
         argument: ``pairwise`` for the pairwise form of E-V2X-BM, None for the coupled form.
         settings: settings of the agent: its scenario, its harm count, and its spec (the text that names the agent),
             which error messages quote.

@@ -31,7 +31,7 @@ class RobustGuard(StepGuard):
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
         """Return the infos of a step, as a mapping from names to values. The info ``members`` is the number of possible
-        worlds in which an action is certified for each true world.
+        worlds that represent each true world; an action is certified in all of these possible worlds.
 
         Args:
             memory: the shield and the policies as they are after the step.
@@ -74,9 +74,9 @@ class EstimatedGuard(ShieldGuard):
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
         """Return the infos of one step as a mapping; the shield has certified the actions in estimated worlds.
 
-        The info ``trusted`` is true in mode ``robust`` and false in mode ``step``, because only in mode ``robust`` may
-        the bound also hold in the true world. ``memory`` contains the shield as it is after the step. ``ruling`` is the
-        shield's decision in this step, or None at the reset of the environment.
+        The info ``trusted`` is true in mode ``robust`` and false in mode ``step``, because only mode ``robust`` has a
+        bound that may also hold in the true world. ``memory`` contains the shield as it is after the step. ``ruling``
+        is the shield's decision in this step, or None at the reset of the environment.
         """
         estimated: EstimatedShield = memory.shield
         robust, shield = estimated.robust is not None, estimated.shield

@@ -118,7 +118,7 @@ class RobustOptions(ShieldOptions):
 
         Args:
             engine: the engine whose learners are shielded.
-            policies: agents that propose the actions; the keys are vehicle indices.
+            policies: maps the index of each vehicle to the agent that proposes the actions of this vehicle.
             several: True if one shield decides for all learners together.
             how: further keyword arguments of ``StepGuard``.
 

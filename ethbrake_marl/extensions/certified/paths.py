@@ -1,4 +1,5 @@
-"""Simulate all worlds of a box along paths: if a pair has an impact in some worlds only, these worlds form a new path.
+"""Simulate all worlds of a box along paths: if a pair has an impact in only some of the worlds, the worlds with the
+impact form a new path.
 
 A *path* is a set of worlds with the same sequence of impacts (``affine.Path``). A *cell* is a box (all worlds whose
 uncertain numbers lie in given intervals) together with the vehicles' commands over time.
@@ -122,8 +123,8 @@ def branch(
     return the largest harm recorded so far.
 
     If no other impact can follow, the harm in the worlds with the impact is final and is recorded. If another impact
-    can follow, these worlds become a new path on the stack. If the new path cannot be simulated, a rough bound on its
-    harm (``rough_harm``) is recorded instead.
+    can follow, the worlds with the impact become a new path on the stack. If this new path cannot be simulated, the
+    function records a rough bound on its harm (``rough_harm``) instead.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -182,7 +183,7 @@ def keep_with(harm: Floats, rest: float, worst: float, out: Floats) -> float:
 
 @compiled(apart=True)
 def closing_after(cell: Cell, path: Path, motion: Motion, p: int, speed: Floats, time: Floats, length: float) -> Floats:
-    """Return the closing speed (m/s) of the other pair at an impact that may follow the impact of pair ``p`` in the
+    """Return the closing speed (m/s) of an impact of the other pair that may follow the impact of pair ``p`` in the
     same piece.
 
     The function is for a line of three vehicles, which has two pairs. The result is an affine form [W] (centre, slopes,
@@ -343,7 +344,8 @@ def may_turn(cell: Cell, motion: Motion, p: int, piece: int) -> bool:
     """Return whether accelerations that build up gradually may press the vehicles of pair ``p`` together harder within
     a piece.
 
-    This is possible if the front vehicle's acceleration may fall, or if the rear vehicle's acceleration may rise.
+    The vehicles may press together harder if the front vehicle's acceleration may fall, or if the rear vehicle's
+    acceleration may rise.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -380,9 +382,9 @@ def touch_only(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, len
     """Put a second path on the stack: the worlds in which pair ``p`` came into contact without an impact and stayed in
     contact.
 
-    With brake build-up the pair may separate and have its first impact within the piece. Worlds in which the pair
-    separates and has this impact belong to the path just below the second path on the stack. Returns False if the stack
-    has no room for the second path.
+    With brake build-up the pair may separate after the contact, and then have its first impact within the same piece.
+    Worlds in which the pair separates and has its first impact belong to the path that lies directly below the second
+    path on the stack. Returns False if the stack has no room for the second path.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -418,8 +420,8 @@ def touch_only(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, len
 def thrown_back(cell: Cell, path: Path, motion: Motion, p: int, how: Approach, speed: Floats) -> bool:
     """Return whether the rear vehicle of pair ``p`` may move backwards after the impact of the pair and be hit again.
 
-    The result is False for the last vehicle of the line if it never drives: no vehicle is behind the last vehicle, so
-    its backward motion cannot lead to an impact.
+    The result is False for the last vehicle of the line if this vehicle never drives: no vehicle is behind the last
+    vehicle, so its backward motion cannot lead to an impact.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -453,8 +455,8 @@ def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
         stack: memory that the search overwrites; it stores the paths (sets of worlds with the same impacts so far).
         motion: memory that the function overwrites; it stores the motion of each vehicle in the present piece.
-        out: [W]; the function writes the affine form of the largest harm into it. The bound is the largest value of
-            this form.
+        out: [W]; the function writes the affine form of the largest harm into it. The bound is the largest value of the
+            affine form in ``out``.
         most: the search stops as soon as the harm of some world may exceed this number, m2/s2.
 
     """
@@ -484,8 +486,8 @@ def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float
 def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
     """Simulate a path (worlds with the same impacts so far) to its end; return the largest harm recorded so far, m2/s2.
 
-    The function records the harm of the path, and the harm in worlds that leave the path because of an impact and need
-    no further simulation.
+    The function records the harm of the path. It also records the harm in worlds that leave the path because of an
+    impact, if these worlds need no further simulation.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -550,8 +552,9 @@ def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out
     """Move the pairs in contact through the present piece, and pass the worlds in which a pair has an impact to
     ``branch``.
 
-    The vehicles of a pair in contact move as one body, or separate. ``branch`` records the harm in the worlds with an
-    impact, or puts these worlds on the stack as a new path. Returns the largest harm recorded so far, m2/s2.
+    In the present piece, the vehicles of a pair in contact either move as one body or separate. ``branch`` records the
+    harm in the worlds with an impact, or adds these worlds as a new path to the stack of paths that still have to be
+    simulated. Returns the largest harm recorded so far, m2/s2.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.

@@ -84,8 +84,8 @@ class RobustShield(StepShield):
 
     @property
     def boxes(self) -> Boxes | None:
-        """The boxes (smallest and largest value of every number of each world) in interior mode. The property is None
-        in corners mode, and before the first episode.
+        """The boxes (smallest and largest value of every number of each world) in interior mode. The property ``boxes``
+        is None in corners mode, and before the first episode.
         """
         boxes: Boxes | None = self.memory.enclosure
         return boxes
@@ -100,11 +100,11 @@ class RobustShield(StepShield):
         reported world and the corners of its box), and the function returns None instead of boxes.
 
         Args:
-            possible: [m * M] members of the new worlds, M consecutive members for each world.
+            possible: [m * M] members (possible worlds) of the new worlds: M consecutive members for each new world.
             problem: table with one row for each world in ``possible``.
             rows: [m] indices of the new episodes.
             plan: [m, L] action of the shielded vehicle at each decision, for each new world.
-            harm: [m] largest harm of each world's plan in any member of this world, m2/s2.
+            harm: [m] harm of each world's plan, m2/s2: the largest harm over the members of this world.
 
         """
         if possible.n == len(rows) or self.robust != INTERIOR:
@@ -133,12 +133,12 @@ class RobustShield(StepShield):
         return decision if boxes is None else certify_inside(boxes, now, memory.backup, budget, decision, asked)
 
     def _leaves_range(self, running: Running) -> Bools:
-        """Return a mask [n]: True for each reported world whose box may have a world that leaves the range between the
-        members. The members are the reported world and the corners of its box; ``running`` contains the states of the
-        members. The mask is True where the method of the same name in ``StepShield`` returns True. In interior mode the
-        mask is also True where the latency of the shielded vehicle is uncertain, because the worlds of a box then have
-        their decisions at different times. If one uncertain number (friction) changes several quantities, the mask is
-        True for all worlds.
+        """Return a mask [n]: True for each reported world whose box may contain a world outside the range of the
+        members (possible worlds). The members are the reported world and the corners of its box; ``running`` contains
+        the states of the members. The mask is True where the method of the same name in ``StepShield`` returns True. In
+        interior mode the mask is also True where the latency of the shielded vehicle is uncertain, because the worlds
+        of a box then have their decisions at different times. If the friction is uncertain, so that one uncertain
+        number changes several quantities, the mask is True for all worlds.
         """
         leaves, boxes = super()._leaves_range(running), self.boxes
         if boxes is not None:

@@ -10,8 +10,8 @@ backwards yet. An impact slows the rear vehicle, but the new speed is at least -
 gives a front vehicle at rest at most (1 + e) times the rear vehicle's speed. So, in a line of three vehicles, the speed
 of the middle vehicle stays between -e u and (1 + e) u until both its pairs have had contact. If three vehicles are in
 contact at once, each vehicle has the speed (1 + e) P - e v after the impact, where v is the speed of this vehicle
-before the impact, and P is a weighted mean of the three speeds before the impact. This speed, too, lies between -e u
-and (1 + e) u.
+before the impact, and P is a weighted mean of the three speeds before the impact. The speed of each vehicle after an
+impact of three vehicles, too, lies between -e u and (1 + e) u.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ def rough_harm(cell: Cell, path: Path, hit: int) -> float:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
         path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
             interval of constant command).
-        hit: index of one more pair whose first impact is treated as past, in addition to the pairs marked in the path;
-            -1: no more pairs.
+        hit: index of one more pair that is treated as if its first impact had already happened, in addition to the
+            pairs marked in the path; -1: no such pair.
 
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
@@ -74,8 +74,8 @@ def rough_harm(cell: Cell, path: Path, hit: int) -> float:
 
 @compiled(apart=True)
 def rough_rest(cell: Cell, own: Floats, backwards: float, since: float, path: Path, hit: int) -> float:
-    """Return an upper bound (m2/s2) on the harm of all first impacts that are still to come: the sum of their squared
-    closing speeds.
+    """Return an upper bound (m2/s2) on the sum of the squared closing speeds of all first impacts that are still to
+    come.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -83,7 +83,7 @@ def rough_rest(cell: Cell, own: Floats, backwards: float, since: float, path: Pa
         backwards: largest backward speed of any vehicle at the time ``since``, m/s.
         since: present time, s after the first decision.
         path: worlds of the box with the same impacts so far; the function reads only which pairs have had an impact.
-        hit: index of one more pair whose first impact is treated as past; -1: no more pairs.
+        hit: index of one more pair that is treated as if its first impact had already happened; -1: no such pair.
 
     """
     P, e = cell.gap.shape[0], cell.restitution

@@ -5,9 +5,9 @@ The state of a pair in contact is the motion of its centre of mass, as affine fo
 vehicles deviate from this motion. While both vehicles move forward, only their commands act on the pair. The centre of
 mass then follows the commands alone, no matter how often the two vehicles collide.
 
-A world *creeps* as soon as one of the two vehicles of the pair stands or moves backwards. The brakes of this vehicle
-then hold the vehicle itself, instead of slowing the pair. For a world that creeps, the state of the pair contains only
-limits on the speeds. A *flight* is the time between two impacts of the pair.
+A world *creeps* as soon as one of the two vehicles of the pair stands or moves backwards. The brakes of the vehicle
+that stands or moves backwards then hold this vehicle itself, instead of slowing the pair. For a world that creeps, the
+state of the pair contains only limits on the speeds. A *flight* is the time between two impacts of the pair.
 """
 
 from __future__ import annotations
@@ -84,9 +84,9 @@ def apart(touch: Floats) -> float:
 
 @compiled(apart=True)
 def faster(cell: Cell, p: int) -> float:
-    """Return the largest possible ratio v / u, for an impact of pair ``p``: v is the front vehicle's speed after the
-    impact, and u is the rear vehicle's speed before the impact. The returned ratio is at least 1. ``cell`` contains the
-    coefficient of restitution and each vehicle's share of the pair's mass.
+    """For an impact of pair ``p``, return the largest possible ratio v / u, where v is the front vehicle's speed after
+    the impact, and u is the rear vehicle's speed before the impact. The returned ratio is at least 1. ``cell`` contains
+    the coefficient of restitution and each vehicle's share of the pair's mass.
     """
     return float(max(1.0, (1.0 + cell.restitution) * high(cell.share[p, 0])))
 
@@ -108,9 +108,10 @@ def stray(cell: Cell, touch: Floats, p: int) -> float:
     form.
 
     The result is above 0 only if one of the two vehicles may stand or move backwards. Let c be ``touch[CREEP]``, the
-    largest speed of the rear vehicle in worlds in which a vehicle stands or moves backwards. The speed in the affine
-    form lies between 0 and c. The rear vehicle's speed lies between ``-backwards(cell, p) * c`` and c. The front
-    vehicle's speed lies between 0 and ``faster(cell, p) * c``. (An impact never makes the rear vehicle faster.)
+    largest speed of the rear vehicle in worlds in which a vehicle stands or moves backwards. The speed of the centre of
+    mass in its affine form lies between 0 and c. The rear vehicle's speed lies between ``-backwards(cell, p) * c`` and
+    c. The front vehicle's speed lies between 0 and ``faster(cell, p) * c``. An impact never makes the rear vehicle
+    faster.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -198,8 +199,8 @@ def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float)
 @compiled(apart=True)
 def dip_of(cell: Cell, vague: float, length: float) -> float:
     """Return by how much (m/s) a vehicle's speed within a piece may fall below the smaller one of its speeds at the
-    start and at the end of the piece. The speed can fall below both of these speeds only if the vehicle's acceleration
-    changes its sign within the piece.
+    start and at the end of the piece. The speed can fall below both the speed at the start and the speed at the end
+    only if the vehicle's acceleration changes its sign within the piece.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -325,10 +326,10 @@ def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length:
     acceleration that the commands cause. While the closing acceleration lies between b- (``least``) and b+ (``most``),
     and b- > 0, the relative speed does not grow. Consider a *flight* (the time between two impacts), with gap g and
     relative speed w at some moment. The gap in this flight is at most ``h = g + w^2 / (2 b-)``, and the flight ends
-    with a closing speed of at most ``sqrt(2 b+ h)``. The next flight starts with a relative speed of e times this
-    closing speed, where e is the restitution. So the relative speed decreases from flight to flight if ``e sqrt(b+ /
-    b-) < 1``. If one vehicle stands or moves backwards, its own brakes hold it, so that flights are shorter and the
-    relative speeds in them are smaller.
+    with a closing speed of at most ``sqrt(2 b+ h)``. The next flight starts with a relative speed of e times the
+    closing speed at the end of this flight, where e is the restitution. So the relative speed decreases from flight to
+    flight if ``e sqrt(b+ / b-) < 1``. If one vehicle stands or moves backwards, its own brakes hold it, so that flights
+    are shorter and the relative speeds in them are smaller.
 
     Args:
         cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
@@ -368,17 +369,17 @@ def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length:
 def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: float, most: float) -> None:
     """Start a new phase of a contact, because the closing acceleration of the pair has changed.
 
-    The recorded range of closing accelerations covers the old and the new phase if, with this range, the relative speed
-    still decreases from impact to impact. If the relative speed does not decrease, the recorded range covers only the
-    new phase.
+    The recorded range of closing accelerations covers both the old and the new phase of the contact, if with this range
+    the relative speed still decreases from impact to impact. If the relative speed does not decrease from impact to
+    impact, the recorded range covers only the new phase.
 
     Args:
         touch: [TOUCH_WIDTH] state of the pair in contact (a row of ``Path.touch``); the function changes it in place.
         e: coefficient of restitution.
-        softest: smallest closing acceleration in the old and the new phase, m/s2.
-        hardest: largest closing acceleration in the old and the new phase, m/s2.
-        least: smallest closing acceleration of the new phase, m/s2.
-        most: largest closing acceleration of the new phase, m/s2.
+        softest: smallest closing acceleration in the old and the new phase of the contact, m/s2.
+        hardest: largest closing acceleration in the old and the new phase of the contact, m/s2.
+        least: smallest closing acceleration of the new phase of the contact, m/s2.
+        most: largest closing acceleration of the new phase of the contact, m/s2.
 
     """
     if not e * math.sqrt(hardest / softest) < 1.0:
@@ -400,8 +401,8 @@ def settle(touch: Floats, e: float) -> None:
     Let the closing acceleration of the pair lie between ``b-`` and ``b+``, and let e be the restitution. A *flight*
     (the time between two impacts) that begins with separating speed s lasts at most ``2 s / b-``. This flight ends with
     a closing speed of at most ``s sqrt(b+ / b-)``, and the next flight begins with e times this closing speed. So all
-    flights together last at most ``2 s / (b- (1 - e sqrt(b+ / b-)))``. After the last flight, the two vehicles move as
-    one body, unless one stands or moves backwards.
+    flights of the pair together last at most ``2 s / (b- (1 - e sqrt(b+ / b-)))``. After the last flight, the two
+    vehicles move as one body, unless one stands or moves backwards.
 
     Args:
         touch: [TOUCH_WIDTH] state of the pair in contact (a row of ``Path.touch``); the function changes it in place.
@@ -422,7 +423,7 @@ def is_blurred(path: Path, motion: Motion, N: int, p: int, length: float) -> boo
     """Return whether the gap of pair ``p`` is too uncertain to simulate a further impact of the pair in this piece.
 
     The gap is too uncertain if its uncertainty exceeds the largest distance by which the gap can shrink within the
-    piece. A pair with such a gap is treated as in contact from the start of the piece.
+    piece. A pair whose gap is too uncertain is treated as in contact from the start of the piece.
 
     Args:
         path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time

@@ -4,9 +4,9 @@ these intervals.
 The true value of a quantity with the reported value x lies in [x - h, x + h]. The half-width h is a number in the
 quantity's unit, or a share of x (such as 5 %). Impossible values are cut off from the interval of a quantity:
 latencies, speeds and gaps below 0, and speeds above the speed limit of the vehicle. The *box* of a world is the set of
-all combinations of values in its intervals. The *members* of a world are the reported world and every corner of its
-box: 2^d corners for d uncertain numbers. In shield mode ``robust`` the bound on the harm is proven for the members
-(``docs/internals/proofs/shield-corners.md``).
+all combinations of values in the intervals around the world's quantities. The *members* of a world are the reported
+world and every corner of its box: 2^d corners for d uncertain numbers. In shield mode ``robust`` the bound on the harm
+is proven for the members (``docs/internals/proofs/shield-corners.md``).
 """
 
 from __future__ import annotations
@@ -130,20 +130,20 @@ class Uncertainty:
     def moves_together(self) -> bool:
         """True if the friction is uncertain, so that one uncertain number changes several quantities.
 
-        If this property is true, the largest and smallest gaps and speeds may occur in worlds that are not corners of
-        the box.
+        If the friction is uncertain, the largest and smallest gaps and speeds may occur in worlds that are not corners
+        of the box.
         """
         return any(each.quantity == "friction" and each.half_width > 0.0 for each in self.intervals)
 
     def members(self, worlds: Worlds) -> Worlds:
         """Return the members of worlds at the alert, [n * M]: each world followed by the corners of its box.
 
-        The *box* of a world is the set of all combinations of values in its intervals. The corners are in the order of
-        binary numbers, with the first interval as the lowest bit (0: smallest value, 1: largest value). An interval of
-        width 0 does not increase the number of corners. For friction, eight values replace the two ends of the
-        interval, because friction changes all capacities together and harm may rise or fall with it. Raises
-        ``InvalidInput`` if an interval names a vehicle that does not exist, if a capacity or mass may be 0, or if there
-        are more than ``MOST_CORNERS`` corners.
+        The *box* of a world is the set of all combinations of values in the intervals around the world's quantities.
+        The corners are in the order of binary numbers, with the first interval as the lowest bit (0: smallest value, 1:
+        largest value). An interval of width 0 does not increase the number of corners. For friction, eight values
+        replace the two ends of the interval, because friction changes all capacities together and harm may rise or fall
+        with it. Raises ``InvalidInput`` if an interval names a vehicle that does not exist, if a capacity or mass may
+        be 0, or if there are more than ``MOST_CORNERS`` corners.
         """
         sides = self._sides(worlds)
         ends = [_OF_FRICTION if name == "friction" else (0.0, 1.0) for name, *_ in reversed(sides)]
@@ -168,7 +168,7 @@ class Uncertainty:
         return Worlds.concatenate(parts).take(order)
 
     def draw(self, worlds: Worlds, rng: np.random.Generator, *, corners: bool = False) -> Worlds:
-        """For each of ``worlds`` [n], draw one world from the box of intervals around it.
+        """For each of ``worlds`` [n], draw one world from the box of intervals around this world.
 
         Args:
             worlds: the reported worlds, [n].
@@ -229,7 +229,7 @@ def parse_uncertainty(text: str) -> Uncertainty:
 
     A half-width is a number in the quantity's unit, or a percentage of its value. ``.vehicle_2`` or ``.pair_1`` after
     the quantity limits the entry to one vehicle or pair. Blanks around an entry and around its ``=`` are ignored.
-    Raises ``InvalidInput`` for any other text.
+    Raises ``InvalidInput`` if ``text`` does not have this form.
     """
     entries = [entry.strip() for entry in text.split(",")]
     if "" in entries:
@@ -251,8 +251,9 @@ def parse_uncertainty(text: str) -> Uncertainty:
 
 
 def _values(worlds: Worlds, quantity: str) -> Floats:
-    """Return the reported values of one of ``QUANTITIES``. The shape of the result is [n, P] for gaps, [n, 1] for
-    friction, and [n, N] for every other quantity. The returned capacities are those on a dry road.
+    """Return the reported values of the quantity ``quantity``, which is one of ``QUANTITIES``. The shape of the result
+    is [n, P] for gaps, [n, 1] for friction, and [n, N] for every other quantity. Returned capacities are the capacities
+    on a dry road.
     """
     if quantity.endswith("_rate_mps3"):
         return np.asarray(getattr(worlds.vehicles, quantity), np.float64)
@@ -265,11 +266,11 @@ def _of(quantity: str, place: int) -> str:
 
 
 def _placed(worlds: Worlds, sides: list[_Side], share: Callable[[int], Floats | float]) -> Worlds:
-    """Return the worlds with each uncertain number at a given position in its interval.
+    """Return the reported worlds, changed so that each uncertain number has a given position in its interval.
 
-    Without a V2X channel, a changed latency changes both when the vehicle reacts and when a message arrives. With a V2X
-    channel, a changed latency changes only when the vehicle reacts. An uncertain friction limits the capacities of all
-    vehicles together.
+    Without a V2X channel, a changed latency changes both the time at which the vehicle reacts and the time at which a
+    message arrives. With a V2X channel, a changed latency changes the time at which the vehicle reacts, but not the
+    time at which a message arrives. An uncertain friction limits the capacities of all vehicles together.
 
     Args:
         worlds: the reported worlds, [n].

@@ -1,4 +1,6 @@
-"""The agent ``AGENT+search``: it searches around the commands of AGENT at the alert, and drives the best commands."""
+"""The agent ``AGENT+search``: at the alert it improves the commands of AGENT by a search, and then it drives the best
+commands.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,8 @@ from ethbrake_marl.scenario.schema import Scenario
 
 
 class Searched(AgentAround):
-    """Agent that searches around the commands of another agent at the alert, and then drives the best commands found.
+    """Agent that improves the commands of another agent by a search at the alert, and then drives the best commands
+    found.
 
     The search simulates the line; all vehicles but the controlled one follow their scripts. After the search the agent
     does not react to what it observes. ``predicted_harm`` [n] (m2/s2) is never above the harm of the agent ``policy``.
@@ -58,8 +61,8 @@ class Searched(AgentAround):
         self._outlook = Outlook(harm_count, scenario.horizon_s, scenario.time_step_s, scenario.objective)
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Simulate the policy's episode from the alert, search around its commands, and return the best commands as
-        memory.
+        """Simulate the policy's episode from the alert, improve its commands by a search, and return the best commands
+        as memory.
 
         Args:
             alert: the worlds at the alert, [n].

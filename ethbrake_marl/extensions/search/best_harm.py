@@ -56,14 +56,15 @@ def best_harm(
     known: BestHarmTable | None = None,
     objective: Declared = "total",
 ) -> BestHarmTable:
-    """Search for the profile with the least harm in each world and under each count. Return the profiles as a table.
+    """Search for the profile with the least harm in each world and under each count. Return the profiles with the least
+    harm as a table.
 
-    With two harm counts, there are two searches; the table stores for each count the better of the two profiles. The
-    harm in the table is at most the harm in ``known`` and, with one controlled vehicle, the harm of the best constant
-    deceleration. With several controlled vehicles, the harm is also at most the result of the same search for one of
-    these vehicles while the others brake fully. The result for a world does not depend on ``threads`` or on the other
-    worlds. Raises ``InvalidInput`` if ``vehicles`` or ``counts`` is empty, if the command
-    of a script is not fixed at the alert, or if ``budget`` is below 1.
+    With two harm counts, there are two searches; for each count, the table stores the profile with the least harm under
+    this count. The harm in the table is at most the harm in ``known`` and, with one controlled vehicle, the harm of the
+    best constant deceleration. With several controlled vehicles, the harm is also at most the harm that the same search
+    reaches if it controls only one of these vehicles and the others brake fully. The result for a world does not depend
+    on ``threads`` or on the other worlds. Raises ``InvalidInput`` if ``vehicles`` or ``counts`` is empty, if the
+    command of a script is not fixed at the alert, or if ``budget`` is below 1.
 
     Args:
         scenario: scenario of the worlds.
@@ -136,7 +137,8 @@ def search_list(
     on_progress: Progress | None = None,
     objective: Declared = "total",
 ) -> BestHarmTable:
-    """Run ``best_harm`` on a long list of worlds, ``CHUNK`` worlds at a time. An interrupted run can be continued.
+    """Run ``best_harm`` on a long list of worlds, ``CHUNK`` worlds at a time. An interrupted run of ``search_list`` can
+    be continued.
 
     The table leaves out worlds that cannot be simulated because of a defect of the physics. The table's header names
     the worlds that are left out, under the key ``LEFT_OUT``. Raises ``InvalidInput`` in the same cases as
@@ -153,8 +155,8 @@ def search_list(
         threads: number of threads; None: one for each core.
         known: table of best known harm; the search starts from the profiles in this table. None: no table.
         chunks: folder in which the table of each finished chunk (``CHUNK`` worlds of the list) is stored as a file. A
-            later call with the same arguments reads these files; a call with other arguments overwrites them. If
-            ``chunks`` is None, no files are read or written.
+            later call with the same arguments reads the stored files; a later call with other arguments overwrites the
+            stored files. If ``chunks`` is None, no files are read or written.
         on_progress: function that is called with the number of finished worlds and the number of all worlds.
         objective: objective to minimise, as in ``best_harm``.
 
@@ -196,7 +198,8 @@ def _kept_or_searched(
     """Return the table of best known harm for one chunk (at most ``CHUNK`` worlds of the list).
 
     If ``file`` contains a table of the chunk's worlds that was made with the same options, this table is returned. If
-    ``file`` contains no such table, the worlds are searched, and the new table is written to ``file``.
+    ``file`` contains no table of these worlds with these options, the worlds are searched, and the new table is written
+    to ``file``.
 
     Args:
         task: scenario and controlled vehicles.
@@ -224,7 +227,8 @@ def _kept_or_searched(
 
 
 def chunks_left(scenario: Scenario, sample: Sample, *, budget: int, chunks: Path) -> tuple[int, list[Path]]:
-    """Return the number of worlds that ``search_list`` still has to search, and the paths of damaged files.
+    """Return the number of worlds that ``search_list`` still has to search, and the paths of the damaged files in the
+    folder ``chunks``.
 
     Args:
         scenario: scenario of the worlds.
@@ -302,7 +306,7 @@ def _searched(
     worlds: Worlds, task: Task, others: Floats, given: Sequence[Profiles], deciders: Sequence[int],
     effort: dict[str, int], aimed: Callable[[ProfileProblem], ProfileProblem],
 ) -> Found:  # fmt: skip
-    """Search each world, and return the best profiles and their harm under each harm count.
+    """Search each world; return the profiles with the least harm, and their harm under each harm count.
 
     With several controlled vehicles, the search also starts from the best profile of each controlled vehicle while the
     others brake fully.
@@ -359,7 +363,8 @@ def starting_profiles(
 
 
 def startable(profiles: Profiles) -> Profiles:
-    """Return the profiles with at most ``MOST_PHASES`` phases (intervals of constant command), the most for a search.
+    """Return the profiles in a form from which a search can start: with at most ``MOST_PHASES`` phases (intervals of
+    constant command).
 
     A profile with more than ``MOST_PHASES`` phases is replaced by its first command for the whole episode.
     """
@@ -410,7 +415,8 @@ def driven_profiles(agent: Driver, worlds: Worlds, task: Task, last_step: Ints) 
 def fold_episodes(
     table: BestHarmTable, scenario: Scenario, worlds: Worlds, name: str, agents: Mapping[HarmCount, Agent]
 ) -> BestHarmTable:
-    """Let agents drive the worlds; return a table with the lower harm wherever an agent does less harm than ``table``.
+    """Let agents drive the worlds; return a copy of ``table`` with the lower harm in each world in which an agent does
+    less harm than ``table``.
 
     The agents' commands are recorded and simulated again; the table stores the harm of the second simulation. The
     table's header says in how many worlds the harm was lowered. If the simulation with an agent fails in a world, the
@@ -421,8 +427,8 @@ def fold_episodes(
         scenario: scenario of the worlds.
         worlds: worlds at t = 0; worlds with best known harm 0 are skipped.
         name: name of the agent, which the table's header mentions.
-        agents: for each harm count, an agent that minimises this count. Every episode is compared with the table under
-            both harm counts.
+        agents: for each harm count, an agent that minimises this count. The harm of every episode is compared with the
+            harm in the table, under both harm counts.
 
     """
     if OBJECTIVE in table.header:

@@ -92,7 +92,8 @@ def try_changes(
     world: SearchWorld, kind: int, at: Floats, start: Floats, low: float, high: float, ends: Ints, commands: Floats,
     values: Floats,
 ) -> float:  # fmt: skip
-    """Simulate profiles whose first change of command is between ``low`` and ``high``; keep the best profiles.
+    """Simulate profiles whose first change of command is between ``low`` and ``high``; keep the profiles with the least
+    harm.
 
     Returns the time (s) at which the command first changes in the profile with the least harm.
 
@@ -100,7 +101,7 @@ def try_changes(
         world: world to simulate, with the bounds of the commands and a random stream.
         kind: ``FRONT_FIRST`` if the controlled vehicle meets the vehicle ahead, ``REAR_FIRST`` if it meets the vehicle
             behind.
-        at: state of the world at the first decision, [WIDTH], in the order of the columns ``proofs.line.LINE``.
+        at: state of the world at the first decision, [WIDTH]; ``proofs.line.LINE`` names the columns.
         start: state of the simulation at the first decision, [S].
         low: earliest time at which the command first changes, s.
         high: latest time at which the command first changes, s.
@@ -147,10 +148,10 @@ def fill_extreme(
         world: world of the profile, with the bounds of the commands and the time step.
         kind: the first command: ``FRONT_FIRST`` for full drive, ``REAR_FIRST`` for full braking.
         change: time at which the command first changes, s.
-        meeting: time of the second change of the command, s.
-        early: how many time steps before ``meeting`` the command changes for the second time.
-        share: weight of the first command, from 0 to 1, in the time step in which the second command changes back to
-            the first command.
+        meeting: time of the second change of the command if ``early`` is 0, s.
+        early: number of time steps by which the second change of the command comes before the time ``meeting``.
+        share: the command of the time step between the second command and the return to the first command is a weighted
+            mean of the two commands; ``share`` is the weight of the first command in this mean, from 0 to 1.
         ends: output: time step at which each phase ends, [5].
         commands: output: command of each phase, [5, 1] m/s2.
 

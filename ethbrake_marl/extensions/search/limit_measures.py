@@ -123,9 +123,10 @@ class LimitMeasures(MeasureSet):
         """Return additional values for the summary of an agent, as a dictionary from the name to the value.
 
         ``known_best_share`` is the share of the worlds for which a best known harm existed before the evaluation.
-        ``below_best_known`` is the number of worlds in which the agent does less harm than this earlier best known
-        harm. ``best_known_warning`` is a warning text or None. ``impact_unproven`` describes the worlds in which
-        contact is proven unavoidable but an impact is not, with the fields of ``Between``.
+        ``below_best_known`` is the number of worlds in which the agent does less harm than the best harm known before
+        the evaluation. ``best_known_warning`` is the warning that a table contains the best known harm of only some of
+        the worlds; None if there is no warning. ``impact_unproven`` describes the worlds in which contact is proven
+        unavoidable, but an impact is not proven unavoidable, with the fields of ``Between``.
 
         Args:
             tally: counts and means over the agent's episodes.

@@ -130,7 +130,8 @@ def unproven_because(worlds: Worlds, task: Task) -> str | None:
 
 
 def undecided_because(worlds: Worlds, task: Task) -> str | None:
-    """Return the reason why it is not known whether contact is avoidable, as a clause; None if it is known.
+    """Return, as a clause, the reason why it is not known whether contact is avoidable; None if it is known whether
+    contact is avoidable.
 
     ``worlds`` must be at the alert. ``task`` names the scenario and the controlled vehicles.
     """
@@ -138,7 +139,7 @@ def undecided_because(worlds: Worlds, task: Task) -> str | None:
 
 
 def _uncovered_because(worlds: Worlds, task: Task) -> str | None:
-    """Return the reason why the proof ``avoidability`` does not cover ``task``, as a clause; None if the proof covers
+    """Return, as a clause, the reason why the proof ``avoidability`` does not cover ``task``; None if the proof covers
     ``task``.
 
     The proof ``avoidability`` assumes that brakes act at once; the function does not check this assumption.
@@ -170,7 +171,9 @@ def _uneven_because(worlds: Worlds) -> str:
 
 
 def _is_team(task: Task) -> bool:
-    """Return whether several vehicles are controlled, or one vehicle in a line of more than three vehicles."""
+    """Return True if several vehicles are controlled, or if one vehicle is controlled in a line of more than three
+    vehicles.
+    """
     return len(task.vehicles) > 1 or (len(task.vehicles) == 1 and task.scenario.vehicles > _VEHICLES)
 
 

@@ -53,8 +53,8 @@ class Outlook(NamedTuple):
     def due(self, worlds: Worlds, planned_s: Floats) -> Ints:
         """Return the indices of worlds that need a new plan.
 
-        A world needs a new plan if a vehicle moves, the horizon is not reached, and time has passed since the last
-        plan. ``planned_s`` [n] is the time of the last plan, s.
+        A world needs a new plan if a vehicle moves, the horizon is not reached, and the last plan was made before the
+        present time. ``planned_s`` [n] is the time at which the last plan was made, s.
         """
         moving = (worlds.speeds_mps != 0.0).any(axis=1)
         return np.flatnonzero((worlds.time_s > planned_s) & (worlds.time_s < self.horizon_s) & moving)
@@ -183,8 +183,8 @@ class Planner:
         return Profiles(ends, plan.commands_mps2)
 
     def _search(self, problem: ProfileProblem, plan: Profiles) -> tuple[Profiles, Floats]:
-        """Search each world, starting from ``plan`` and constant commands; return the best profile and its harm, [n]
-        m2/s2.
+        """Search each world, starting from ``plan`` and constant commands; return the profile with the least harm in
+        each world, and its harm, [n] m2/s2.
         """
         constants = problem.constant(problem.even_grid(15))
         n, K = plan.ends.shape  # [n * Q]: for each world its plan, then constants
@@ -197,7 +197,9 @@ class Planner:
 
 
 def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
-    """Return the agent ``planner`` or ``planner:CANDIDATES``. ``argument`` is CANDIDATES as text, or None."""
+    """Return the agent ``planner`` or ``planner:CANDIDATES``. ``argument`` is the number of profiles that are simulated
+    in each world at each decision, as text; None means the default number.
+    """
     return Planner(
         argument, harm_count=settings.harm_count, horizon_s=settings.horizon_s,
         most_candidates=settings.most_candidates, time_step_s=settings.time_step_s,
@@ -209,7 +211,8 @@ def make_estimating_planner(argument: str | None, settings: AgentSettings) -> Ag
     """Return the agent ``planner:estimated`` or ``planner:CANDIDATES:estimated``, which searches in the world as it is
     estimated from messages and sights.
 
-    ``argument`` is CANDIDATES as text, or None.
+    ``argument`` is the number of profiles that are simulated in each world at each decision, as text; None means the
+    default number.
     """
     return Estimating(make_planner(argument, settings), settings.needed_scenario(), shows=True)
 

@@ -1,4 +1,4 @@
-"""Search for the best command profile in each world of a problem, on several threads."""
+"""Search for the command profile with the least harm in each world of a problem, on several threads."""
 
 from __future__ import annotations
 
@@ -56,12 +56,13 @@ Found = tuple[Profiles, dict[HarmCount, Floats]]
 
 
 def search_profiles(problem: ProfileProblem, given: Profiles, *, budget: int, seed: int = 0, threads: int = 1) -> Found:
-    """Search each world; return the best profile of each world, and its harm [n] (m2/s2) under each harm count.
+    """Search each world; return the profile with the least harm in each world, and the harm [n] (m2/s2) of this profile
+    under each harm count.
 
-    A profile has at most ``MOST_PHASES`` phases of constant command. The best profile is never worse than any profile
-    of ``given``. The harm is the quantity that ``problem`` minimises. Raises ``InvalidInput`` for ``budget`` or
-    ``threads`` below 1 or a negative seed, and ``PhysicsError``, which names the worlds in which the physics could
-    simulate no profile.
+    A profile has at most ``MOST_PHASES`` phases of constant command. The harm of the returned profile is at most the
+    harm of each profile of ``given``. The harm is the quantity that ``problem`` minimises. Raises ``InvalidInput`` if
+    ``budget`` or ``threads`` is below 1, or if ``seed`` is negative. Raises ``PhysicsError``, which names the worlds in
+    which the physics could simulate no profile.
 
     Args:
         problem: n worlds, with the commands of the other vehicles and the harm to minimise.

@@ -1,4 +1,4 @@
-"""Compiled random search for the best profile of one world. Each world has its own random stream.
+"""Compiled random search for the profile with the least harm in one world. Each world has its own random stream.
 
 A *profile* has at most K phases (intervals of constant command). ``ends`` [K] are the time steps at which the phases
 end, and ``commands`` [K, C] are the commands of the C controlled vehicles in each phase (m/s2). ``bounds`` [C, 2] are
@@ -175,10 +175,10 @@ class Population(NamedTuple):
 def search_world(
     world: SearchWorld, start: Floats, seed_ends: Ints, seed_commands: Floats, budget: int, ends: Ints, commands: Floats
 ) -> int:
-    """Search for the best profile of one world, and write the profile to ``ends`` and ``commands``.
+    """Search for the profile with the least harm in one world, and write the profile to ``ends`` and ``commands``.
 
-    Returns the number of phases of the best profile; 0 if the physics could simulate no profile. The best profile is
-    never worse than any starting profile.
+    Returns the number of phases of the profile with the least harm; 0 if the physics could simulate no profile. The
+    harm of the written profile is at most the harm of each starting profile.
 
     Args:
         world: world to simulate, with the bounds of the commands and a random stream.
@@ -301,7 +301,7 @@ def gather(
 ) -> None:
     """Fill the field (profiles to improve) with the best of the starting profiles and of ``drawn`` random profiles.
 
-    No two profiles of the field have the same harm.
+    No two profiles in the field have the same harm.
 
     Args:
         world: world to simulate, with the bounds of the commands and a random stream.
@@ -373,7 +373,9 @@ def is_among(value: float, values: Floats) -> bool:
 
 @compiled
 def largest(values: Floats) -> int:
-    """Return the index of the largest value. If several values are equally large, return the first index."""
+    """Return the index of the largest number in ``values``. If several numbers are equally large, return the index of
+    the first of them.
+    """
     place = 0
     for k in range(values.shape[0]):
         if values[k] > values[place]:
@@ -429,7 +431,7 @@ def select_stepwise(
         seed_commands: commands of the starting profiles, [Q, K, C] m/s2.
         states: [K + 1, S] state of the world at the start of each phase; row 0: state at the first decision;
             overwritten.
-        field: profiles that the search improves; the first profile is overwritten.
+        field: profiles that the search improves; the function overwrites the first profile with the result.
 
     """
     world.episode.clock[CLOCK.STEPWISE] = 1.0

@@ -35,10 +35,10 @@ class BestHarm:
     """Agent that drives the command profile with the least known harm.
 
     In a world without a stored profile, the agent searches for a profile at the alert. If the controlled vehicle is the
-    only learner, the agent then searches a second time. The second search starts from the better one of two profiles:
-    the result of the first search, and the commands of the shipped policy ``universal``. Therefore the result is never
-    worse than ``universal``. If the environment has the agent's time step, the simulated harm is exactly
-    ``predicted_harm`` [n] (m2/s2). Raises ``InvalidInput`` if ``budget`` is below 1 or ``harm_count`` is
+    only learner, the agent searches a second time after this search. The second search starts from the better one of
+    two profiles: the result of the first search, and the commands of the shipped policy ``universal``. Therefore the
+    result is never worse than ``universal``. If the environment has the agent's time step, the simulated harm is
+    exactly ``predicted_harm`` [n] (m2/s2). Raises ``InvalidInput`` if ``budget`` is below 1 or ``harm_count`` is
     unknown. ``begin`` raises ``InvalidInput`` if the command of another vehicle's script is not fixed at the alert.
 
     Args:
@@ -135,7 +135,8 @@ class BestHarm:
         return self._outlook.command(worlds, memory), memory
 
     def _search(self, worlds: Worlds, vehicle: int, others: Floats) -> tuple[Floats, Floats]:
-        """Search each world; return the best command at each decision, [n, decisions] m/s2, and the harm, [n] m2/s2.
+        """Search each world; return the commands with the least harm, one for each decision, [n, decisions] m/s2, and
+        their harm, [n] m2/s2.
 
         ``others`` [n, N] are the commands of the other vehicles, m/s2.
         """

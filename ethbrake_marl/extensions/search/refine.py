@@ -1,10 +1,10 @@
-"""Compiled random search around the commands of an episode.
+"""Compiled random search that improves the commands of an episode.
 
 The search improves two sequences of commands by random changes of a few neighbouring steps. The caller gives the first
-sequence. The second sequence is the best of some random *templates*; it is needed because small changes of the caller's
-commands may miss the best commands. A template is a random braking profile of three phases: one command, then another
-command for a short while, then full braking. The search simulates one decision after the other, as the engine does, and
-therefore computes exactly the same harm as the engine.
+sequence of commands. The second sequence is the best of some random *templates*; it is needed because small changes of
+the caller's commands may miss the best commands. A template is a random braking profile of three phases: one command,
+then another command for a short while, then full braking. The search simulates one decision after the other, as the
+engine does, and therefore computes exactly the same harm as the engine.
 """
 
 from __future__ import annotations
@@ -53,13 +53,14 @@ class Plan(NamedTuple):
 
 
 def refine(problem: ProfileProblem, commands_mps2: Floats, *, budget: int, seed: int = 0) -> tuple[Floats, Floats]:
-    """Improve given commands by a search. Return the best commands, [n, T] m/s2, and their harm, [n] m2/s2.
+    """Improve given commands by a search. Return the commands with the least harm, [n, T] m/s2, and their harm, [n]
+    m2/s2.
 
-    The result is never worse than the given commands. The harm is the quantity that ``problem`` minimises, and equals
-    the harm that the engine computes. The result for a world does not depend on the other worlds. Raises
-    ``InvalidInput`` if several vehicles are controlled, if the commands have a wrong shape or exceed a capacity, or if
-    ``budget`` is below 1. Raises ``PhysicsError``, which names the worlds in which the physics cannot simulate the
-    given commands.
+    The harm of the returned commands is at most the harm of the given commands. The harm is the quantity that
+    ``problem`` minimises, and equals the harm that the engine computes. The result for a world does not depend on the
+    other worlds. Raises ``InvalidInput`` if several vehicles are controlled, if the commands have a wrong shape or
+    exceed a capacity, or if ``budget`` is below 1. Raises ``PhysicsError``, which names the worlds in which the physics
+    cannot simulate the given commands.
 
     Args:
         problem: n worlds with one controlled vehicle, the commands of the other vehicles, and the harm to minimise.
@@ -99,7 +100,7 @@ def _refine_worlds(
         random: initial state of each world's random stream, [n].
         budget: number of candidates (sequences of commands) that are simulated in each world.
         commands: command of each step, [n, T] m/s2; changed in place.
-        value: output: harm of the improved commands, as ``problem`` counts it, [n] m2/s2.
+        value: output: for the improved commands, the harm that ``problem`` minimises, [n] m2/s2.
         failed: output: True for worlds in which the physics cannot simulate the commands, [n].
 
     """
@@ -149,9 +150,9 @@ def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[
 
     Args:
         world: world to simulate, with the commands of the other vehicles.
-        plan: commands to simulate, with the state at step ``begin``.
+        plan: commands to simulate; ``plan`` also contains the state at step ``begin``.
         begin: first step to simulate.
-        bound: harm at which the simulation stops, m2/s2.
+        bound: the simulation stops as soon as the harm is at least this number, m2/s2.
 
     """
     table, clock = world.table, world.clock
@@ -173,10 +174,12 @@ def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[
 
 @compiled(apart=True)
 def climb(world: SearchWorld, plan: Plan, room: Plan, value: float, reached: int, budget: int) -> tuple[float, int]:
-    """Improve ``plan`` in place by random changes, and return its harm (m2/s2) and its number of steps.
+    """Improve ``plan`` in place by random changes; return the harm (m2/s2) of the improved plan and the number of steps
+    of its episode.
 
-    Most changes add an amount to the commands of some neighbouring steps; the others replace these commands. If adding
-    an amount lowers the harm, the next change adds twice this amount to the commands of the same steps.
+    Most changes add an amount to the commands of some neighbouring steps; the other changes replace the commands of
+    some neighbouring steps. If adding an amount lowers the harm, the next change adds twice this amount to the commands
+    of the same steps.
 
     Args:
         world: world to simulate, with the bounds of the commands and a random stream.
@@ -229,8 +232,8 @@ def draw_templates(world: SearchWorld, best: Plan, room: Plan, bound: float, num
     """Simulate random templates (braking profiles), and write the one with the least harm to ``best``.
 
     A *template* has three phases: one command, then another command for a short while, then full braking. Returns the
-    harm of the best template (m2/s2) and the number of steps of its episode. The number of steps is 0 if no template
-    does less harm than ``bound``.
+    harm of the template with the least harm (m2/s2), and the number of steps of the episode under this template. The
+    number of steps is 0 if no template does less harm than ``bound``.
 
     Args:
         world: world to simulate, with the bounds of the commands and a random stream.

@@ -40,7 +40,7 @@ class Regrets:
         return self.first_impact_harm if harm_count == "first" else self.total_harm
 
     def regret(self, outcome: Outcome, harm_count: HarmCount) -> Floats:
-        """Return an agent's harm minus the best known harm, [n] m2/s2, never negative.
+        """Return an agent's harm minus the best known harm, [n] m2/s2; the result is never negative.
 
         ``outcome`` is the agent's outcome in these worlds; ``harm_count`` is ``first`` or ``total``.
         """
@@ -50,7 +50,8 @@ class Regrets:
         """Return a mask [n]: True for worlds in which an agent does less harm than the best harm known before the
         evaluation.
 
-        The agent's harm must be smaller by more than ``TOLERANCE``, under at least one of the two harm counts.
+        True means that the agent's harm is smaller by more than ``TOLERANCE``, under at least one of the two harm
+        counts.
         """
         first, total = self.limits.first_impact_harm, self.limits.total_harm
         return (outcome.first_impact_harm < first - TOLERANCE) | (outcome.total_harm < total - TOLERANCE)
@@ -62,7 +63,7 @@ class Regrets:
 
     @property
     def between(self) -> Between | None:
-        """Summary of the worlds in which contact is proven unavoidable but an impact is not.
+        """Summary of the worlds in which contact is proven unavoidable, but an impact is not proven unavoidable.
 
         The result is None if it is not known whether contact is avoidable.
         """
@@ -73,7 +74,9 @@ class Regrets:
 
 @dataclass(frozen=True, slots=True)
 class Between:
-    """Summary of the worlds in which contact is proven unavoidable but an impact is not: share and best known harm."""
+    """Summary of the worlds in which contact is proven unavoidable, but an impact is not proven unavoidable: share and
+    best known harm.
+    """
 
     rate: float  # share of all worlds
     mean_first: float | None  # mean best known first-impact harm; None if unknown in all of them
@@ -95,7 +98,8 @@ class Between:
 
     @classmethod
     def of(cls, contact: Bools, impact: Bools, first: Floats, total: Floats) -> Between:
-        """Return the summary of the worlds in which contact is proven unavoidable but an impact is not.
+        """Return the summary of the worlds in which contact is proven unavoidable, but an impact is not proven
+        unavoidable.
 
         Args:
             contact: [n] True if contact is proven unavoidable.
@@ -127,7 +131,8 @@ KNOWN_OF_WORLDS: dict[str, Callable[[Outcome, Regrets], Values | None]] = {
 
 
 def limits_of(evaluation: Evaluation) -> Limits | Unproven:
-    """Return what is proven about each world, and the harm that is known before the agents of this evaluation drive.
+    """Return what is proven about each world, and the best harm that was known before the agents of this evaluation
+    drive.
 
     Returns ``Unproven`` if the proofs do not cover the evaluation. The result is computed once per evaluation. Warns
     with ``IncompleteTable`` if a table contains the best known harm of only some of the worlds.

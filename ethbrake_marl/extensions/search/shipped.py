@@ -1,4 +1,4 @@
-"""The shipped tables of best known harm, and the agent that drives their profiles."""
+"""The shipped tables of best known harm, and the agent that drives the command profiles in these tables."""
 
 from __future__ import annotations
 

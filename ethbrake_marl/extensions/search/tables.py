@@ -63,9 +63,9 @@ class BestHarmTable:
     def load(cls, path: Path) -> BestHarmTable:
         """Return the table that is stored in the file ``path``.
 
-        Raises ``InvalidInput`` if the file does not exist, and ``CorruptBundle`` if it is not a table. The names,
-        types, shapes and sizes of the arrays are checked before the file is unpacked. The stored harm is not checked
-        by simulation.
+        Raises ``InvalidInput`` if the file does not exist, and ``CorruptBundle`` if the file is not a table. The names,
+        types, shapes and sizes of the arrays are checked before the file is unpacked. The stored harm is not checked by
+        simulation.
         """
         if not os.path.exists(path):
             raise InvalidInput(f"{path}: there is no such file; give the file of a table of best known harm")
@@ -154,9 +154,9 @@ class BestHarmTable:
         """Return a copy of the table in which smaller values from ``harm`` replace the old values, and a mask [m]: True
         for the changed worlds.
 
-        A value in ``harm`` must be smaller than the value in the table by more than ``TOLERANCE``. Worlds that are not
-        in the table are ignored. Raises ``InvalidInput`` if the table does not contain ``harm_count``, or if ``harm``
-        and ``identity`` have different shapes.
+        A value in ``harm`` replaces the value in the table only if the value in ``harm`` is smaller by more than
+        ``TOLERANCE``. Worlds that are not in the table are ignored. Raises ``InvalidInput`` if the table does not
+        contain ``harm_count``, or if ``harm`` and ``identity`` have different shapes.
 
         Args:
             identity: hash of each world, [m].
@@ -290,6 +290,6 @@ def _read_best(arrays: Mapping[str, NDArray[Any]], harm_count: HarmCount) -> Bes
 def _used(ends: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the number of phases that each profile uses, [n]; 0 for a world without a profile.
 
-    ``ends`` [n, K] are the steps at which the phases end.
+    ``ends`` [n, K] are the time steps at which the phases of each profile end.
     """
     return np.where(ends[:, -1] > 0, np.argmax(ends == ends[:, -1:], axis=1) + 1, 0)

@@ -2,7 +2,8 @@
 
 A *template* is a random braking profile of three phases: one command, then another command for a short while, then full
 braking. From templates a policy can learn different ways to drive in a world. The best template is not improved by a
-search: a random template with little harm tolerates small errors of the commands, so a policy can imitate it.
+search: a random template with little harm tolerates small errors of the commands, so a policy can imitate this
+template.
 """
 
 from __future__ import annotations
@@ -20,9 +21,10 @@ from ethbrake_marl.physics.state import Floats, Ints, UInt64s
 def best_templates(problem: ProfileProblem, bound: Floats, *, number: int, seed: int = 0) -> tuple[Floats, Ints]:
     """Draw random templates (braking profiles) in each world, and return the template with the least harm.
 
-    Returns the commands of the best template of each world, [n, T] m/s2, and the number of steps of its episode, [n].
-    The number of steps is 0 if no template does less harm than ``bound``. The result for a world does not depend on the
-    other worlds. Raises ``InvalidInput`` if several vehicles are controlled, or if ``number`` is below 1.
+    Returns, for each world, the commands of the template with the least harm, [n, T] m/s2, and the number of steps of
+    the episode under these commands, [n]. The number of steps is 0 if no template does less harm than ``bound``. The
+    result for a world does not depend on the other worlds. Raises ``InvalidInput`` if several vehicles are controlled,
+    or if ``number`` is below 1.
 
     Args:
         problem: n worlds, with the commands of the other vehicles and the harm to minimise.
@@ -49,9 +51,9 @@ def _best_templates(
 ) -> None:
     """Write the template with the least harm in each world to ``commands`` [n, T].
 
-    The number of steps of this template's episode is written to ``steps`` [n]. ``random`` [n] is the initial state of
-    each world's random stream. A template whose harm is at least ``bound`` [n] is rejected. ``number`` templates are
-    drawn in each world.
+    The number of steps of the episode under this template is written to ``steps`` [n]. ``random`` [n] is the initial
+    state of each world's random stream. A template whose harm is at least ``bound`` [n] is rejected. ``number``
+    templates are drawn in each world.
     """
     start, T, S = problem.start, commands.shape[1], problem.start.shape[1]
     best, room = Plan(np.zeros(T), np.zeros((T + 1, S))), Plan(np.zeros(T), np.zeros((T + 1, S)))
