@@ -124,8 +124,8 @@ def place_row(table: Floats, state: Floats, params: Floats, k: int, pieces: Floa
     """Write into ``table`` the quantities of world ``k`` that are needed only if brakes take time to build up.
 
     The present accelerations come from row ``k`` of ``state``, and the rates of build-up from row ``k`` of ``params``.
-    ``pieces`` [N, 2 K] are braking profiles with K intervals of constant command. Inside the loop of ``step_worlds``,
-    this code would slow down the simulation of worlds whose brakes act at once.
+    ``pieces`` [N, 2 K] are braking profiles with K intervals of constant command. This code is not inside the loop of
+    ``step_worlds``, because there it would slow down the simulation of worlds whose brakes act at once.
     """
     column, N = columns(state), pieces.shape[0]
     command, brake_rate, release_rate = column.command, column.brake_rate, column.release_rate

@@ -227,7 +227,7 @@ class Engine:
         self._now = self._started(stream, None, worlds, {})
 
     def check_time_step(self, drivers: Mapping[int, Script]) -> None:
-        """Raise ``InvalidInput`` if an agent was made for a time between decisions that is not the scenario's.
+        """Raise ``InvalidInput`` if an agent was made for another time between decisions than the scenario's time step.
 
         ``drivers`` maps vehicle indices to agents or scripts. An agent without the attribute ``time_step_s`` can be
         used in every scenario.
@@ -349,8 +349,8 @@ class Engine:
     def _columns(self, actions: Actions) -> Floats:
         """Return the learners' actions as an array [n, L]; ``actions`` is an array or a mapping, as in ``step``.
 
-        If ``actions`` is an array [n, L] of floats or integers, ``_columns`` does not check whether they are in [-1,
-        1].
+        If ``actions`` is an array [n, L] of floats or integers, ``_columns`` does not check whether the numbers are in
+        [-1, 1].
         """
         shape = (self.n, len(self.learners))
         if type(actions) is np.ndarray and actions.shape == shape and actions.dtype.kind in "fiu":
@@ -384,7 +384,8 @@ class Engine:
     def _ruled(self, before: Engine, columns: Floats, *, checked: bool) -> Ruling:
         """Return the guard's answer (``Ruling``) to the learners' actions ``columns`` [n, L].
 
-        ``before`` is the engine before the step. If ``checked`` is True, the actions are known to be in [-1, 1].
+        ``before`` is the engine before the step. If ``checked`` is True, the caller has already checked that the
+        actions are in [-1, 1].
         """
         assert self.guard is not None
         if before.guarded is None:
@@ -426,7 +427,7 @@ class Engine:
     def _move(self, columns: Floats) -> tuple[Step, bool]:
         """Move the worlds by one step under the learners' actions ``columns`` [n, L], and deliver messages.
 
-        Returns the results of the step, and whether some world could not be advanced.
+        Returns the results of the step, and whether at least one world could not be advanced.
         """
         if self._now.stops:
             self._now = self._now._replace(stops=())
@@ -545,7 +546,7 @@ class Engine:
         step.outcome[TRUNCATED, cut] = self._now.state.clock[cut, ENDED] = 1.0
 
     def segments(self, before: Worlds, last_mps2: Floats) -> Iterator[tuple[Worlds, Floats, Floats]]:
-        """Yield the segments into which the decisions that scripts made within the last step divide this step.
+        """Yield the last step in segments (time intervals), separated by the decisions of scripts within the step.
 
         After a reset and before the first step, the segments lead from the alert to the first decision. Each segment is
         a tuple: the worlds at the start of the segment, the vehicles' commands in the segment ([n, N] m/s2), and the
@@ -634,8 +635,8 @@ class Engine:
     def place(self, worlds: Worlds, ledger: Ledger | None = None, *, ended: Bools | None = None) -> None:
         """Replace all n worlds, for example by worlds that another simulator has moved.
 
-        The parameters of the vehicles, the memories and the times of decisions do not change. The next step leads from
-        the time of ``worlds`` to the next decision.
+        ``place`` does not change the parameters of the vehicles, the memories and the times of decisions. The next step
+        leads from the time of ``worlds`` to the next decision.
 
         Args:
             worlds: n worlds at any time of their episodes.

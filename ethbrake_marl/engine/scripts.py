@@ -21,7 +21,7 @@ class Script(Protocol):
       evaluation, the vehicles that the evaluated agent drives.
 
     - ``act(worlds, memory, vehicle) -> (command, memory)`` returns the command [n] m/s2, and the new memory. ``worlds``
-      can include worlds in which no decision is due at this moment; the results for these worlds are ignored.
+      can include worlds in which no decision is due when ``act`` is called; the results for these worlds are ignored.
 
     A memory is None, an array with one row per world, or a tuple or mapping of memories. The caller may select or
     replace rows of a memory, or pass the same memory to several calls. For this reason a script must never change a

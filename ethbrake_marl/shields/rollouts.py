@@ -95,8 +95,8 @@ def certify_rollouts(
 
     In each world one plan is tried: the proposal, clipped to [-1, 1], followed by the policy's actions in a simulation
     from the next state on. If this plan stays within the budget and the caps, the plan becomes the backup, and the
-    proposal is accepted. If the plan exceeds the budget or a cap, the reason stays ``NO_CERTIFICATE``. If a vehicle's
-    proposal is NaN, the vehicle's planned action is used.
+    proposal is accepted. If the plan exceeds the budget or a cap, the proposal stays rejected, with the reason
+    ``NO_CERTIFICATE``. If a vehicle's proposal is NaN, the vehicle's planned action is used.
 
     Args:
         running: the n episodes of the whole batch.
@@ -129,7 +129,7 @@ def certify_rollouts(
 def _later_plan(
     running: Running, first: Floats, rows: Ints, budget: Floats, held: Floats, proposer: Proposer
 ) -> Floats:
-    """Return plans for m worlds: the actions so far, then ``first``, then the actions of a rollout of the policies.
+    """Return plans for m worlds: the actions so far, then ``first``, then the policies' actions in a rollout.
 
     A rollout stops as soon as its harm exceeds the budget.
 

@@ -75,8 +75,8 @@ def begin_running(problem: ProfileProblem, members: int = 1) -> Running:
     """Return running episodes in the worlds of ``problem``, at their first decision.
 
     ``problem`` contains the states of the worlds at the first decision, and the commands of the unshielded vehicles.
-    ``members`` is the number M of possible worlds of each world. M consecutive rows of ``problem`` belong to the same
-    world.
+    ``members`` is the number M of possible worlds of each world. M consecutive rows of ``problem`` contain the M
+    possible worlds of one world.
     """
     steps, ended = np.zeros(problem.n // members, np.int64), np.zeros(problem.n, np.bool_)
     return Running(problem, problem.start, steps, ended)

@@ -1,4 +1,4 @@
-"""Record episodes of any agent with the actions that a learner in the environment would have taken.
+"""Record episodes of any agent, with the actions in [-1, 1] that make a learner drive like the agent.
 
 An agent's commands are float64 numbers in m/s2. A learner's action is a float32 number in [-1, 1], so most commands do
 not correspond exactly to an action. Therefore each world is simulated twice. In the first episode, the agent drives,
@@ -88,7 +88,8 @@ class Recording:
     def terms(self) -> dict[str, Floats]:
         """Return the terms of the reward without their weights: name of the term -> values [T + 1, n, L].
 
-        Values with the first index t + 1 belong to time step t. Values with the first index 0 are 0.
+        Values with the first index t + 1 belong to time step t. Values with the first index 0 belong to the time before
+        the first time step; these values are 0.
         """
         shape = (len(self.index), self.task.scenario.vehicles)
         terms = {}
