@@ -162,8 +162,8 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
         outcome: array that receives, for each world, the harm of the step and whether the episode has ended,
             [OUTCOME_ROWS, n].
 
-    Returns ``(-1, FLAG.DONE)`` if all worlds were advanced. If some world was not advanced, returns the row number of
-    such a world, and ``BAD_ACTION`` or the status code of the physics.
+    Returns ``(-1, FLAG.DONE)`` if all worlds were advanced. If at least one world was not advanced, returns the row
+    number of one of these worlds, and ``BAD_ACTION`` or the status code of the physics.
 
     """
     n, N = wanted.shape

@@ -343,7 +343,8 @@ class Engine:
 
     @property
     def _nobody_refuses_steps(self) -> bool:
-        """True if a step cannot raise an error; if True, the engine changes its arrays in place, which is faster."""
+        """True if a step calls nothing that may raise an error, such as a guard; arrays then change in place, which is
+        faster."""
         return not (self.guard or self._now.watched or self._terms.are_foreign or self._own_grid.scripts)
 
     def _columns(self, actions: Actions) -> Floats:
@@ -534,7 +535,8 @@ class Engine:
 
     @property
     def _nobody_refuses_episodes(self) -> bool:
-        """True if the start of an episode cannot raise an error; if True, the engine changes its arrays in place."""
+        """True if the start of an episode calls nothing that may raise an error, such as a guard; arrays then change in
+        place."""
         return not (self._now.watched or self._remembering or self.guard or self._terms.count_impacts)
 
     def cut(self, step: Step, most_steps: int) -> None:

@@ -269,7 +269,7 @@ def within_capacity(
     Args:
         command_mps2: accelerations that the script commands, [n] m/s2.
         worlds: n worlds.
-        vehicle: index of the vehicle (0 = front).
+        vehicle: index of the vehicle that the script drives (0 = front).
         script: the script, whose name the error message contains.
         due: whether to check the command in each world, [n]; None: check the command in all worlds.
 

@@ -6,8 +6,8 @@ shield. The *budget* is the largest harm that the shield accepts for the whole e
 functions of the module ``members``.
 
 Two plans that begin with the proposed action are simulated. One plan continues with the rest of the backup, the other
-with the best constant action. The module ``step`` proves that the harm of the episode never exceeds the bound at the
-alert.
+with the constant action that does the least harm. The module ``step`` proves that the harm of the episode never exceeds
+the bound at the alert.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ NEARLY = 1e-9
 
 @compiled(apart=True)
 def best_constant(world: Members, states: Floats, ended: Bools, step: int, constants: Floats) -> tuple[int, float]:
-    """Return the index (in ``constants``) of the action that does the least harm, and its harm, m2/s2.
+    """Return the index (in ``constants``) of the action that does the least harm, and the harm of this action, m2/s2.
 
     The harm of a constant action is the largest harm over the possible worlds if the action is held from now to the
     horizon. The time until the horizon is simulated as one segment, not decision by decision.
@@ -224,7 +224,7 @@ def decide_world(
         certified: harm of the present ``plan``, m2/s2.
         constants: constant actions that may replace the rest of a plan, [C, K].
         plan: the present plan, with the actions of each decision, [L, K]; replaced in place by the new plan, whose harm
-            is the bound in ``out``.
+            is written into the column ``BOUND`` of ``out``.
         room: memory for two plans, into which the function writes the plans that it tries, [2, L, K].
         tried: workspace for the actions that are tried, [2, K].
         after: receives the state of each possible world after the step, [M, S].

@@ -70,7 +70,7 @@ def difference(predicted: Floats, seen: Floats) -> str:
 
 
 def ends_under(running: Running, plan: Floats) -> tuple[Bools, Floats]:
-    """Return how the episodes end if the plans are executed from now on: whether at rest, and with how much harm.
+    """Return whether all vehicles come to rest, and each vehicle's harm, if the plans are executed from now on.
 
     ``plan`` contains the actions of each decision, [n, L], or [n, L, K] for K shielded vehicles. ``running`` contains n
     worlds, each with M possible worlds.

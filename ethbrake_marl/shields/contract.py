@@ -137,8 +137,8 @@ class ShieldGuard(ABC):
 
         Args:
             memory: memory of the guard.
-            ruling: the decision; None before the first decision. The infos must have the same names before the first
-                decision as after it.
+            ruling: the decision in the last step; None before the first decision. The infos must have the same names
+                before the first decision as after it.
 
         """
 

@@ -87,7 +87,7 @@ def _released_harm(shield: StepShield, policy: Driver, worlds: Worlds, world: In
 
     Args:
         shield: the shield after it has run the episodes; its plans then contain the actions that were applied.
-        policy: the agent or team that drives from the given decision on.
+        policy: the agent or team that drives from decision ``step`` of an episode on.
         worlds: the n worlds of the batch at the alert.
         world: for each of the m episodes, the index of its world in ``worlds``, [m].
         step: number of the first decision at which the policy drives, in each of the m episodes, [m].

@@ -82,7 +82,7 @@ def enter(world: Members, m: int, state: Floats) -> None:
 
 @compiled(apart=True)
 def take_step(world: Members, m: int, state: Floats, step: int, action: Floats, after: Floats) -> int:
-    """Advance one possible world by one decision, and save its new state.
+    """Advance one possible world from one decision to the next, and save its new state.
 
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).
@@ -111,7 +111,7 @@ def take_step(world: Members, m: int, state: Floats, step: int, action: Floats, 
 def take_steps(
     world: Members, states: Floats, ended: Bools, step: int, action: Floats, after: Floats, over: Bools
 ) -> int:
-    """Advance every possible world of one world by one decision, with the same action.
+    """Advance every possible world of one world from one decision to the next, with the same action.
 
     A possible world whose episode has ended keeps its state.
 

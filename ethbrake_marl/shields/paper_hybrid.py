@@ -72,7 +72,7 @@ class HybridAgent(AgentAround):
         Args:
             alert: n worlds at the alert.
             vehicle: index of the controlled vehicle (0 = front).
-            scripts: index of each scripted vehicle -> its script.
+            scripts: dictionary from the index of each scripted vehicle to the vehicle's script.
 
         """
         refuse_untold(alert, [vehicle], f"agent {self.name!r}")

@@ -46,7 +46,7 @@ def rolled_out(
 
     Args:
         worlds: n worlds at the alert.
-        policies: index of each shielded vehicle -> its policy.
+        policies: dictionary from the index of each shielded vehicle to the vehicle's policy.
         scenario: the scenario whose scripts drive the other vehicles.
         vehicle: index of the only shielded vehicle, or a tuple of K indices.
         width: number of decisions for which to return actions.
@@ -190,8 +190,8 @@ def proposed_actions(
 ) -> tuple[Floats, dict[int, Memory]]:
     """Return the actions that the policies propose, [n, K] in [-1, 1], and the new memory of each vehicle's policy.
 
-    ``policies`` maps the index of each of K vehicles to its policy. ``memories`` maps the index of each of these
-    vehicles to the memory of the vehicle's policy. ``worlds`` are n worlds at a decision.
+    ``policies`` maps the index of each of K vehicles to the vehicle's policy. ``memories`` maps the index of each of
+    these vehicles to the memory of the vehicle's policy. ``worlds`` are n worlds at a decision.
     """
     asked = {i: proposed_action(policy, worlds, memories[i], i) for i, policy in policies.items()}
     after = {i: memory for i, (_, memory) in asked.items()}

@@ -28,7 +28,7 @@ class Running(NamedTuple):
 
     @property
     def uncapped(self) -> Running:
-        """These episodes without ``caps`` (the limits of each vehicle's harm)."""
+        """The episodes without ``caps`` (the limits of each vehicle's harm)."""
         return self._replace(caps=np.zeros((0, 0)))
 
     @property
@@ -61,7 +61,7 @@ class Running(NamedTuple):
         return self._select(self.rows_of(worlds), worlds)
 
     def nominal(self) -> Running:
-        """Return these episodes with a single possible world for each world: the world itself."""
+        """Return the episodes with only one possible world for each world: the world itself."""
         if self.members == 1:
             return self
         return self._select(np.arange(self.n) * self.members, np.arange(self.n))

@@ -212,8 +212,9 @@ class StepShield:
             worlds: worlds of the new episodes at the alert, as the shield assumes them (the true worlds may differ).
             rows: indices of the batch rows in which the new episodes start.
             policy: policy that proposes actions, or vehicle index -> policy for several vehicles. The policy is
-                simulated from the alert; in worlds where the policy does less harm than the best constant actions, the
-                policy's harm is the bound. If ``policy`` is None, the bound is the harm of the best constant actions.
+                simulated from the alert; in worlds where the policy does less harm than the constant actions with the
+                least harm, the policy's harm is the bound. If ``policy`` is None, the bound is the harm of the constant
+                actions with the least harm.
             possible: the M possible worlds of each world (the world itself first), [len(rows) * M]; None: the result of
                 ``members_of(worlds)``.
 

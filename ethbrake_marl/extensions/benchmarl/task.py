@@ -204,7 +204,7 @@ class LineTask(TaskClass):  # type: ignore[misc]
 
     @staticmethod
     def env_name() -> str:
-        """Return ``ethbrake``, the first part of the names of these tasks in BenchMARL."""
+        """Return ``ethbrake``, the first part of the names of this package's tasks in BenchMARL."""
         return "ethbrake"
 
 

@@ -6,8 +6,9 @@ and its commands are rounded to actions. In the second episode, which is recorde
 environment that gets the recorded actions repeats the second episode bit for bit.
 
 If two vehicles almost miss each other, the last bit of an action can decide whether they have an impact. Therefore, if
-rounding to the nearest action changes the harm of a world, the code also rounds all actions of this world down, and all
-up. The recording contains the actions of the rounding that changes the harm of the world least.
+rounding to the nearest action changes the harm of a world, the code also tries two other roundings: all actions of this
+world down, and all actions up. The recording contains the actions of the rounding that changes the harm of the world
+least.
 """
 
 from __future__ import annotations
@@ -108,7 +109,7 @@ def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Re
     ``episode_engine`` before the first episode begins.
 
     Args:
-        sample: worlds at the alert.
+        sample: the worlds, at the alert, in which the episodes are recorded.
         driver: agent or team that drives the learners.
         name: name of the agent in the recording.
         task: scenario, seed, reward and observation of the recording.

@@ -59,7 +59,7 @@ class Seen(NamedTuple):
 
         Args:
             worlds: present state of the n worlds.
-            vehicle: index of the vehicle (0 = front).
+            vehicle: index of the vehicle that the script drives (0 = front).
             step_s: time between two decisions (s).
 
         """
