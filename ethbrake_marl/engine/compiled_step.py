@@ -290,8 +290,8 @@ class Rules(NamedTuple):
                 [OUTCOME_ROWS, n].
 
         The status code is ``FLAG.DONE`` if all worlds were advanced. The status code is ``BAD_ACTION`` if an action is
-        outside [-1, 1]; in this case no world was moved. Any other status code belongs to a check of the physics that
-        failed in some world.
+        outside [-1, 1]; in this case no world was moved. Any other status code means that a check of the physics failed
+        in at least one world.
 
         """
         _, status = step_worlds(

@@ -343,8 +343,7 @@ class Engine:
 
     @property
     def _nobody_refuses_steps(self) -> bool:
-        """True if a step calls nothing that may raise an error, such as a guard; arrays then change in place, which is
-        faster."""
+        """True if a step calls nothing that may raise an error; the engine then changes its arrays in place (faster)."""
         return not (self.guard or self._now.watched or self._terms.are_foreign or self._own_grid.scripts)
 
     def _columns(self, actions: Actions) -> Floats:
@@ -535,8 +534,7 @@ class Engine:
 
     @property
     def _nobody_refuses_episodes(self) -> bool:
-        """True if the start of an episode calls nothing that may raise an error, such as a guard; arrays then change in
-        place."""
+        """True if the start of an episode calls nothing that may raise an error; arrays then change in place."""
         return not (self._now.watched or self._remembering or self.guard or self._terms.count_impacts)
 
     def cut(self, step: Step, most_steps: int) -> None:
@@ -685,8 +683,8 @@ class Engine:
     def branch(self, state: State) -> Engine:
         """Return a new engine whose episodes continue from ``state``, under the same guard.
 
-        This engine does not change. Raises ``InvalidInput`` if the reward is shaped, because the potentials of shaping
-        depend on more than ``state``.
+        ``branch`` does not change the engine that it is called on. Raises ``InvalidInput`` if the reward is shaped,
+        because the potentials of shaping depend on more than ``state``.
         """
         if self.reward.shaping > 0.0:
             raise InvalidInput(f"branch: the reward has shaping = {self.reward.shaping:g}; branch needs shaping = 0")
