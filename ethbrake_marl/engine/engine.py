@@ -81,7 +81,7 @@ class Ruling(NamedTuple):
 
 
 class Guard(Protocol):
-    """A shield inside an engine, which may replace the actions that the learners propose.
+    """A shield that, inside an engine, may replace the actions that the learners propose.
 
     The engine calls the guard in every ``Engine.step``, so no action can bypass the guard. The engine stores the
     guard's memory and answer together with the state of its episodes, and replaces all three in a single assignment. If
@@ -343,7 +343,7 @@ class Engine:
 
     @property
     def _nobody_refuses_steps(self) -> bool:
-        """True if a step calls nothing that may raise an error; the engine then changes its arrays in place (faster)."""
+        """True if a step calls nothing that may raise an error; arrays then change in place, which is faster."""
         return not (self.guard or self._now.watched or self._terms.are_foreign or self._own_grid.scripts)
 
     def _columns(self, actions: Actions) -> Floats:
@@ -482,7 +482,7 @@ class Engine:
         self._now = self._now._replace(state=self._now.state._replace(**fields))
 
     def observe(self, vehicle: int) -> Observations:
-        """Return the current observation of the vehicle with this index (0 = front) in each world, [n, F]."""
+        """Return the current observation of vehicle number ``vehicle`` (0 = front) in each world, [n, F]."""
         if not isinstance(vehicle, int | np.integer) or not 0 <= vehicle < self.scenario.vehicles:
             raise InvalidInput(
                 f"observe: vehicle = {vehicle!r}: must be a vehicle index in 0..{self.scenario.vehicles - 1}"

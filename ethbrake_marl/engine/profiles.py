@@ -120,7 +120,7 @@ class ProfileProblem(NamedTuple):
     def minimising(self, weights: Floats, *, largest: bool = False) -> ProfileProblem:
         """Return a copy of this problem in which searches minimise a weighted harm of the vehicles.
 
-        The harm count (first-impact or total harm) and the field ``identity`` stay the same.
+        ``minimising`` does not change the harm count (first-impact or total harm) and the field ``identity``.
 
         Args:
             weights: for each vehicle, the weight (at least 0) of the harm that the vehicle bears, [n, N]; an obstacle

@@ -108,7 +108,8 @@ class Stream:
 
     Args:
         scenario: the scenario from which worlds are drawn.
-        deciders: indices of vehicles (0 = front). The first decision is at the shortest latency of these vehicles.
+        deciders: indices (0 = front) of the vehicles at whose decisions the engine's steps begin and end. The first
+            decision is at the shortest latency of these vehicles.
         scripts: dictionary from the index of each scripted vehicle to the vehicle's script.
         seed: seed from which the worlds of the stream are drawn.
 

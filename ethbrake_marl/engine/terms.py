@@ -59,8 +59,7 @@ class Terms:
         return 0.0 if self._objectives else self.params.harm
 
     def vector(self, step: Step, before: Ledger, state: State) -> Floats:
-        """Return the vector reward of a step, [n, N, K] for K components; 0 where the episode had ended before the
-        step.
+        """Return the vector reward of a step, [n, N, K] for K components; 0 if the episode had ended before the step.
 
         ``step`` contains the results of the step. ``before`` contains the harm of each pair from the alert to the
         beginning of the step. ``state`` is the state after the step.

@@ -140,7 +140,7 @@ def try_action(
     world: Members, states: Floats, ended: Bools, step: int, action: Floats, budget: float, certified: float,
     constants: Floats, plan: Floats, room: Floats, after: Floats, over: Bools,
 ) -> tuple[float, float, int]:  # fmt: skip
-    """Simulate one step with an action, then search for a plan from the next state on that stays within the budget.
+    """Simulate one step with ``action``; then search for a plan, from the next state on, that stays within the budget.
 
     The plan that is tried first continues after ``action`` with the rest of the present plan; the other plans continue
     after ``action`` with a constant action. An action for which the physics fails is not certified.

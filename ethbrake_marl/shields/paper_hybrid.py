@@ -8,7 +8,7 @@ The coupled ``H*`` is computed in the same engine as the policy's harm. With the
 the harm of the baseline in every world, provided that the policy drives exactly as in its rollout. A policy with random
 actions does not repeat its rollout; use the step shield for such a policy. With the paper's pairwise ``H*`` there is no
 guarantee, because the pairwise ``H*`` treats the pair in front and the pair behind as independent. The pairwise ``H*``
-is only about half of the harm that the same deceleration causes in the engine.
+is only about half of the harm that E-V2X-BM's deceleration causes in the engine.
 """
 
 from __future__ import annotations
