@@ -124,8 +124,8 @@ def place_row(table: Floats, state: Floats, params: Floats, k: int, pieces: Floa
     """Write into ``table`` the quantities of world ``k`` that are needed only if brakes take time to build up.
 
     The present accelerations come from row ``k`` of ``state``, and the rates of build-up from row ``k`` of ``params``.
-    ``pieces`` [N, 2 K] are braking profiles with K intervals of constant command. Inside the loop of ``step_worlds``,
-    this code would slow down the simulation of worlds whose brakes act at once.
+    ``pieces`` [N, 2 K] are braking profiles with K intervals of constant command. This code is not inside the loop of
+    ``step_worlds``, because there it would slow down the simulation of worlds whose brakes act at once.
     """
     column, N = columns(state), pieces.shape[0]
     command, brake_rate, release_rate = column.command, column.brake_rate, column.release_rate
@@ -162,8 +162,8 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
         outcome: array that receives, for each world, the harm of the step and whether the episode has ended,
             [OUTCOME_ROWS, n].
 
-    Returns ``(-1, FLAG.DONE)`` if all worlds were advanced. If some world was not advanced, returns the row number of
-    such a world, and ``BAD_ACTION`` or the status code of the physics.
+    Returns ``(-1, FLAG.DONE)`` if all worlds were advanced. If at least one world was not advanced, returns the row
+    number of one of these worlds, and ``BAD_ACTION`` or the status code of the physics.
 
     """
     n, N = wanted.shape
@@ -290,8 +290,8 @@ class Rules(NamedTuple):
                 [OUTCOME_ROWS, n].
 
         The status code is ``FLAG.DONE`` if all worlds were advanced. The status code is ``BAD_ACTION`` if an action is
-        outside [-1, 1]; in this case no world was moved. Any other status code belongs to a check of the physics that
-        failed in some world.
+        outside [-1, 1]; in this case no world was moved. Any other status code means that a check of the physics failed
+        in at least one world.
 
         """
         _, status = step_worlds(

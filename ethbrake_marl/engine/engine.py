@@ -81,7 +81,7 @@ class Ruling(NamedTuple):
 
 
 class Guard(Protocol):
-    """A shield inside an engine, which may replace the actions that the learners propose.
+    """A shield that, inside an engine, may replace the actions that the learners propose.
 
     The engine calls the guard in every ``Engine.step``, so no action can bypass the guard. The engine stores the
     guard's memory and answer together with the state of its episodes, and replaces all three in a single assignment. If
@@ -227,7 +227,7 @@ class Engine:
         self._now = self._started(stream, None, worlds, {})
 
     def check_time_step(self, drivers: Mapping[int, Script]) -> None:
-        """Raise ``InvalidInput`` if an agent was made for a time between decisions that is not the scenario's.
+        """Raise ``InvalidInput`` if an agent was made for another time between decisions than the scenario's time step.
 
         ``drivers`` maps vehicle indices to agents or scripts. An agent without the attribute ``time_step_s`` can be
         used in every scenario.
@@ -343,14 +343,14 @@ class Engine:
 
     @property
     def _nobody_refuses_steps(self) -> bool:
-        """True if a step cannot raise an error; if True, the engine changes its arrays in place, which is faster."""
+        """True if a step calls nothing that may raise an error; arrays then change in place, which is faster."""
         return not (self.guard or self._now.watched or self._terms.are_foreign or self._own_grid.scripts)
 
     def _columns(self, actions: Actions) -> Floats:
         """Return the learners' actions as an array [n, L]; ``actions`` is an array or a mapping, as in ``step``.
 
-        If ``actions`` is an array [n, L] of floats or integers, ``_columns`` does not check whether they are in [-1,
-        1].
+        If ``actions`` is an array [n, L] of floats or integers, ``_columns`` does not check whether the numbers are in
+        [-1, 1].
         """
         shape = (self.n, len(self.learners))
         if type(actions) is np.ndarray and actions.shape == shape and actions.dtype.kind in "fiu":
@@ -384,7 +384,8 @@ class Engine:
     def _ruled(self, before: Engine, columns: Floats, *, checked: bool) -> Ruling:
         """Return the guard's answer (``Ruling``) to the learners' actions ``columns`` [n, L].
 
-        ``before`` is the engine before the step. If ``checked`` is True, the actions are known to be in [-1, 1].
+        ``before`` is the engine before the step. If ``checked`` is True, the caller has already checked that the
+        actions are in [-1, 1].
         """
         assert self.guard is not None
         if before.guarded is None:
@@ -426,7 +427,7 @@ class Engine:
     def _move(self, columns: Floats) -> tuple[Step, bool]:
         """Move the worlds by one step under the learners' actions ``columns`` [n, L], and deliver messages.
 
-        Returns the results of the step, and whether some world could not be advanced.
+        Returns the results of the step, and whether at least one world could not be advanced.
         """
         if self._now.stops:
             self._now = self._now._replace(stops=())
@@ -481,7 +482,7 @@ class Engine:
         self._now = self._now._replace(state=self._now.state._replace(**fields))
 
     def observe(self, vehicle: int) -> Observations:
-        """Return the current observation of the vehicle with this index (0 = front) in each world, [n, F]."""
+        """Return the current observation of vehicle number ``vehicle`` (0 = front) in each world, [n, F]."""
         if not isinstance(vehicle, int | np.integer) or not 0 <= vehicle < self.scenario.vehicles:
             raise InvalidInput(
                 f"observe: vehicle = {vehicle!r}: must be a vehicle index in 0..{self.scenario.vehicles - 1}"
@@ -533,7 +534,7 @@ class Engine:
 
     @property
     def _nobody_refuses_episodes(self) -> bool:
-        """True if the start of an episode cannot raise an error; if True, the engine changes its arrays in place."""
+        """True if the start of an episode calls nothing that may raise an error; arrays then change in place."""
         return not (self._now.watched or self._remembering or self.guard or self._terms.count_impacts)
 
     def cut(self, step: Step, most_steps: int) -> None:
@@ -545,7 +546,7 @@ class Engine:
         step.outcome[TRUNCATED, cut] = self._now.state.clock[cut, ENDED] = 1.0
 
     def segments(self, before: Worlds, last_mps2: Floats) -> Iterator[tuple[Worlds, Floats, Floats]]:
-        """Yield the segments into which the decisions that scripts made within the last step divide this step.
+        """Yield the last step in segments (time intervals), separated by the decisions of scripts within the step.
 
         After a reset and before the first step, the segments lead from the alert to the first decision. Each segment is
         a tuple: the worlds at the start of the segment, the vehicles' commands in the segment ([n, N] m/s2), and the
@@ -634,8 +635,8 @@ class Engine:
     def place(self, worlds: Worlds, ledger: Ledger | None = None, *, ended: Bools | None = None) -> None:
         """Replace all n worlds, for example by worlds that another simulator has moved.
 
-        The parameters of the vehicles, the memories and the times of decisions do not change. The next step leads from
-        the time of ``worlds`` to the next decision.
+        ``place`` does not change the parameters of the vehicles, the memories and the times of decisions. The next step
+        leads from the time of ``worlds`` to the next decision.
 
         Args:
             worlds: n worlds at any time of their episodes.
@@ -682,8 +683,8 @@ class Engine:
     def branch(self, state: State) -> Engine:
         """Return a new engine whose episodes continue from ``state``, under the same guard.
 
-        This engine does not change. Raises ``InvalidInput`` if the reward is shaped, because the potentials of shaping
-        depend on more than ``state``.
+        ``branch`` does not change the engine that it is called on. Raises ``InvalidInput`` if the reward is shaped,
+        because the potentials of shaping depend on more than ``state``.
         """
         if self.reward.shaping > 0.0:
             raise InvalidInput(f"branch: the reward has shaping = {self.reward.shaping:g}; branch needs shaping = 0")

@@ -130,9 +130,9 @@ def unflat(arrays: Mapping[str, NDArray[Any]], place: str) -> Memory:
 def _check_kept(before: Memory, after: Memory, who: str) -> None:
     """Raise ``InvalidInput`` if a call of ``act`` changed the keys, shapes or dtypes of a memory.
 
-    If the form of the memory changed, the engine could not replace the memory of single worlds when new episodes start.
-    ``before`` is the memory before the call of ``act``, and ``after`` the memory after the call. The error message
-    begins with ``who``.
+    If ``act`` changed the keys, shapes or dtypes of a memory, the engine could not replace the memory of single worlds
+    when new episodes start. ``before`` is the memory before the call of ``act``, and ``after`` the memory after the
+    call. The error message begins with ``who``.
     """
     began, kinds = (map_memory(lambda array: (array.dtype, *array.shape[1:]), each) for each in (before, after))
     if began != kinds:
@@ -249,7 +249,7 @@ def _named(error: Exception, script: Script, what: str, worlds: Worlds, vehicle:
     Args:
         error: the exception that the script raised.
         script: the script.
-        what: name of the method of the script that raised the error.
+        what: name of the script's method that raised the error.
         worlds: the worlds that were passed to the script's method.
         vehicle: index of the script's vehicle (0 = front).
 
@@ -269,7 +269,7 @@ def within_capacity(
     Args:
         command_mps2: accelerations that the script commands, [n] m/s2.
         worlds: n worlds.
-        vehicle: index of the vehicle (0 = front).
+        vehicle: index of the vehicle that the script drives (0 = front).
         script: the script, whose name the error message contains.
         due: whether to check the command in each world, [n]; None: check the command in all worlds.
 

@@ -65,7 +65,7 @@ class Way(NamedTuple):
 
 
 class OwnGrid:
-    """Scripts with a memory that decide within an engine's steps.
+    """Scripts that have a memory and decide between the beginning and the end of an engine's steps.
 
     Each script first decides when the latency of its vehicle has elapsed, and then once in every time step. An engine's
     step leads from one decision of its deciders (the learners or the evaluated agent's vehicles) to their next
@@ -127,9 +127,9 @@ class OwnGrid:
         """Let the scripts make all decisions before ``until_s`` [n] s; return the results up to the last decision.
 
         Only worlds of ``state`` for which the mask ``running`` [n] is True are advanced, in place. ``_decide`` moves a
-        world to a decision only if this decision changes a command. Stopping at other decisions, too, would change how
-        the motion is rounded. ``rules`` contains the settings of the engine's steps, and ``actions`` the learners'
-        actions, [n, L].
+        world to a decision only if this decision changes a command. If worlds stopped at other decisions, too, their
+        motion would be rounded differently. ``rules`` contains the settings of the engine's steps, and ``actions`` the
+        learners' actions, [n, L].
         """
         motion, params, _, wanted_so_far, *_ = state
         (n, N), column = wanted_so_far.shape, state.packed.column

@@ -120,7 +120,7 @@ class ProfileProblem(NamedTuple):
     def minimising(self, weights: Floats, *, largest: bool = False) -> ProfileProblem:
         """Return a copy of this problem in which searches minimise a weighted harm of the vehicles.
 
-        The harm count (first-impact or total harm) and the field ``identity`` stay the same.
+        ``minimising`` does not change the harm count (first-impact or total harm) and the field ``identity``.
 
         Args:
             weights: for each vehicle, the weight (at least 0) of the harm that the vehicle bears, [n, N]; an obstacle
@@ -138,7 +138,7 @@ class ProfileProblem(NamedTuple):
         return self._replace(weights=pairs, clock=clock)
 
     def follow(self, profiles: Profiles) -> tuple[Floats, Floats]:
-        """Return first-impact harm and total harm of each world if each world follows its profile, [n] m2/s2 each.
+        """Return first-impact harm and total harm of each world if the vehicles follow ``profiles``, [n] m2/s2 each.
 
         An engine whose vehicles follow the same commands computes exactly the same harm, to the last bit. Raises
         ``InvalidInput`` for profiles that do not fit the problem or exceed a capacity, and ``PhysicsError``, which
@@ -148,7 +148,7 @@ class ProfileProblem(NamedTuple):
         return line_sum(first, np.zeros(self.n)), line_sum(total, np.zeros(self.n))
 
     def values(self, profiles: Profiles) -> dict[HarmCount, Floats]:
-        """Return the value that a search minimises, if each world follows its profile: {harm count: value, [n] m2/s2}.
+        """Return the value that a search minimises if the vehicles follow ``profiles``: {harm count: value, [n] m2/s2}.
 
         The value is the harm summed over the line. In a problem that ``minimising`` has returned, the value is instead
         the sum of the vehicles' weighted harms, or the largest of these harms. Raises the same errors as ``follow``.
@@ -165,7 +165,7 @@ class ProfileProblem(NamedTuple):
         return harms
 
     def borne(self, profiles: Profiles) -> dict[HarmCount, Floats]:
-        """Return the harm that each vehicle bears if each world follows its profile: {harm count: [n, N] m2/s2}.
+        """Return the harm that each vehicle bears if the vehicles follow ``profiles``: {harm count: [n, N] m2/s2}.
 
         The returned arrays have no column for an obstacle. An engine whose vehicles follow the same commands counts the
         same harm, to the last bit. Raises the same errors as ``follow``.
@@ -178,7 +178,7 @@ class ProfileProblem(NamedTuple):
         return harms
 
     def follow_pairs(self, profiles: Profiles) -> tuple[Floats, Floats]:
-        """Return first-impact harm and total harm of each pair if each world follows its profile, [n, P] m2/s2 each.
+        """Return first-impact harm and total harm of each pair if the vehicles follow ``profiles``, [n, P] m2/s2 each.
 
         If there is an obstacle ahead, the first pair consists of the obstacle and Vehicle 1. Raises the same errors as
         ``follow``.
@@ -246,8 +246,8 @@ def profile_problem(
             has already elapsed in a world, the first decision is at the world's present time. None: ``vehicles``.
         written_out: whether the arrays always contain an obstacle, as an additional vehicle in front
             (``Worlds.with_obstacle``), even if no world has an obstacle. If some world has an obstacle, the arrays
-            always contain one. If the arrays contain an obstacle, worlds without an obstacle get one that no vehicle
-            can reach.
+            always contain an obstacle. If the arrays contain an obstacle, worlds without an obstacle get an obstacle
+            that no vehicle can reach.
 
     Raises ``InvalidInput`` if ``vehicles`` is empty, repeats an index or contains an unknown index, if the harm count
     is unknown, if a command exceeds a capacity, or if the horizon is not after the first decision.
@@ -372,9 +372,9 @@ class Profiles(NamedTuple):
 
     @staticmethod
     def padded(parts: Sequence[Profiles], least: int) -> list[Profiles]:
-        """Return copies of all ``parts``, extended by empty phases to the same number of phases (at least ``least``).
+        """Return copies of the profiles ``parts``, all with the same number of phases (at least ``least``).
 
-        An added phase begins and ends where the last phase ends.
+        An added phase is empty: it begins and ends where the profile's last phase ends.
         """
         width = max([least, *(part.ends.shape[1] for part in parts)])
         return [

@@ -17,11 +17,11 @@ class Script(Protocol):
     and stores nothing in its attributes:
 
     - ``begin(alert, vehicle, scripts) -> memory`` is called when episodes start in the worlds ``alert``, at t = 0.
-      ``scripts`` maps the index of each scripted vehicle to the vehicle's script; it lacks learners and, in an
-      evaluation, the vehicles that the evaluated agent drives.
+      ``scripts`` maps the index of each scripted vehicle to the vehicle's script. Learners and, in an evaluation, the
+      vehicles that the evaluated agent drives are not in ``scripts``.
 
     - ``act(worlds, memory, vehicle) -> (command, memory)`` returns the command [n] m/s2, and the new memory. ``worlds``
-      can include worlds in which no decision is due at this moment; the results for these worlds are ignored.
+      can include worlds in which no decision is due when ``act`` is called; the results for these worlds are ignored.
 
     A memory is None, an array with one row per world, or a tuple or mapping of memories. The caller may select or
     replace rows of a memory, or pass the same memory to several calls. For this reason a script must never change a

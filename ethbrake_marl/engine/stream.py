@@ -102,12 +102,14 @@ class Roster:
 class Stream:
     """The training worlds of a seed, one after the other, each advanced to its first decision.
 
-    Here learners, and scripts with a memory, coast until the first decision of the ``deciders``. If such a script
-    decides earlier, the engine advances the worlds once more from the alert.
+    In the stream, learners, and scripts with a memory, coast until the first decision of the ``deciders``. If a script
+    with a memory decides before the first decision of the ``deciders``, the engine advances the worlds once more from
+    the alert.
 
     Args:
         scenario: the scenario from which worlds are drawn.
-        deciders: indices of vehicles (0 = front). The first decision is at the shortest latency of these vehicles.
+        deciders: indices (0 = front) of the vehicles at whose decisions the engine's steps begin and end. The first
+            decision is at the shortest latency of these vehicles.
         scripts: dictionary from the index of each scripted vehicle to the vehicle's script.
         seed: seed from which the worlds of the stream are drawn.
 
@@ -134,7 +136,7 @@ class Stream:
         return self._drawn - (0 if self._pool is None else len(self._pool.clock) - self._next)
 
     def take(self, count: int) -> Start:
-        """Return the next ``count`` worlds of the stream at their first decision; the next call continues there."""
+        """Return the next ``count`` worlds of the stream, at their first decision, and move on by ``count`` worlds."""
         if self._pool is None or self._next + count > len(self._pool.clock):
             self._fill(count)
         assert self._pool is not None

@@ -23,7 +23,7 @@ class Terms:
     """The reward terms that the compiled step cannot compute; ``add`` adds them to the reward of a step.
 
     An *objective* says whose harm a vehicle's reward includes. If neither the reward nor the scenario has an objective,
-    each vehicle's reward includes the harm of the whole line. *Shaping* adds to the reward the change of the
+    each vehicle's reward includes the harm of the whole line. *Shaping* adds to the reward the change of the vehicle's
     *potential*, a function of the state.
 
     Args:
@@ -59,7 +59,7 @@ class Terms:
         return 0.0 if self._objectives else self.params.harm
 
     def vector(self, step: Step, before: Ledger, state: State) -> Floats:
-        """Return the vector reward of a step, [n, N, K]; 0 where the episode had ended before the step.
+        """Return the vector reward of a step, [n, N, K] for K components; 0 if the episode had ended before the step.
 
         ``step`` contains the results of the step. ``before`` contains the harm of each pair from the alert to the
         beginning of the step. ``state`` is the state after the step.
@@ -77,7 +77,7 @@ class Terms:
         impacts_before: EpisodeImpacts | None,
         worlds: Worlds | None,
     ) -> State:
-        """Add the reward terms of this class to the reward of a step; return the state with its new potentials.
+        """Add the reward terms of this class to the reward of a step; return the state with the present potentials.
 
         Episodes that had ended before the step get the reward 0.
 
@@ -88,8 +88,8 @@ class Terms:
             before: harm of each pair from the alert to the beginning of the step; None if there are no objectives.
             impacts_before: impacts from the alert to the beginning of the step; None if no reward term is computed from
                 single impacts.
-            worlds: worlds after the step, from which the new potentials (see the class) are computed; None if the
-                reward is not shaped.
+            worlds: worlds after the step, from which the potentials after the step are computed; None if the reward is
+                not shaped.
 
         """
         if before is not None and self.params.harm > 0.0:

@@ -104,8 +104,8 @@ class Attached:
     Args:
         env: the environment to shield.
         interface: class of which ``env`` must be an instance, such as ``gymnasium.Env``.
-        maker: code that makes an environment of the right kind, such as ``eb.parallel_env``; error messages contain
-            this code.
+        maker: code that makes an environment that this wrapper accepts, such as ``eb.parallel_env``; error messages
+            contain this code.
         policy: policy that proposes the actions that the caller leaves out; None: no policy.
         where: name with which error messages begin: the name of the shield wrapper.
         options: keywords of ``ShieldOptions``.

@@ -1,4 +1,4 @@
-"""Certify proposed actions: apply them if some plan after them stays within the budget; if not, follow the backup plan.
+"""Apply proposed actions if a plan that begins with them stays within the budget; if not, apply the backup plan.
 
 A *plan* is a sequence of actions, one for each decision up to the horizon. The *backup* is the present plan of the
 shield. The *budget* is the largest harm that the shield accepts for the whole episode. The shield may consider several
@@ -6,8 +6,8 @@ shield. The *budget* is the largest harm that the shield accepts for the whole e
 functions of the module ``members``.
 
 Two plans that begin with the proposed action are simulated. One plan continues with the rest of the backup, the other
-with the best constant action. The module ``step`` proves that the harm of the episode never exceeds the bound at the
-alert.
+with the constant action that does the least harm. The module ``step`` proves that the harm of the episode never exceeds
+the bound at the alert.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ NEARLY = 1e-9
 
 @compiled(apart=True)
 def best_constant(world: Members, states: Floats, ended: Bools, step: int, constants: Floats) -> tuple[int, float]:
-    """Return the index (in ``constants``) of the action that does the least harm, and its harm, m2/s2.
+    """Return the index (in ``constants``) of the action that does the least harm, and the harm of this action, m2/s2.
 
     The harm of a constant action is the largest harm over the possible worlds if the action is held from now to the
     horizon. The time until the horizon is simulated as one segment, not decision by decision.
@@ -86,7 +86,7 @@ def better_plan(
     world: Members, states: Floats, ended: Bools, step: int, constants: Floats, value: float, most: float,
     plan: Floats, trial: Floats,
 ) -> tuple[float, float]:  # fmt: skip
-    """Replace the rest of a plan by the best constant action if the harm is then below ``value`` and at most ``most``.
+    """Replace the rest of a plan by the best constant action if the new harm is below ``value`` and at most ``most``.
 
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).
@@ -97,7 +97,7 @@ def better_plan(
         value: harm of the present ``plan``, the largest over the possible worlds, m2/s2.
         most: largest harm that the new plan may have, m2/s2.
         plan: the present plan, with the actions of each decision, [L, K]; changed in place.
-        trial: workspace for the plan that is tried, [L, K].
+        trial: memory into which the function writes the plan that it tries, [L, K].
 
     Returns the harm of the resulting plan, and the least harm of all plans that were tried, whether accepted or not
     (both m2/s2).
@@ -140,10 +140,10 @@ def try_action(
     world: Members, states: Floats, ended: Bools, step: int, action: Floats, budget: float, certified: float,
     constants: Floats, plan: Floats, room: Floats, after: Floats, over: Bools,
 ) -> tuple[float, float, int]:  # fmt: skip
-    """Simulate one step with an action, then search for a plan from the next state on that stays within the budget.
+    """Simulate one step with ``action``; then search for a plan, from the next state on, that stays within the budget.
 
-    After the action, the rest of the present plan is tried first, then the constant actions. An action for which the
-    physics fails is not certified.
+    The plan that is tried first continues after ``action`` with the rest of the present plan; the other plans continue
+    after ``action`` with a constant action. An action for which the physics fails is not certified.
 
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).
@@ -156,7 +156,7 @@ def try_action(
         constants: C constant actions to try, each with one number per shielded vehicle, [C, K].
         plan: the shield's present plan, [L, K]. If the search succeeds, ``plan`` is replaced in place by the plan
             found, which begins with ``action``.
-        room: workspace for two plans, [2, L, K].
+        room: memory for two plans, into which the function writes the plans that it tries, [2, L, K].
         after: receives the state of each possible world after the step, [M, S].
         over: for each possible world, receives True if the episode has ended after the step, [M].
 
@@ -224,8 +224,8 @@ def decide_world(
         certified: harm of the present ``plan``, m2/s2.
         constants: constant actions that may replace the rest of a plan, [C, K].
         plan: the present plan, with the actions of each decision, [L, K]; replaced in place by the new plan, whose harm
-            is the bound in ``out``.
-        room: workspace for two plans, [2, L, K].
+            is written into the column ``BOUND`` of ``out``.
+        room: memory for two plans, into which the function writes the plans that it tries, [2, L, K].
         tried: workspace for the actions that are tried, [2, K].
         after: receives the state of each possible world after the step, [M, S].
         over: for each possible world, receives True if the episode has ended after the step, [M].
@@ -319,8 +319,8 @@ def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Flo
     """Write into ``value`` [n] m2/s2 the harm of each whole episode if its plan is executed from now on.
 
     The harm of a plan is the largest harm over the possible worlds, and infinite if the physics fails. If one of the
-    ``constants`` [C, K], held to the horizon, does less harm than the rest of a plan in ``plans`` [n, L, K], this
-    constant action replaces the rest of the plan, and ``value`` contains the harm of the changed plan.
+    ``constants`` [C, K], repeated up to the horizon, does less harm than the rest of a plan in ``plans`` [n, L, K],
+    this constant action replaces the rest of the plan, and ``value`` contains the harm of the changed plan.
     """
     n, every = running.steps.shape[0], all_members(running)
     trial = np.zeros((plans.shape[1], plans.shape[2]))

@@ -36,8 +36,8 @@ def seen_columns(packed: Packed) -> Floats:
 def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
     """Return a copy of ``worlds`` with the speeds, gaps and hit flags (1: the pair had an impact) of ``states``.
 
-    ``states`` [n, S] has the layout of ``Running.states``. The gap to an obstacle ahead and its hit flag also come from
-    ``states``.
+    ``states`` [n, S] has the layout of ``Running.states``. The gap to an obstacle ahead and the obstacle's hit flag
+    also come from ``states``.
     """
     added = (states.shape[1] + 4) // 6 - worlds.N  # 1 if each group starts with the column of an obstacle, else 0
     N = worlds.N + added
@@ -70,7 +70,7 @@ def difference(predicted: Floats, seen: Floats) -> str:
 
 
 def ends_under(running: Running, plan: Floats) -> tuple[Bools, Floats]:
-    """Return how the episodes end if the plans are executed from now on: whether at rest, and with how much harm.
+    """Return whether all vehicles come to rest, and each vehicle's harm, if the plans are executed from now on.
 
     ``plan`` contains the actions of each decision, [n, L], or [n, L, K] for K shielded vehicles. ``running`` contains n
     worlds, each with M possible worlds.

@@ -7,8 +7,8 @@ A *guard* is the object in an engine that decides which actions are applied. The
 
 - ``state``: the engine with its running episodes. The guard reads the engine and does not change it.
 
-- ``memory``: the guard's memory of these episodes. The guard never changes its memory in place: ``decide`` returns a
-  new memory.
+- ``memory``: the guard's memory of the running episodes. The guard never changes its memory in place: ``decide``
+  returns a new memory.
 
 - ``proposed``: proposed actions, [n, L] in [-1, 1]. A column of NaN means that the caller gave no action for the
   learner of this column. A single NaN is an invalid action.
@@ -116,7 +116,8 @@ class ShieldGuard(ABC):
             running: the engine with its running episodes, before the step.
             memory: memory of the guard.
             proposed: proposed actions, [n, L]. A column of NaN means that the caller gave no action for the learner of
-                this column; the learner's policy then proposes. A single NaN is an invalid action and is never applied.
+                this column; in this case the learner's policy proposes an action. A single NaN is an invalid action and
+                is never applied.
 
         """
 
@@ -136,8 +137,8 @@ class ShieldGuard(ABC):
 
         Args:
             memory: memory of the guard.
-            ruling: the decision; None before the first decision. The infos must have the same names before the first
-                decision as after it.
+            ruling: the decision in the last step; None before the first decision. The infos must have the same names
+                before the first decision as after it.
 
         """
 
@@ -162,15 +163,15 @@ class ShieldGuard(ABC):
         return memory
 
     def intervened(self, ruling: Ruling) -> Bools:
-        """Return whether the decision ``ruling`` replaced the learner's proposed action, [n, L]."""
+        """Return, for each learner, whether the decision ``ruling`` replaced the learner's proposed action, [n, L]."""
         decided: Bools = ruling.decision.intervened
         return decided.reshape(ruling.applied.shape)
 
     def report(self, running: Engine) -> dict[str, NDArray[Any]]:
         """Return the infos of every vehicle: dictionary from name (without ``shield_``) to values [n, N].
 
-        The infos describe the last step of the engine, which is ``running``. In a row where a new episode has just
-        started, the infos describe the alert of the new episode instead.
+        The infos describe the last step of the engine ``running``. In a row where a new episode has just started, the
+        infos describe the alert of the new episode instead.
         """
         memory: Any = running.guarded
         ruling, first = running.ruling, running.steps == 0

@@ -21,7 +21,7 @@ class ShieldedDriver(ByPolicy):
 
     At the alert the policy is simulated to the end of the episode. In worlds where the simulated policy does at most
     the harm of E-V2X-BM, the policy drives without interventions, and the policy's harm is the bound. In all other
-    worlds each proposed action must be certified by a plan that begins with the action: it continues with the rest of
+    worlds each proposed action must be certified by a plan that begins with this action, and continues with the rest of
     the present plan, with a constant action, or with a rollout (a simulation of the policy). In each world, the shield
     decides on the proposals of all vehicles of a team together.
 

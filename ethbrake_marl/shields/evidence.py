@@ -41,10 +41,10 @@ class Review(NamedTuple):
 
 
 def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
-    """For each intervention, compare the episode with an episode in which ``policy`` drives unshielded from then on.
+    """Judge each intervention by the harm if ``policy`` drives unshielded from the decision of the intervention on.
 
     An intervention is *needed* if the episode without the intervention does more harm than the actual episode, *costly*
-    if it does less harm, and *harmless* if both episodes do equal harm. The episode with the interventions is also
+    if it does less harm, and *harmless* if both episodes do equal harm. The actual episode, with the interventions, is
     simulated again in ``worlds``, because the shield may have assumed other worlds.
 
     Args:
@@ -83,11 +83,11 @@ def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
 def _released_harm(shield: StepShield, policy: Driver, worlds: Worlds, world: Ints, step: Ints) -> Floats:
     """Return the harm of m episodes in which ``policy`` drives unshielded from a given decision on, [m] m2/s2.
 
-    Before the given decision, the shielded vehicles repeat the actions that the shield applied.
+    Before decision ``step`` of an episode, the shielded vehicles repeat the actions that the shield applied.
 
     Args:
         shield: the shield after it has run the episodes; its plans then contain the actions that were applied.
-        policy: the agent or team that drives from the given decision on.
+        policy: the agent or team that drives from decision ``step`` of an episode on.
         worlds: the n worlds of the batch at the alert.
         world: for each of the m episodes, the index of its world in ``worlds``, [m].
         step: number of the first decision at which the policy drives, in each of the m episodes, [m].

@@ -8,7 +8,7 @@ the following plans are compared, and the one that does the least harm is used:
 - E-V2X-BM for one vehicle: this vehicle repeats the action of E-V2X-BM, and the other shielded vehicles brake fully.
 
 - Coordinate descent: each shielded vehicle repeats the action that a coordinate descent over the vehicles finds. The
-  descent starts from the best of the other plans.
+  descent starts from whichever of the plans above does the least harm.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def best_constants(
     scenario: Scenario,
     harm_count: HarmCount,
 ) -> Floats:
-    """Return plans that repeat the best constant actions found: [n, width], or [n, width, K] for several vehicles.
+    """Return plans that repeat the constant actions with the least harm found: [n, width], or [n, width, K].
 
     Args:
         worlds: n worlds at the alert.

@@ -87,7 +87,8 @@ class StepGuard(ShieldGuard):
             running: the engine with its running episodes, before the step.
             memory: memory of the guard.
             proposed: proposed actions, [n, L]. A column of NaN means that the caller gave no action for the learner of
-                this column; the learner's policy then proposes. A single NaN is an invalid action and is never applied.
+                this column; in this case the learner's policy proposes an action. A single NaN is an invalid action and
+                is never applied.
 
         """
         shield: StepShield = memory.shield
@@ -111,8 +112,8 @@ class StepGuard(ShieldGuard):
 
         ``ruling`` is the decision that was applied. ``after`` is the engine after the step. Raises ``UncertifiedStep``
         if a world differs from the prediction. If the shield has assumed worlds, which may be wrong, a world that
-        differs from the prediction becomes distrusted, and no error is raised. Worlds in which the physics failed
-        are not compared.
+        differs from the prediction becomes distrusted, and no error is raised. Worlds in which the physics failed are
+        not compared with the prediction.
         """
         memory: Guarded = ruling.memory
         shield: StepShield = memory.shield
@@ -140,10 +141,12 @@ class StepGuard(ShieldGuard):
         return memory._replace(shield=shield)
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos of a step by name: actions, reason, margin, bound, trusted, settles; shares if asked for.
+        """Return the infos of a step by name: actions, reason, margin, bound, trusted, settles.
 
-        ``memory`` is the guard's memory. ``ruling`` is the decision in the step, None before the first decision. Each
-        value is a single number, or an array with one number per world [n], learner [n, L] or vehicle [n, N].
+        If the guard reports shares (settings ``shares`` and ``cap``), the infos also contain the harm that each vehicle
+        bears. ``memory`` is the guard's memory. ``ruling`` is the decision in the last step, None before the first
+        decision. Each value is a single number, or an array with one number per world [n], learner [n, L] or vehicle
+        [n, N].
         """
         shield: StepShield = memory.shield
         infos = self._of_step(ruling) | why(ruling)

@@ -27,7 +27,7 @@ OF_COMMAND, OF_LATENCY, OF_MASS, OF_LIMIT, OF_BRAKE_RATE, OF_RELEASE_RATE, OF_CA
 
 
 class Members(NamedTuple):
-    """Parameters of M possible worlds, and workspace, as input for the compiled functions of this package.
+    """Parameters of M possible worlds, and an array to simulate in, as input for the package's compiled functions.
 
     ``all_members`` returns the possible worlds of a whole batch. ``members_from`` returns the possible worlds of one
     world.
@@ -64,7 +64,7 @@ def all_members(running: Running) -> Members:
 
 @compiled
 def members_from(every: Members, a: int, b: int) -> Members:
-    """Return the rows ``a`` to ``b - 1`` of ``every``, the possible worlds of all worlds, as views (without a copy)."""
+    """Return the rows ``a`` to ``b - 1`` of ``every`` (the result of ``all_members``) as views, not as copies."""
     clock, bounds, lines, pieces = every.clock[a:b], every.bounds[a:b], every.lines[a:b], every.pieces[a:b]
     return Members(every.table, clock, bounds, lines, pieces, every.vehicles, every.critical)
 
@@ -82,7 +82,7 @@ def enter(world: Members, m: int, state: Floats) -> None:
 
 @compiled(apart=True)
 def take_step(world: Members, m: int, state: Floats, step: int, action: Floats, after: Floats) -> int:
-    """Advance one possible world by one decision, and save its new state.
+    """Advance one possible world from one decision to the next, and save its new state.
 
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).
@@ -111,7 +111,7 @@ def take_step(world: Members, m: int, state: Floats, step: int, action: Floats, 
 def take_steps(
     world: Members, states: Floats, ended: Bools, step: int, action: Floats, after: Floats, over: Bools
 ) -> int:
-    """Advance every possible world of one world by one decision, with the same action.
+    """Advance every possible world of one world from one decision to the next, with the same action.
 
     A possible world whose episode has ended keeps its state.
 

@@ -28,13 +28,13 @@ from ethbrake_marl.shields.step import Cap, StepShield
 
 @dataclass(frozen=True)
 class ShieldOptions:
-    """Keywords of ``eb.shield``, ``HybridShield`` and the other wrappers. The mode of an extension may add keywords.
+    """Keywords of ``eb.shield``, ``HybridShield`` and the other wrappers; modes of extensions may accept further ones.
 
     Args:
         mode: ``step`` certifies or replaces each action. An action is certified if some plan that begins with this
             action keeps the harm within the bound. ``episode`` is the paper's Algorithm 1: the policy or E-V2X-BM
-            drives the whole episode. None means ``step``; but if the mode ``step`` lacks one of the other settings,
-            None means the first mode that has all of them.
+            drives the whole episode. None means ``step``; but if the mode ``step`` does not accept one of the other
+            settings, None means the first mode that accepts all of them.
         bound: method to compute ``H*``, the harm of E-V2X-BM, in mode ``episode``: ``coupled`` (the engine's physics)
             or ``pairwise`` (the paper's closed form).
         harm_count: which harm is bounded: ``first`` (first impact of each pair) or ``total`` (every impact).
@@ -70,7 +70,7 @@ class ShieldOptions:
     where: str = field(default="shield", compare=False)
 
     def __new__(cls, mode: str | None = None, **settings: Any) -> ShieldOptions:
-        """Create an instance of the first class that has all ``settings``; the class of ``mode`` is tried first.
+        """Create an instance of the class of ``mode`` or, if it lacks a setting, of the first class with all of them.
 
         For this reason ``ShieldOptions(mode, setting=...)`` accepts the settings of every installed mode.
         """
@@ -165,10 +165,10 @@ def misplaced(name: str, value: object, mode: str, takers: list[str], where: str
     """Return the error to raise for a setting that the mode ``mode`` does not accept.
 
     Args:
-        name: name of the setting.
-        value: value of the setting.
+        name: name of the setting that the mode does not accept.
+        value: value that the user gave to the setting.
         mode: the mode that does not accept the setting.
-        takers: modes that accept the setting.
+        takers: names of the modes that accept the setting.
         where: name with which the message begins: the function or class that the user called.
 
     """
@@ -187,7 +187,7 @@ def one_learner(scenario: Scenario) -> int | None:
 
 
 def _class_with(mode: str, settings: Mapping[str, Any]) -> type[ShieldOptions]:
-    """Return the settings class of ``mode`` if it has all ``settings``, otherwise the first class that has them all.
+    """Return the settings class of ``mode``; if it lacks one of ``settings``, of the first mode that has all of them.
 
     Raises ``UnknownName`` for a setting that no mode has.
     """

@@ -7,8 +7,8 @@ episode.
 The coupled ``H*`` is computed in the same engine as the policy's harm. With the coupled ``H*``, the hybrid does at most
 the harm of the baseline in every world, provided that the policy drives exactly as in its rollout. A policy with random
 actions does not repeat its rollout; use the step shield for such a policy. With the paper's pairwise ``H*`` there is no
-guarantee, because the pairwise ``H*`` treats the two pairs as independent. The pairwise ``H*`` is only about half of
-the harm that the same deceleration causes in the engine.
+guarantee, because the pairwise ``H*`` treats the pair in front and the pair behind as independent. The pairwise ``H*``
+is only about half of the harm that E-V2X-BM's deceleration causes in the engine.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class HybridAgent(AgentAround):
         Args:
             alert: n worlds at the alert.
             vehicle: index of the controlled vehicle (0 = front).
-            scripts: index of each scripted vehicle -> its script.
+            scripts: dictionary from the index of each scripted vehicle to the vehicle's script.
 
         """
         refuse_untold(alert, [vehicle], f"agent {self.name!r}")
@@ -92,7 +92,7 @@ class HybridAgent(AgentAround):
 
         Args:
             worlds: the n worlds at this decision.
-            memory: the agent's memory, as returned by ``begin`` or by the last call of ``act``.
+            memory: the agent's memory, as returned by ``begin`` or by the previous call of ``act``.
             vehicle: index of the controlled vehicle (0 = front).
 
         """

@@ -46,7 +46,7 @@ def rolled_out(
 
     Args:
         worlds: n worlds at the alert.
-        policies: index of each shielded vehicle -> its policy.
+        policies: dictionary from the index of each shielded vehicle to the vehicle's policy.
         scenario: the scenario whose scripts drive the other vehicles.
         vehicle: index of the only shielded vehicle, or a tuple of K indices.
         width: number of decisions for which to return actions.
@@ -95,8 +95,8 @@ def certify_rollouts(
 
     In each world one plan is tried: the proposal, clipped to [-1, 1], followed by the policy's actions in a simulation
     from the next state on. If this plan stays within the budget and the caps, the plan becomes the backup, and the
-    proposal is accepted. If the plan exceeds the budget or a cap, the reason stays ``NO_CERTIFICATE``. If a vehicle's
-    proposal is NaN, the vehicle's planned action is used.
+    proposal is accepted. If the plan exceeds the budget or a cap, the proposal stays rejected, with the reason
+    ``NO_CERTIFICATE``. If a vehicle's proposal is NaN, the vehicle's planned action is used.
 
     Args:
         running: the n episodes of the whole batch.
@@ -129,7 +129,7 @@ def certify_rollouts(
 def _later_plan(
     running: Running, first: Floats, rows: Ints, budget: Floats, held: Floats, proposer: Proposer
 ) -> Floats:
-    """Return plans for m worlds: the actions so far, then ``first``, then the actions of a rollout of the policies.
+    """Return plans for m worlds: the actions so far, then ``first``, then the policies' actions in a rollout.
 
     A rollout stops as soon as its harm exceeds the budget.
 
@@ -190,8 +190,8 @@ def proposed_actions(
 ) -> tuple[Floats, dict[int, Memory]]:
     """Return the actions that the policies propose, [n, K] in [-1, 1], and the new memory of each vehicle's policy.
 
-    ``policies`` maps the index of each of K vehicles to its policy. ``memories`` maps the index of each of these
-    vehicles to the memory of the vehicle's policy. ``worlds`` are n worlds at a decision.
+    ``policies`` maps the index of each of K vehicles to the vehicle's policy. ``memories`` maps the index of each of
+    these vehicles to the memory of the vehicle's policy. ``worlds`` are n worlds at a decision.
     """
     asked = {i: proposed_action(policy, worlds, memories[i], i) for i, policy in policies.items()}
     after = {i: memory for i, (_, memory) in asked.items()}

@@ -28,7 +28,7 @@ class Running(NamedTuple):
 
     @property
     def uncapped(self) -> Running:
-        """These episodes without ``caps`` (the limits of each vehicle's harm)."""
+        """The episodes without ``caps`` (the limits of each vehicle's harm)."""
         return self._replace(caps=np.zeros((0, 0)))
 
     @property
@@ -61,7 +61,7 @@ class Running(NamedTuple):
         return self._select(self.rows_of(worlds), worlds)
 
     def nominal(self) -> Running:
-        """Return these episodes with a single possible world for each world: the world itself."""
+        """Return the episodes with only one possible world for each world: the world itself."""
         if self.members == 1:
             return self
         return self._select(np.arange(self.n) * self.members, np.arange(self.n))
@@ -75,8 +75,8 @@ def begin_running(problem: ProfileProblem, members: int = 1) -> Running:
     """Return running episodes in the worlds of ``problem``, at their first decision.
 
     ``problem`` contains the states of the worlds at the first decision, and the commands of the unshielded vehicles.
-    ``members`` is the number M of possible worlds of each world. M consecutive rows of ``problem`` belong to the same
-    world.
+    ``members`` is the number M of possible worlds of each world. M consecutive rows of ``problem`` contain the M
+    possible worlds of one world.
     """
     steps, ended = np.zeros(problem.n // members, np.int64), np.zeros(problem.n, np.bool_)
     return Running(problem, problem.start, steps, ended)

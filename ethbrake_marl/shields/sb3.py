@@ -78,7 +78,7 @@ class ShieldedVecEnv(SeededInside, VecEnvWrapper):
 
     @reset_infos.setter
     def reset_infos(self, infos: list[dict[str, Any]]) -> None:
-        """Ignore the empty infos that SB3's constructor assigns."""
+        """Ignore the empty infos that SB3's constructor assigns; the infos of the wrapped environment stay."""
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for pickling, without ``class_attributes``, which SB3 sets and pickle cannot handle."""

@@ -20,8 +20,8 @@ the harm in the same order as the engine. Hence:
    would repeat the same operations.
 
 3. *Otherwise the planned action is applied.* When ``follow_plan`` computed ``c``, the simulation passed through the
-   state after the planned action. So from this state on, the rest of the plan again has the harm ``c``, to the last
-   bit. A plan with less harm may replace the rest of the plan.
+   state after the planned action. So from the state after the planned action on, the rest of the plan again has the
+   harm ``c``, to the last bit. The shield may also replace the rest of the plan by a plan with less harm.
 
 4. *End.* When the episode ends, no action is left to execute, and ``c`` is the harm of the episode.
 
@@ -212,8 +212,9 @@ class StepShield:
             worlds: worlds of the new episodes at the alert, as the shield assumes them (the true worlds may differ).
             rows: indices of the batch rows in which the new episodes start.
             policy: policy that proposes actions, or vehicle index -> policy for several vehicles. The policy is
-                simulated from the alert; in worlds where the policy does less harm than the best constant actions, the
-                policy's harm is the bound. If ``policy`` is None, the bound is the harm of the best constant actions.
+                simulated from the alert; in worlds where the policy does less harm than the constant actions with the
+                least harm, the policy's harm is the bound. If ``policy`` is None, the bound is the harm of the constant
+                actions with the least harm.
             possible: the M possible worlds of each world (the world itself first), [len(rows) * M]; None: the result of
                 ``members_of(worlds)``.
 
@@ -318,7 +319,8 @@ class StepShield:
     ) -> tuple[Floats, Any]:
         """Return the bound of each episode at the alert, [n] m2/s2, and further memory (``StepMemory.enclosure``).
 
-        This class returns ``harm`` as the bound, and no further memory (None); a subclass may return both.
+        This class returns ``harm`` as the bound, and None as the further memory; a subclass may return another bound
+        and a further memory.
 
         Args:
             possible: the M possible worlds of each world at the alert.
@@ -412,8 +414,8 @@ class StepShield:
             now: the running episodes before the decision.
             memory: the shield's memory before the decision, which contains the old plan.
             budget: largest harm of the whole episode that the shield accepts in each world, [n] m2/s2.
-            decision: the decision of ``certify``; where only a rollout of the policy certified a proposal, this
-                proposal is accepted.
+            decision: the decision of ``certify``, changed so that proposals that only a rollout of the policy certifies
+                are accepted, too.
             asked: True for each world in which to decide (only trusted worlds), [n].
 
         """
@@ -440,7 +442,7 @@ class StepShield:
 
         With a single possible world, each observed number must equal the predicted number to the bit. With several
         possible worlds, each observed number must lie within the range of its predictions in the possible worlds. Once
-        an impact has happened in one of the possible worlds, every finite observed number agrees.
+        an impact has happened in one of the possible worlds, every finite observed number is accepted.
         """
         running = self.memory.running
         assert running is not None
@@ -467,8 +469,8 @@ class StepShield:
         """Compare the observed worlds with the prediction in ``memory``; return the new memory.
 
         ``seen`` [n, columns] contains the observed worlds; its columns are the first columns of ``Running.states``.
-        ``asked`` [n] is True for the worlds that are compared. A world that differs from the prediction becomes
-        distrusted, and gets a new plan from the observed state on.
+        ``asked`` [n] is True for the worlds that are compared with the prediction. A world that differs from the
+        prediction becomes distrusted, and gets a new plan from the observed state on.
         """
         running, backup, seen = memory.running, memory.backup, self.as_seen(seen)
         assert running is not None

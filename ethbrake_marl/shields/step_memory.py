@@ -39,10 +39,10 @@ class StepMemory(NamedTuple):
     def put(self, rows: Ints, begun: StepMemory) -> StepMemory:
         """Return a copy of this memory in which new episodes replace the episodes in the rows ``rows`` (indices).
 
-        ``begun`` is the memory of the new episodes, in the order of ``rows``. The field ``begun.enclosure`` contains
-        all rows of the batch; all other fields of ``begun`` contain only the new episodes. If there are at least as
-        many new episodes as rows in the batch, the new episodes replace the whole batch. Each new episode gets a higher
-        number than the old episode in its row.
+        ``begun`` is the memory of the new episodes, in the order of ``rows``. The field ``begun.enclosure`` (further
+        memory of a subclass) contains all rows of the batch; all other fields of ``begun`` contain only the new
+        episodes. If there are at least as many new episodes as rows in the batch, the new episodes replace the whole
+        batch. Each new episode gets a higher number than the old episode in its row.
         """
         old, new = self.running, begun.running
         assert new is not None

@@ -258,8 +258,8 @@ def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, *
         policy: policy that proposes the actions that the caller leaves out. In worlds where the policy does less harm
             than E-V2X-BM, the policy's harm is the bound (the harm that the episode will not exceed). In all modes
             except ``episode``, ``policy`` may be None.
-        mode: ``step``, ``episode``, or the mode of an extension. None means ``step``; but if the mode ``step`` lacks
-            one of the ``options``, None means the first mode that has all of them.
+        mode: ``step``, ``episode``, or the mode of an extension. None means ``step``; but if the mode ``step`` does not
+            accept one of the ``options``, None means the first mode that accepts all of them.
         options: further keywords of ``ShieldOptions``.
 
     Returns a ``HybridShield`` (for AEC, an AEC environment around a ``HybridShield``), a ``ShieldedEnv``, a

@@ -107,7 +107,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         return TensorDict(content, batch_size=self.batch_size)
 
     def _set_seed(self, seed: int | None) -> None:
-        """Start new episodes in all worlds, which are drawn from ``seed``. If ``seed`` is None, do nothing."""
+        """Start new episodes in worlds that are drawn from ``seed``; do nothing if ``seed`` is None."""
         if seed is not None:
             self.engine.reset(seed=seed)
 
@@ -204,7 +204,7 @@ class LineTask(TaskClass):  # type: ignore[misc]
 
     @staticmethod
     def env_name() -> str:
-        """Return ``ethbrake``, the first part of the names of these tasks in BenchMARL."""
+        """Return ``ethbrake``, the first part of the names of this package's tasks in BenchMARL."""
         return "ethbrake"
 
 

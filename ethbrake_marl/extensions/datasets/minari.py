@@ -95,7 +95,7 @@ def minari_folder(
         path: path of the folder, named ``NAME-vNUMBER``.
         task: scenario, seed, reward and observation of the recordings.
         told: metadata (result of ``tell``), which are stored in the dataset as JSON under the key ``ethbrake_marl``
-            when the ``with`` block ends. The caller may add entries to ``told`` until the block ends.
+            when the ``with`` block ends. The caller may add entries to ``told`` until the ``with`` block ends.
         force: whether to replace an existing dataset.
 
     """

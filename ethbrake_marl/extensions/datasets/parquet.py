@@ -32,7 +32,7 @@ def parquet_dataset(path: Path, told: Mapping[str, Any]) -> Iterator[Callable[[R
     Args:
         path: path of the file.
         told: metadata (result of ``tell``), which are stored in the file as JSON under the key ``ethbrake_marl`` when
-            the ``with`` block ends. The caller may add entries to ``told`` until the block ends.
+            the ``with`` block ends. The caller may add entries to ``told`` until the ``with`` block ends.
 
     """
     with naming_extras():

@@ -1,4 +1,4 @@
-"""Record episodes of any agent with the actions that a learner in the environment would have taken.
+"""Record episodes of any agent, with the actions in [-1, 1] that make a learner drive like the agent.
 
 An agent's commands are float64 numbers in m/s2. A learner's action is a float32 number in [-1, 1], so most commands do
 not correspond exactly to an action. Therefore each world is simulated twice. In the first episode, the agent drives,
@@ -6,8 +6,9 @@ and its commands are rounded to actions. In the second episode, which is recorde
 environment that gets the recorded actions repeats the second episode bit for bit.
 
 If two vehicles almost miss each other, the last bit of an action can decide whether they have an impact. Therefore, if
-rounding to the nearest action changes the harm of a world, the code also rounds all actions of this world down, and all
-up. The recording contains the actions of the rounding that changes the harm of the world least.
+rounding to the nearest action changes the harm of a world, the code also tries two other roundings: all actions of this
+world down, and all actions up. The recording contains the actions of the rounding that changes the harm of the world
+least.
 """
 
 from __future__ import annotations
@@ -88,7 +89,8 @@ class Recording:
     def terms(self) -> dict[str, Floats]:
         """Return the terms of the reward without their weights: name of the term -> values [T + 1, n, L].
 
-        Values with the first index t + 1 belong to time step t. Values with the first index 0 are 0.
+        Values with the first index t + 1 belong to time step t. Values with the first index 0 belong to the time before
+        the first time step; these values are 0.
         """
         shape = (len(self.index), self.task.scenario.vehicles)
         terms = {}
@@ -107,7 +109,7 @@ def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Re
     ``episode_engine`` before the first episode begins.
 
     Args:
-        sample: worlds at the alert.
+        sample: the worlds, at the alert, in which the episodes are recorded.
         driver: agent or team that drives the learners.
         name: name of the agent in the recording.
         task: scenario, seed, reward and observation of the recording.

@@ -59,7 +59,7 @@ class Seen(NamedTuple):
 
         Args:
             worlds: present state of the n worlds.
-            vehicle: index of the vehicle (0 = front).
+            vehicle: index of the vehicle that the script drives (0 = front).
             step_s: time between two decisions (s).
 
         """
@@ -158,7 +158,7 @@ def fuzzy(seen: Seen, p: Parameters) -> tuple[Floats, Floats]:
     Each criterion is a number from 0 (no danger) to 1 (full danger).
 
     Args:
-        seen: motion of the vehicle, and what it knows about the vehicle ahead.
+        seen: motion of the controlled vehicle, and what this vehicle knows about the vehicle ahead.
         p: parameters of the law ``r157_fsm``.
 
     """
@@ -288,7 +288,7 @@ class Controller:
 
         Args:
             worlds: present state of the n worlds.
-            memory: memory from the last call of ``act``; at the first decision, the result of ``begin``.
+            memory: memory that the previous call of ``act`` returned; at the first decision, the result of ``begin``.
             vehicle: index of the vehicle that the controller drives (0 = front).
 
         """
