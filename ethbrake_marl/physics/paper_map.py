@@ -13,9 +13,10 @@ impact changes the speeds of both its vehicles.
 
 The paper leaves some points open. This map resolves these points as follows:
 
-* f1 uses the state that f3 has changed. The closing speed of the front impact, and its harm (the square of this closing
-  speed), therefore depend on f3. The paper's formula of J_harm uses the speeds before both impacts. The two formulas
-  differ only if both pairs have an impact at the same sample.
+* The impact f1 starts from the speeds that result from the impact f3. The closing speed of the front impact, and its
+  harm (the square of this closing speed), therefore depend on the impact f3. The paper's formula of J_harm uses the
+  speeds before both impacts. The paper's formula and this map lead to different harms only if both pairs have an
+  impact at the same sample.
 * The paper's formulas of f1 and f3 also change the speeds of overlapping vehicles that are separating, and would pull
   these vehicles together again. The paper's text below eq. (13) requires a positive relative velocity (closing speed).
   This map therefore changes speeds and counts harm only if the relative velocity is positive.
@@ -66,8 +67,8 @@ def exchange(
     Args:
         front_mps: speed v_i of the front vehicle, m/s.
         rear_mps: speed v_{i+1} of the rear vehicle, m/s.
-        front_t: mass m_i of the front vehicle, t.
-        rear_t: mass m_{i+1} of the rear vehicle, t.
+        front_t: mass m_i of the front vehicle, in tonnes (t).
+        rear_t: mass m_{i+1} of the rear vehicle, in tonnes (t).
         restitution: coefficient of restitution e, in [0, 1].
 
     """
@@ -90,7 +91,7 @@ def exchange_at_sample(
         k: index of the world in all arrays.
         gaps: gaps of all pairs, [n, P] m.
         speeds: speeds of all vehicles, [n, N] m/s; updated.
-        mass: masses of all vehicles, [n, N] t.
+        mass: masses of all vehicles, [n, N] tonnes (t).
         restitution: coefficient of restitution of this world.
         hit: whether each pair has had an impact, [n, P]; updated.
         first_harm: first-impact harm, [n, P] m2/s2; updated.
