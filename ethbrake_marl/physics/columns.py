@@ -134,8 +134,8 @@ class Packed(NamedTuple):
     def widened(self, obstacle: bool, news: bool) -> Packed:
         """Return these worlds, with the requested columns added if they are missing.
 
-        Added obstacle columns say that there is no obstacle. Added columns *news by link* say that each vehicle knows
-        everything once its own latency has elapsed.
+        Added obstacle columns contain the values of a world without an obstacle. Added columns *news by link* contain
+        the values of a world in which each vehicle knows everything once its own latency has elapsed.
 
         Args:
             obstacle: whether to add the columns of an obstacle.

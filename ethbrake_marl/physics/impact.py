@@ -164,7 +164,7 @@ def record_impacts(table: Floats, time_s: float, world: int, rows: Floats, recor
         world: number of this world, written into ``rows``.
         rows: array to which the impacts are written, [capacity, LISTED.WIDTH]; if the array is full, further impacts
             are counted but not written.
-        recorded: number of impacts so far, written or only counted.
+        recorded: number of earlier impacts, including impacts that did not fit into ``rows``.
 
     """
     for p in range(table.shape[1] - 1):

@@ -23,7 +23,7 @@ The paper leaves some points open. This map resolves these points as follows:
 * Samples are at ``tau_2 + n h``, where tau_2 is the latency of Vehicle 2. Before its first sample a world moves
   exactly, and no impact is detected, because the paper assumes that no impact happens before this sample.
 * The command of a step is the command in force at the sample that begins the step (zero-order hold). If the latency of
-  a vehicle ends between two samples, its command takes effect at the later sample.
+  a vehicle ends between two samples, its command takes effect at the later of these two samples.
 * In the paper ``0 <= v <= v_max`` is a constraint on u and not part of the map. This map limits the command of every
   vehicle so that the vehicle's speed satisfies the constraint at the next sample. An impact can leave a negative speed.
   Setting a negative speed to 0 would violate conservation of momentum. The map therefore keeps the negative speed, and

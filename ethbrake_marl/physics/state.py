@@ -251,7 +251,7 @@ class Worlds:
 
     @staticmethod
     def concatenate(parts: Sequence[Worlds]) -> Worlds:
-        """Join the batches ``parts`` in this order into one batch; all batches must have the same number of vehicles."""
+        """Join the batches ``parts`` in this order into one batch; all parts must have the same number of vehicles."""
         parts = _alike(parts)
         return parts[0]._each(lambda *columns: np.concatenate(columns), *parts[1:])
 
@@ -336,8 +336,7 @@ class Worlds:
 
         A braking profile is a fixed sequence of commands. ``pieces`` maps a vehicle (index from 0) to a sequence of
         pairs (start, deceleration), one for each command. The start is in s after the vehicle's latency; the first
-        start is 0. The deceleration is in m/s2. If the sequence of a vehicle has a single pair, the vehicle gets no
-        profile.
+        start is 0. The deceleration is in m/s2. A vehicle whose sequence has a single pair gets no profile.
         """
         several = {i: np.array(each, np.float64) for i, each in pieces.items() if len(each) > 1}
         if not several and not self.vehicles.pieces.shape[2]:
