@@ -36,7 +36,7 @@ def advance_worlds(
     command: Floats, until: Floats, braking: Floats, driving: Floats, latency: Floats, mass: Floats, limit: Floats,
     restitution: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats, failed: Ints, at: int, rows: Floats,
 ) -> tuple[int, bool]:  # fmt: skip
-    """Advance every world to its time ``until``, in place; return the number of impacts, and whether input is valid.
+    """Advance every world to ``until``, in place; return the number of impacts, and whether the input is valid.
 
     A world in which a check of the physics fails keeps its state; the other worlds are advanced. The second result is
     True if all entries of ``until`` and ``command`` are valid, otherwise False. Arguments that are not listed are
@@ -50,7 +50,7 @@ def advance_worlds(
     - ``command``: commands, [n, N] m/s2.
     - ``until``: time at which each world's segment ends, [n] s.
     - ``failed``: result, the status of each world, [n]: ``FLAG.DONE``, or the code of the check that failed.
-    - ``at``: 1 if some world has an obstacle, otherwise 0; vehicle i is column ``at + i`` of the table
+    - ``at``: 1 if at least one world has an obstacle, otherwise 0; vehicle i is column ``at + i`` of the table
       (``physics.rows``).
     - ``rows``: result, one row for each impact, [capacity, LISTED.WIDTH]; if it is full, further impacts are only
       counted.
@@ -178,7 +178,7 @@ def _advance_part(arrays: tuple[NDArray[Any], ...], at: int, capacity: int, part
 
     Args:
         arrays: the array arguments of ``advance_worlds`` for all worlds, in the order of its signature.
-        at: 1 if some world has an obstacle ahead, otherwise 0.
+        at: 1 if at least one world has an obstacle ahead, otherwise 0.
         capacity: largest number of impacts to record.
         part: slice of the world indices to advance.
 

@@ -48,8 +48,8 @@ def built_up(table: Floats) -> bool:
 def first_return(value: float, rate: float, jerk: float) -> float:
     """Return the first time t > 0 at which ``value + rate t + jerk t^2 / 2`` is 0, in s; infinite if there is none.
 
-    For a speed, ``value`` is in m/s, ``rate`` in m/s2 and ``jerk`` in m/s3. The result is later than 0 even if this
-    polynomial is 0 at t = 0.
+    For a speed, ``value`` is in m/s, ``rate`` in m/s2 and ``jerk`` in m/s3. The result is above 0 even if ``value`` is
+    0.
     """
     if value == 0.0:
         return -2.0 * rate / jerk if rate * jerk < 0.0 else math.inf
@@ -360,7 +360,7 @@ def next_moving_event(table: Floats, now: float, end: float, parting: float) -> 
     act at once, ``constant_motion.next_event`` replaces this function.
 
     Args:
-        table: one world in the layout of ``physics.rows``, after ``accelerate_moving``.
+        table: one world in the layout of ``physics.rows``, to which ``accelerate_moving`` has been applied.
         now: present time, counted from the start of the segment, s.
         end: end of the segment, s.
         parting: time until touching vehicles separate (the result of ``accelerate_moving``), s.

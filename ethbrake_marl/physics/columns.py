@@ -86,7 +86,8 @@ class Packed(NamedTuple):
     def of(cls, worlds: Worlds) -> Packed:
         """Pack ``worlds`` as at the start of an episode, with harm 0.
 
-        The columns of an obstacle and the columns *news by link* (see ``Columns``) exist only if a world needs them.
+        The columns of an obstacle and the columns *news by link* (see ``Columns``) exist only if at least one world
+        needs them.
         """
         v, (n, N) = worlds.vehicles, worlds.speeds_mps.shape
         none = np.zeros((n, 3 * (N - 1)))
@@ -133,8 +134,8 @@ class Packed(NamedTuple):
     def widened(self, obstacle: bool, news: bool) -> Packed:
         """Return these worlds, with the requested columns added if they are missing.
 
-        Added obstacle columns say that there is no obstacle. Added columns *news by link* say that each vehicle knows
-        everything once its own latency has elapsed.
+        Added obstacle columns contain the values of a world without an obstacle. Added columns *news by link* contain
+        the values of a world in which each vehicle knows everything once its own latency has elapsed.
 
         Args:
             obstacle: whether to add the columns of an obstacle.
@@ -192,7 +193,7 @@ class Packed(NamedTuple):
         return self.params[:, column.news : column.messages].copy().reshape(-1, column.vehicles, column.vehicles)
 
     def ledger(self) -> tuple[Floats, Floats, Ints, Floats, Floats, Ints]:
-        """Return harm and number of impacts since the start of the episode, of the pairs and of the obstacle.
+        """Return six arrays: harm and number of impacts since the episode began, for the pairs and for the obstacle.
 
         The first three arrays, [n, P], are first-impact harm (m2/s2), total harm (m2/s2) and number of impacts of each
         pair. The last three arrays, [n], are first-impact harm, total harm and number of impacts of Vehicle 1 with the

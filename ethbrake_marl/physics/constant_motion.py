@@ -52,7 +52,7 @@ def next_event(table: Floats, now: float, end: float) -> float:
     limit, and when each pair next comes into contact.
 
     Args:
-        table: one world in the layout of ``physics.rows``, after ``accelerate``.
+        table: one world in the layout of ``physics.rows``, to which ``accelerate`` has been applied.
         now: present time, counted from the start of the segment, s.
         end: end of the segment, s.
 

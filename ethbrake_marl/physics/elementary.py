@@ -100,8 +100,8 @@ def power_of_two(k: int) -> float:
 def exp_rest(x: float, k: int) -> float:
     """Return ``e^x / 2^k`` for the whole number k nearest to ``x / ln 2``.
 
-    The result is the sum of Taylor's series of ``e^y`` to the 13th power of ``y = x - k ln 2``. The absolute value of y
-    is at most ``ln(2) / 2``. The relative error of cutting the series after the 13th power is 5e-18.
+    The result is the Taylor series of ``e^y`` up to the power ``y^13``, with ``y = x - k ln 2``. The absolute value of
+    y is at most ``ln(2) / 2``. The relative error of ending the series after ``y^13`` is 5e-18.
     """
     return _polynomial(_EXP, (x - k * _LN2_HIGH) - k * _LN2_LOW)
 
@@ -124,9 +124,9 @@ def exp(x: float) -> float:
 def _log_parts(x: float) -> tuple[float, float]:
     """Return two numbers whose sum is ``ln x``, for a finite x > 0; the pair is more accurate than a single number.
 
-    With ``x = 2^k m`` and m between ``sqrt(1/2)`` and ``sqrt(2)``, the first number is k times the leading bits of ``ln
-    2``, which is exact. The second number is the rest of ``k ln 2``, plus the series of ``ln m = 2 artanh((m - 1) / (m
-    + 1))``.
+    With ``x = 2^k m`` and m between ``sqrt(1/2)`` and ``sqrt(2)``, the first number is k times the leading bits of
+    ``ln 2``; this product is exact. The second number is the rest of ``k ln 2``, plus the series of
+    ``ln m = 2 artanh((m - 1) / (m + 1))``.
     """
     k, m = 0, x
     while m >= _SQRT2:

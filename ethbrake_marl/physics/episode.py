@@ -60,7 +60,7 @@ _ON_GRID = 1e-6  # part of a step: a time this close before a decision counts as
 
 
 class Grid(NamedTuple):
-    """Decision times of one episode: from ``first_s`` on, every ``time_step_s``, up to the horizon."""
+    """Decision times of one episode: at ``first_s``, then every ``time_step_s``, up to the horizon."""
 
     first_s: float  # time of the first decision (s)
     time_step_s: float  # time between two decisions (s)
@@ -92,7 +92,7 @@ class Decisions(NamedTuple):
         return np.ceil((time_s - self.first_s) / self.time_step_s - _ROUNDING)
 
     def latest(self, time_s: Floats) -> Ints:
-        """Return the number of the latest decision at or before each time (s), from 0; negative before decision 0."""
+        """Return the number (from 0) of the latest decision at or before each time (s); negative before decision 0."""
         number: Floats = np.floor((time_s - self.first_s) / self.time_step_s + _ON_GRID)
         return number.astype(np.int64)
 
@@ -192,7 +192,7 @@ def step_again(table: Floats, restitution: float, grid: Grid, step: int, end: in
     """Advance a world from decision number ``step`` to decision number ``end``; return the result of ``step_episode``.
 
     Apart from the commands, the table must contain what the previous step or ``restore`` wrote into it. For each
-    vehicle, the function computes again when the command takes effect.
+    vehicle, the function computes anew the time until the vehicle's command takes effect.
 
     Args:
         table: the world in the layout of ``physics.rows``, with at least ``ROW.OF_EPISODE`` rows; updated.
@@ -226,7 +226,7 @@ def harm_so_far(table: Floats, total: float) -> float:
 
 @compiled
 def value_of(table: Floats, clock: Floats, other_weight: float = OTHER_WEIGHT) -> float:
-    """Return the harm that a search minimises, of the episode so far, m2/s2; this harm never decreases in an episode.
+    """Return the harm of the episode so far (m2/s2), as a search minimises it; this harm never decreases in an episode.
 
     The result is one of three harms: the harm of the line, the weighted sum of the vehicles' harms, or the largest
     weighted harm of a vehicle. Each of these harms can be computed as first-impact harm or as total harm. To break
@@ -236,8 +236,9 @@ def value_of(table: Floats, clock: Floats, other_weight: float = OTHER_WEIGHT) -
     Args:
         table: one world in the layout of ``physics.rows``, with at least ``ROW.OF_EPISODE`` rows.
         clock: settings of the episode, [CLOCK.WIDTH]: the entry ``HARM_IS_TOTAL`` chooses the count of harm, and the
-            entry ``AIM`` chooses one of the three harms.
-        other_weight: weight of the line's harm in the other count, a number without unit.
+            entry ``AIM`` chooses one of the three harms named above.
+        other_weight: weight of the line's harm in the count of harm that the search does not minimise, a number without
+            unit.
 
     """
     total, aim = clock[CLOCK.HARM_IS_TOTAL], clock[CLOCK.AIM]
@@ -292,7 +293,7 @@ def restore(table: Floats, state: Floats) -> None:
 
 @compiled(apart=True)
 def follow_whole(world: Episode, ends: Ints, commands: Floats, states: Floats, bound: float) -> tuple[float, int]:
-    """Simulate a whole profile (a sequence of constant commands) from its first phase on.
+    """Simulate a whole profile (a sequence of constant commands), from its first command on.
 
     Arguments and result are the same as in ``follow``, which this function calls with ``phase`` 0.
     """

@@ -28,10 +28,10 @@ def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> 
     If the observer has received the state of a vehicle, the function extrapolates the newest received place and speed
     to the present, under the received command and without contact. If the received states of both vehicles of a pair
     are from the present time, the estimated gap is the true gap. The observer knows whether its own pairs have had an
-    impact, but not whether other pairs have. If the observer has received nothing about a vehicle, the function puts
-    this vehicle at rest at the place of the next vehicle towards the observer. If messages do not contain a quantity,
-    the function replaces the quantity in the same way: a place by the place of the next vehicle towards the observer, a
-    speed or a command by 0.
+    impact, but not whether other pairs have had an impact. If the observer has received nothing about a vehicle, the
+    function puts this vehicle at rest at the place of the next vehicle towards the observer. If messages do not contain
+    a quantity, the function replaces the quantity in the same way: a place by the place of the next vehicle towards the
+    observer, a speed or a command by 0.
 
     Args:
         state: true states of the worlds, [n, S], one row per world in the layout of ``physics.columns``.

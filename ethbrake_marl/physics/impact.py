@@ -154,17 +154,17 @@ def resolve_impacts(table: Floats, restitution: float) -> bool:
 
 @compiled(bare=True)
 def record_impacts(table: Floats, time_s: float, world: int, rows: Floats, recorded: int) -> int:
-    """Add the harm of the impacts of the last ``resolve_impacts`` to ``table``; write these impacts to ``rows``.
+    """Record the impacts that ``resolve_impacts`` resolved: add their harm to ``table``, write them to ``rows``.
 
     Returns ``recorded`` plus the number of these impacts.
 
     Args:
-        table: one world in the layout of ``physics.rows``, after ``resolve_impacts``.
+        table: one world in the layout of ``physics.rows``, to which ``resolve_impacts`` has been applied.
         time_s: time of the impacts, s.
         world: number of this world, written into ``rows``.
         rows: array to which the impacts are written, [capacity, LISTED.WIDTH]; if the array is full, further impacts
-            are only counted.
-        recorded: number of impacts so far, written or only counted.
+            are counted but not written.
+        recorded: number of earlier impacts, including impacts that did not fit into ``rows``.
 
     """
     for p in range(table.shape[1] - 1):

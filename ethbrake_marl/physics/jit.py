@@ -123,7 +123,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         self.add_overload(compiled)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """Return the template by which numba finds the types of a call of this kernel from another kernel.
+        """Return the template with which numba determines the types when another kernel calls this kernel.
 
         This method is part of numba's protocol for dispatchers. ``args`` and ``kws`` are the numba types of the
         positional and keyword arguments of the call.
@@ -378,13 +378,14 @@ def compiled(function: Any = None, *, apart: bool = False, within: bool = False,
 
     Args:
         function: the function to compile; None if the decorator is used with arguments.
-        apart: do not inline this kernel. Use this option for a large kernel that many kernels call, but rarely. If such
-            a large kernel were inlined, numba would compile it once per caller, which takes minutes instead of seconds.
-        within: inline this kernel into the code of its callers before numba compiles them. In contrast to
+        apart: if True, do not inline this kernel. Use this option for a large kernel that many kernels call, but
+            rarely. If such a large kernel were inlined, numba would compile it once per caller, which takes minutes
+            instead of seconds.
+        within: if True, inline this kernel into the code of its callers before numba compiles them. In contrast to
             ``forceinline``, ``within`` avoids the counting of references in each function that passes an array on.
-        bare: compile this kernel without any counting of references. Use this option for kernels that neither create
-            nor return arrays. A kernel that is inlined into a bare kernel still counts references unless it is bare,
-            too.
+        bare: if True, compile this kernel without any counting of references. Use this option for kernels that neither
+            create nor return arrays. A kernel that is inlined into a bare kernel still counts references unless it is
+            bare, too.
 
     """
     if function is None:
@@ -411,7 +412,7 @@ def by_parts(work: Callable[[slice], Result], n: int, threads: int) -> list[Resu
 
     Args:
         work: function that is called with each slice of the rows.
-        n: number of rows.
+        n: number of rows to divide into slices.
         threads: largest number of threads.
 
     """

@@ -24,7 +24,7 @@ def measured_without_failed(measure: Callable[[Ints], Result], n: int) -> tuple[
 
     Args:
         measure: function of an array of world indices (from 0 to n - 1). If the physics fails, the function must raise
-            a ``PhysicsError`` that lists the positions of the failed worlds in this array.
+            a ``PhysicsError`` that lists the failed worlds by their positions in this array of indices.
         n: number of worlds.
 
     """
@@ -43,7 +43,7 @@ def leaving_out_failed(work: Callable[[Ints], Result], rows: Ints) -> tuple[Resu
 
     Args:
         work: function of an array of world indices. If the physics fails, the function must raise a ``PhysicsError``
-            that lists the positions of the failed worlds in this array.
+            that lists the failed worlds by their positions in this array of indices.
         rows: indices of the worlds for the first call of ``work``, [k].
 
     """

@@ -155,10 +155,11 @@ def sample_width(messages: Floats, vehicles: int) -> int:
 def knows_piece(messages: Floats, vehicles: int, receiver: int, sender: int, piece: int, time: float) -> bool:
     """Return whether, at ``time`` (s), ``receiver`` knows the quantity ``PIECES[piece]`` of ``sender``.
 
-    The function assumes that by ``time`` the first message has arrived, or the sender is in sight. ``messages`` are the
-    message columns of one world; the array may be empty. The receiver knows the intent (the command chosen at the last
-    decision) only by a message. The receiver knows every other quantity if the sender's messages contain it. Once the
-    sender is in sight, the receiver also knows the sender's place, speed and acceleration, because it measures them.
+    The function assumes that the sender's first message has arrived by ``time``, or that the sender is in sight.
+    ``messages`` are the message columns of one world; the array may be empty, for a world without message columns. The
+    receiver knows the intent (the command chosen at the last decision) only by a message. The receiver knows every
+    other quantity if the sender's messages contain it. Once the sender is in sight, the receiver also knows the
+    sender's place, speed and acceleration, because it measures them.
     """
     if not has_contents(messages, vehicles):
         return piece != INTENT
@@ -289,7 +290,7 @@ class Messages(NamedTuple):
         return tuple(piece for piece in pieces if not always[PIECES.index(piece)])
 
     def withhold_from(self, vehicle: int) -> Bools:
-        """Return, for each world [n], whether messages of a vehicle but ``vehicle`` lack any of ``USUAL_PIECES``."""
+        """Return for each world whether messages of any vehicle but ``vehicle`` lack one of ``USUAL_PIECES``, [n]."""
         others = np.delete(self.contents, vehicle, axis=1)[:, :, : len(USUAL_PIECES)]
         return np.asarray(~others.all(axis=(1, 2)))
 
@@ -299,16 +300,17 @@ class Messages(NamedTuple):
         return np.full(len(self.columns), np.inf) if seen is None else seen
 
     def known_pieces(self, vehicle: int, time_s: Floats) -> Bools:
-        """Return a mask [n, N, CONTENTS]: whether ``vehicle`` knows ``PIECES[c]`` of vehicle j at ``time_s`` [n].
+        """Return a mask [n, N, CONTENTS], True at (world, j, c) if ``vehicle`` knows ``PIECES[c]`` of vehicle j.
 
-        The result is valid for a vehicle whose first message has arrived by ``time_s``, and for a vehicle in sight.
+        The mask describes the time ``time_s`` [n]. The result is valid for a vehicle j whose first message has arrived
+        by ``time_s``, and for a vehicle j in sight.
         """
         known = np.empty((len(time_s), self.vehicles, CONTENTS), np.bool_)
         _known_pieces(np.ascontiguousarray(self.columns), time_s, self.vehicles, vehicle, known)
         return known
 
     def intents(self, vehicle: int) -> Floats:
-        """Return each vehicle's newest intent that ``vehicle`` knows, [n, N] m/s2; 0 if ``vehicle`` knows none."""
+        """Return the newest intents (chosen commands) that ``vehicle`` knows, [n, N] m/s2; 0 for an unknown intent."""
         n, N = len(self.columns), self.vehicles
         if not self.says_contents:
             return np.zeros((n, N))
@@ -364,9 +366,9 @@ def refuse_untold(
 ) -> None:
     """Raise ``InvalidInput`` if messages lack a quantity that the agent ``who`` needs to control ``vehicles``.
 
-    The agent needs messages of every vehicle in ``senders`` (None: of all vehicles), also of vehicles that it controls
-    itself. An agent that controls a single vehicle needs no message of this vehicle. ``needs``: the quantities that
-    these messages must contain. ``who``: name of the agent in the error message.
+    The agent needs messages of every vehicle in ``senders`` (None: of all vehicles), including the controlled vehicles
+    if it controls several. An agent that controls a single vehicle needs no message of this vehicle. ``needs``: the
+    quantities that these messages must contain. ``who``: name of the agent in the error message.
     """
     messages = Messages.of(worlds)
     for sender in (range(worlds.N) if senders is None else senders) if messages.says_contents else ():

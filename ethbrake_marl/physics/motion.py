@@ -122,9 +122,9 @@ def speed_event(speed: float, acceleration: float, command: float, limit: float)
 def force_range(speed: float, command: float, limit: float) -> tuple[float, float]:
     """Return the acceleration (m/s2) by a vehicle's own brakes or engine for motion forward, and for motion backward.
 
-    The acceleration for motion forward differs from the acceleration for motion backward in two cases. The brakes of a
-    vehicle at rest act against motion in either direction. A driving vehicle at its speed limit uses only as much force
-    as keeps it at this speed.
+    The acceleration for motion forward and the acceleration for motion backward differ if the vehicle brakes at rest or
+    drives at its speed limit. The brakes of a vehicle at rest act against motion in either direction. A driving vehicle
+    at its speed limit uses only as much force as keeps it at this speed.
 
     Args:
         speed: present speed, m/s.

@@ -13,16 +13,17 @@ impact changes the speeds of both its vehicles.
 
 The paper leaves some points open. This map resolves these points as follows:
 
-* f1 uses the state that f3 has changed. The closing speed of the front impact, and its harm (the square of this closing
-  speed), therefore depend on f3. The paper's formula of J_harm uses the speeds before both impacts. The two formulas
-  differ only if both pairs have an impact at the same sample.
+* The impact f1 starts from the speeds that result from the impact f3. The closing speed of the front impact, and its
+  harm (the square of this closing speed), therefore depend on the impact f3. The paper's formula of J_harm uses the
+  speeds before both impacts. The paper's formula and this map lead to different harms only if both pairs have an
+  impact at the same sample.
 * The paper's formulas of f1 and f3 also change the speeds of overlapping vehicles that are separating, and would pull
   these vehicles together again. The paper's text below eq. (13) requires a positive relative velocity (closing speed).
   This map therefore changes speeds and counts harm only if the relative velocity is positive.
 * Samples are at ``tau_2 + n h``, where tau_2 is the latency of Vehicle 2. Before its first sample a world moves
   exactly, and no impact is detected, because the paper assumes that no impact happens before this sample.
 * The command of a step is the command in force at the sample that begins the step (zero-order hold). If the latency of
-  a vehicle ends between two samples, its command takes effect at the later sample.
+  a vehicle ends between two samples, its command takes effect at the later of these two samples.
 * In the paper ``0 <= v <= v_max`` is a constraint on u and not part of the map. This map limits the command of every
   vehicle so that the vehicle's speed satisfies the constraint at the next sample. An impact can leave a negative speed.
   Setting a negative speed to 0 would violate conservation of momentum. The map therefore keeps the negative speed, and
@@ -66,8 +67,8 @@ def exchange(
     Args:
         front_mps: speed v_i of the front vehicle, m/s.
         rear_mps: speed v_{i+1} of the rear vehicle, m/s.
-        front_t: mass m_i of the front vehicle, t.
-        rear_t: mass m_{i+1} of the rear vehicle, t.
+        front_t: mass m_i of the front vehicle, in tonnes (t).
+        rear_t: mass m_{i+1} of the rear vehicle, in tonnes (t).
         restitution: coefficient of restitution e, in [0, 1].
 
     """
@@ -90,7 +91,7 @@ def exchange_at_sample(
         k: index of the world in all arrays.
         gaps: gaps of all pairs, [n, P] m.
         speeds: speeds of all vehicles, [n, N] m/s; updated.
-        mass: masses of all vehicles, [n, N] t.
+        mass: masses of all vehicles, [n, N] tonnes (t).
         restitution: coefficient of restitution of this world.
         hit: whether each pair has had an impact, [n, P]; updated.
         first_harm: first-impact harm, [n, P] m2/s2; updated.

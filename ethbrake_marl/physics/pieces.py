@@ -58,7 +58,7 @@ def force_at(table: Floats, i: int, command: float, latency_s: float, time_s: fl
         i: column of the vehicle.
         command: command of the vehicle in the segment, m/s2.
         latency_s: time before which the vehicle's commands have no effect, s.
-        time_s: end of the segment, s, on the same clock as ``latency_s``.
+        time_s: end of the segment, s, counted from the same moment as ``latency_s``.
 
     """
     acts = command_acts(latency_s, time_s)

@@ -1,8 +1,8 @@
 """The table of one world on which the compiled functions work: a row per quantity, a column per vehicle or pair.
 
 The constants of ``ROW`` name the rows: ``table[ROW.SPEED, i]`` is the speed of vehicle i. In a row for pairs, column p
-belongs to the pair (vehicle p, vehicle p + 1). An obstacle ahead is the vehicle in column 0; vehicle i then is in
-column i + 1.
+belongs to the pair (vehicle p, vehicle p + 1). If there is an obstacle ahead, the obstacle is in column 0 and vehicle i
+is in column i + 1.
 """
 
 from __future__ import annotations

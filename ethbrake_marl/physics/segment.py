@@ -36,7 +36,7 @@ def advance_table(
         start_s: absolute time at the start of the segment, s; used to write the times of impacts into ``rows``.
         world: index of the world, written into ``rows``.
         rows: array to which the impacts are written, [capacity, LISTED.WIDTH]; if the array is full, further impacts
-            are only counted.
+            are counted but not written.
         recorded: number of impacts that were recorded before this segment.
 
     """
@@ -202,7 +202,8 @@ def to_next_event(table: Floats, now: float, duration: float, building: bool) ->
 def begin_commands(table: Floats, now: float, passed: float, building: bool) -> None:
     """Put into effect the commands that begin between ``now`` and ``now + passed``.
 
-    If a vehicle follows a fixed sequence of commands, this includes the next command of the sequence.
+    For a vehicle that follows a fixed sequence of commands, the function also starts the next command of the sequence
+    if this command begins in the interval.
 
     Args:
         table: the world in the layout of ``physics.rows``.

@@ -116,8 +116,8 @@ class Vehicles:
     def known_at_once(latency_s: Floats) -> Floats:
         """Return the field ``known_from_s`` [n, N, N] of vehicles without a V2X channel, from their latencies [n, N] s.
 
-        Without a channel vehicle i acts on news of every vehicle once its own latency has elapsed. The result is a
-        read-only view of ``latency_s``; the last axis has stride 0, so the result takes no memory of its own.
+        Without a channel vehicle i acts on news of every vehicle once the latency of vehicle i has elapsed. The result
+        is a read-only view of ``latency_s``; the last axis has stride 0, so the result takes no memory of its own.
         """
         latency = np.ascontiguousarray(latency_s, np.float64)
         (n, N), size = latency.shape, latency.itemsize
@@ -127,13 +127,13 @@ class Vehicles:
 
     @property
     def build_up(self) -> Bools:
-        """For each world, whether a vehicle has a finite brake or release rate, or follows a braking profile, [n]."""
+        """For each world, whether any vehicle has a finite brake or release rate, or follows a braking profile, [n]."""
         rates = np.minimum(self.brake_rate_mps3, self.release_rate_mps3)
         return np.asarray(np.isfinite(rates).any(axis=1) | self.in_pieces)
 
     @property
     def in_pieces(self) -> Bools:
-        """For each world, whether one of its vehicles follows a braking profile (a fixed sequence of commands), [n]."""
+        """For each world, whether any vehicle follows a braking profile (a fixed sequence of commands), [n]."""
         return np.asarray(np.isfinite(self.pieces).any(axis=(1, 2)))
 
     def piece_commands(self, command_mps2: Floats, time_s: Floats) -> Floats:
@@ -154,11 +154,12 @@ class Vehicles:
         return command
 
     def hide_from(self, vehicle: int) -> Bools:
-        """Return whether a channel hides part of the line from ``vehicle`` (index from 0) at its first decision, [n].
+        """Return for each world whether a V2X channel hides information from ``vehicle`` at its first decision, [n].
 
-        The channel hides something if information about another vehicle has not arrived yet. The channel also hides
-        something if it extends the latency of another vehicle, because messages report that vehicle's latency without
-        the extension. If there is no channel, the result is False.
+        ``vehicle`` is an index from 0. The channel hides information if news of another vehicle has not arrived by the
+        first decision of ``vehicle``. The channel also hides information if it extends the latency of another vehicle,
+        because messages report the latency of that vehicle without the extension. If there is no channel, the result is
+        False.
         """
         late = self.latency_s > self.own_latency_s
         hidden = (self.known_from_s[:, vehicle] > self.latency_s[:, [vehicle]]) | late
@@ -167,7 +168,7 @@ class Vehicles:
 
     @property
     def is_known_at_once(self) -> bool:
-        """Whether every vehicle knows everything once its own latency has elapsed, as without a V2X channel."""
+        """Whether every vehicle knows everything once its own latency has elapsed, as it does without a V2X channel."""
         if self._is_view:
             return True
         own, latency = self.own_latency_s, self.latency_s
@@ -175,7 +176,10 @@ class Vehicles:
 
     @property
     def _is_view(self) -> bool:
-        """Whether ``own_latency_s`` and ``known_from_s`` share the memory of ``latency_s``, as after ``at_once``."""
+        """Whether ``own_latency_s`` and ``known_from_s`` share the memory of ``latency_s``.
+
+        In the result of ``at_once`` these fields share memory.
+        """
         latency, news = self.latency_s, self.known_from_s
         return self.own_latency_s is latency and news.base is latency and news.strides[1:] == (latency.itemsize, 0)
 
@@ -247,7 +251,7 @@ class Worlds:
 
     @staticmethod
     def concatenate(parts: Sequence[Worlds]) -> Worlds:
-        """Join the batches ``parts`` into one batch, in this order; all must have the same number N of vehicles."""
+        """Join the batches ``parts`` in this order into one batch; all parts must have the same number of vehicles."""
         parts = _alike(parts)
         return parts[0]._each(lambda *columns: np.concatenate(columns), *parts[1:])
 
@@ -306,7 +310,7 @@ class Worlds:
         """Return these worlds on a road with this ``friction`` [n]; capacities are at most ``friction * GRAVITY_MPS2``.
 
         ``dry``: new capacities on a dry road, a dictionary from field name to [n, N] m/s2, for example
-        ``{"braking_capacity_mps2": array}``. Capacities on a dry road that ``dry`` does not contain stay as they are.
+        ``{"braking_capacity_mps2": array}``. Capacities on a dry road that are missing from ``dry`` do not change.
         """
         on_dry = {name: self.dry(name) for name in _ON_ROADS} | dict(dry or {})
         vehicles = replace(self.vehicles, **as_road_allows(on_dry, friction[:, np.newaxis]))
@@ -332,8 +336,7 @@ class Worlds:
 
         A braking profile is a fixed sequence of commands. ``pieces`` maps a vehicle (index from 0) to a sequence of
         pairs (start, deceleration), one for each command. The start is in s after the vehicle's latency; the first
-        start is 0. The deceleration is in m/s2. If the sequence of a vehicle has a single pair, the vehicle gets no
-        profile.
+        start is 0. The deceleration is in m/s2. A vehicle whose sequence has a single pair gets no profile.
         """
         several = {i: np.array(each, np.float64) for i, each in pieces.items() if len(each) > 1}
         if not several and not self.vehicles.pieces.shape[2]:
@@ -418,11 +421,12 @@ class Worlds:
     def with_post_ahead(self, duration_s: Floats) -> Worlds:
         """Return these worlds; a world without an obstacle gets one that no vehicle reaches within ``duration_s`` [n].
 
-        The change of the gap to an added obstacle is the distance that Vehicle 1 travels, which worlds do not store. An
-        added obstacle changes no motion, because its gap is larger than ``T sqrt(2 E / m_1)``. The distance
-        ``T sqrt(2 E / m_1)`` is what Vehicle 1, of mass m_1, would travel in the time T if it had all the energy E that
-        the line can have within T. Impacts and brakes only remove energy. A vehicle of mass m that drives at the speed
-        v with the acceleration a adds at most the energy ``m a v`` per second, and only up to the speed limit.
+        The change of the gap to an added obstacle is the distance that Vehicle 1 travels; worlds do not store this
+        distance. An added obstacle changes no motion, because its gap is larger than ``T sqrt(2 E / m_1)``. The
+        distance ``T sqrt(2 E / m_1)`` is what Vehicle 1, of mass m_1, would travel in the time T if it had all the
+        energy E that the line can have within T. Impacts and brakes only remove energy. A vehicle of mass m that drives
+        at the speed v with the acceleration a adds at most the energy ``m a v`` per second, and only up to the speed
+        limit.
         """
         vehicles = self.vehicles
         driving = vehicles.driving_capacity_mps2 * vehicles.speed_limit_mps * duration_s[:, np.newaxis]
@@ -432,7 +436,7 @@ class Worlds:
 
 
 def _alike(parts: Sequence[Worlds]) -> Sequence[Worlds]:
-    """Return the batches ``parts`` with arrays of equal width, so that they can be joined.
+    """Return the batches ``parts`` with arrays of equal width, so that the batches can be joined.
 
     In all batches, the array ``Vehicles.pieces`` (fixed sequences of commands) gets the width of the widest of these
     arrays. If some batches model the friction of the road, the other batches get infinite friction.
@@ -448,9 +452,9 @@ def _alike(parts: Sequence[Worlds]) -> Sequence[Worlds]:
 
 
 def _padded(pieces: Floats, most: int) -> Floats:
-    """Return ``pieces`` [n, N, 2 K] with infinite entries added, so that the result is [n, N, most].
+    """Return ``pieces`` [n, N, 2 K], extended by infinite entries to the shape [n, N, most].
 
-    A piece is a time interval of constant command; its two entries are the start and the command. Infinite entries
+    A piece is a time interval of constant command; its two entries are its start and its command. Infinite entries
     stand in the places of pieces that a vehicle does not have. ``most`` is even.
     """
     n, N, width = pieces.shape
@@ -470,7 +474,7 @@ def _unwritable(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def _span(values: Floats) -> str:
-    """Return a text with the smallest and the largest value, one number if these are equal, ``none`` without values."""
+    """Return the smallest and the largest of ``values`` as text, one number if they are equal, ``none`` if empty."""
     if not values.size:
         return "none"
     low, high = float(values.min()), float(values.max())
@@ -482,7 +486,7 @@ def _combined(change: Callable[..., NDArray[Any]], *parts: Vehicles) -> Vehicles
 
     ``change`` is called with one array per entry of ``parts``. ``change`` returns one array, with selected or joined
     rows. If no entry of ``parts`` has a V2X channel, ``latency_s``, ``own_latency_s`` and ``known_from_s`` of the
-    result share memory, as in ``at_once``.
+    result share memory, as in the result of ``at_once``.
     """
     at_once = all(part._is_view for part in parts)
     columns = [
@@ -566,7 +570,7 @@ def make_worlds(
         braking_capacity_mps2: largest deceleration, m/s2, broadcast to [n, N].
         driving_capacity_mps2: largest forward acceleration, m/s2, broadcast to [n, N].
         latency_s: time before which commands have no effect, s, broadcast to [n, N].
-        mass_t: mass, t, broadcast to [n, N].
+        mass_t: masses of the vehicles in tonnes (t), broadcast to [n, N].
         restitution: coefficient of restitution of every impact, in [0, 1], broadcast to [n].
         speed_limit_mps: speed up to which a vehicle drives, m/s, broadcast to [n, N].
         brake_rate_mps3: rate at which a vehicle's acceleration falls to a lower command, m/s3, broadcast to [n, N];

@@ -23,8 +23,8 @@ _CAPACITY = 64
 def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) -> int:
     """Write the state at the start of each interval of constant jerk into ``rows``; return the number of intervals.
 
-    The state consists of time, gaps, speeds, accelerations and jerks. If ``rows`` is full, further intervals are only
-    counted. If a contact was missed, the returned number of intervals is negative.
+    The state consists of time, gaps, speeds, accelerations and jerks. If ``rows`` is full, further intervals are
+    counted but not written. If a contact was missed, the returned number of intervals is negative.
 
     Args:
         table: one world in the layout of ``physics.rows``; updated.

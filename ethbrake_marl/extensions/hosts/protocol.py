@@ -205,14 +205,14 @@ def drive_host(host: Host, agent: Driver, scenario: str | Path | Scenario, world
 
 
 class _Grid:
-    """Decision times of vehicles that always decide together: in each world a first time, then every time step.
+    """Decision times of vehicles that always decide together: in each world at ``first_s``, then once per time step.
 
     For each world, the attribute ``made`` [n] is the number of decisions so far, and ``all`` [n] is the number of
     decisions from the alert to the horizon.
 
     Args:
         first_s: [n] time of the first decision in each world (s).
-        vehicles: indices (0 = front) of the vehicles that decide together.
+        vehicles: indices (0 = front) of the vehicles that decide at these times.
         scenario: scenario that provides the time step and the horizon.
 
     """
@@ -228,7 +228,7 @@ class _Grid:
         return np.where(self.made < self.all, self.decisions.at(self.made), self.horizon_s)
 
     def is_due(self, time_s: Floats) -> Bools:
-        """Return for each world, [n] bool, whether a decision is due: ``time_s`` has reached the time ``next_s``."""
+        """Return for each world whether a decision is due, [n] bool: whether ``time_s`` has reached ``next_s``."""
         return self.next_s <= time_s + ROUNDING * self.decisions.time_step_s
 
 
@@ -308,7 +308,7 @@ class _Run:
         Args:
             worlds: present state of the n worlds.
             due: [n] whether a decision is due in each world.
-            idle: indices of the worlds in which no decision is due and the agents' memories do not change.
+            idle: indices of the worlds in which no decision is due; in these worlds the agents' memories do not change.
 
         """
         engine = self.engine
@@ -384,9 +384,9 @@ class _Run:
         Args:
             before_m: [n, P] gaps before the step (m).
             begin: [n, N] speeds at the start of the step (m/s).
-            step_s: [n] length of the step (s).
+            step_s: [n] length of the host's step in each world (s).
 
-        Returns the impacts. The attribute ``speeds_mps`` of this object gets the speeds after the impacts.
+        Returns the impacts. The function writes the speeds after the impacts into ``self.speeds_mps``.
 
         """
         v, gaps, speeds, speeds_seen = self.alert.vehicles, self.gaps_m, self.speeds_mps, self.speeds_mps.copy()
@@ -495,10 +495,10 @@ class _Motion:
        differs from the command by at most ``OFF_MPS2`` plus ``OFF_SHARE`` times the command.
 
     If the host does not report impacts, the rules assume that its vehicles pass through one another. If the host
-    reports impacts, vehicles in contact may push one another. For vehicles that may have been pushed, rule 1 allows
-    every speed that the commands of the whole line make possible, and after an impact every speed that the energy of
-    the line makes possible. For these vehicles, rules 2 and 3 use the reported state instead of the alert as their new
-    start.
+    reports impacts, the rules allow that vehicles in contact push one another. For vehicles that may have been pushed,
+    rule 1 allows every speed that the commands of the whole line make possible, and after an impact every speed that
+    the energy of the line makes possible. For these vehicles, rules 2 and 3 start again from the reported state instead
+    of the state at the alert.
 
     Args:
         alert: the worlds at the alert.
@@ -620,8 +620,8 @@ def _refused(
 ) -> tuple[int, str] | None:
     """Find the first element of ``values`` [n, k] that is outside its range, ``low`` to ``high`` (both [n, k]).
 
-    Returns the row of the element, and the result of ``describe(row, column, range as text)``, an error message.
-    Returns None if all elements are in their ranges.
+    Returns the row of this element, and the error message ``describe(row, column, range as text)``. Returns None if all
+    elements are in their ranges.
     """
     good = (low <= values) & (values <= high)
     if good.all():

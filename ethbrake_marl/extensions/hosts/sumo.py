@@ -1,4 +1,7 @@
-"""Use the traffic simulator SUMO as a host. Each world is a straight road of one simulation in this process."""
+"""Use the traffic simulator SUMO as a host.
+
+All worlds run in one SUMO simulation in this process, each world on a straight road of its own.
+"""
 
 from __future__ import annotations
 

@@ -108,11 +108,11 @@ class Chains:
         """Return a dictionary from a vehicle's id to the vehicle that follows it at one moment; count faulty data.
 
         Args:
-            there: states of all vehicles at the moment.
-            by_id: dictionary from the id of a vehicle to its state at the moment. If a vehicle is recorded twice, the
+            there: states of all vehicles at this moment.
+            by_id: dictionary from the id of a vehicle to its state at this moment. If a vehicle is recorded twice, the
                 dictionary contains the state that is recorded first.
-            row: whether chains are formed at the moment. If ``row`` is False, the function counts neither the data that
-                it leaves out nor faulty data.
+            row: whether chains are formed at this moment. If ``row`` is False, the function counts neither the data
+                that it leaves out nor faulty data.
 
         """
         behind, in_lane = dict[float, Link](), dict[float, float]()  # in_lane: vehicle -> vehicle ahead in the lane
@@ -159,7 +159,7 @@ class Chains:
         by_id_before: dict[float, Any],
         passed_s: float,
     ) -> None:
-        """Add the changes of gaps and positions between two moments to running sums, which ``cut`` checks at the end.
+        """Add the changes of gaps and positions between two moments to sums that ``cut`` checks after the last chain.
 
         Args:
             behind: result of ``_links`` at the later moment: the follower of each vehicle.

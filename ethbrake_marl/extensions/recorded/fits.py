@@ -53,7 +53,7 @@ def fit_rows(rows: Floats, draw: DataDraw) -> dict[str, Any]:
 
 
 def _fit(values: Floats, draw: DataDraw) -> Any:
-    """Fit a distribution to ``values`` [k], limited to their range; return it in the form of a scenario file.
+    """Return a distribution fitted to ``values`` [k], limited to their range, in the form of a scenario file.
 
     ``draw`` is the kind of distribution: ``normal``, ``lognormal`` or ``quantiles``.
     """

@@ -101,9 +101,9 @@ def _search(folder: Path, entry: Format) -> tuple[dict[str, Path], list[str], li
     """Find the files of a format in a folder and its subfolders by their names.
 
     Returns a dictionary from printable paths to files, the errors for subfolders that cannot be read, and the names of
-    files that are left out because they repeat another file. Copies of a file and links to a file repeat this file. A
-    text file without a header repeats a CSV file of the same name in the same folder. Files and folders whose names
-    begin with a dot are ignored, and links to folders are not followed.
+    files that are left out because they repeat another file. Copies of a file and links to a file are left out as
+    repetitions. A text file without a header is left out as a repetition if its folder contains a CSV file of the same
+    name. Files and folders whose names begin with a dot are ignored, and links to folders are not followed.
     """
     if folder.is_file():
         return {plain_text(folder.name): folder}, [], []

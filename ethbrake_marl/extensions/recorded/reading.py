@@ -195,7 +195,7 @@ def _text(text: TextIOWrapper, file: Path, entry: Format, columns: Sequence[str]
 
 
 def _rows(file: Path, lines: Iterator[tuple[int, str]], separator: str, streets: Sequence[str]) -> Iterator[_Row]:
-    """Yield the line number and the cells of each line that is not blank and contains none of the texts ``streets``."""
+    """Yield line number and cells of each line that is not blank and contains none of the texts in ``streets``."""
     elsewhere = seen = 0
     for number, line in lines:
         if streets and any(street in line for street in streets):

@@ -104,7 +104,10 @@ def keep_states(
 
 
 def moments(store: sqlite3.Connection) -> Iterator[tuple[float, list[Any]]]:
-    """Yield (tick, states) for each moment in the table ``state``, in order of time; states have the file's order."""
+    """Yield (time, states) for each moment in the table ``state``, in order of time.
+
+    The time is in units of ``every_s`` (see ``keep_states``). The states of a moment have the order of the file.
+    """
     for tick, rows in groupby(store.execute("SELECT * FROM state ORDER BY tick, line"), itemgetter(0)):
         yield tick, [State(*row) for row in rows]
 
@@ -139,7 +142,7 @@ def _states(piece: Piece, entry: Format, ticks: Floats, turned: Floats) -> Float
     Args:
         piece: consecutive rows of the file, as numbers.
         entry: format of the file.
-        ticks: [rows] time of each row, in units of the time between two moments at which chains are formed.
+        ticks: [rows] time of each row since the first row of the file, in units of ``every_s`` (see ``keep_states``).
         turned: [vehicles, 2] id and driving direction of each vehicle, sorted by id; used for highD only.
 
     """
