@@ -246,8 +246,9 @@ def policy_agent(
         ignore_wrappers: whether to accept a model if wrappers of its training environment may have changed observations
             or actions, if its actions have bounds other than -1 and 1, or if its ``VecNormalize`` statistics are
             missing.
-        actions: number of discrete actions, for a policy that returns the index of an action. None: the number in the
-            model's training environment, if known; otherwise the policy returns actions in [-1, 1].
+        actions: number of discrete actions, for a policy that returns the index of an action. None: the number of
+            discrete actions in the model's training environment, if known; otherwise the policy returns actions in [-1,
+            1].
 
     Raises ``InvalidInput`` if ``policy`` is of another kind, if it was trained with another number of features than the
     observation has, or if wrappers of its training environment may have changed observations or actions.
@@ -418,7 +419,7 @@ class PolicyAgent:
         return to_array(action), checked_memory(state, len(rows))
 
     def _find_failing(self, seen: Observations, state: State) -> int | None:
-        """Return the index of a world for which the policy fails even without the other worlds; None: no such world.
+        """Return the index of a world for which the policy fails when called for this world alone; None: no such world.
 
         ``seen`` [n, F] are the observations in all n worlds; ``state`` is the policy's memory for all n worlds.
         """

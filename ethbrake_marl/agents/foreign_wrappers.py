@@ -122,8 +122,8 @@ def _was_normalised(model: Any) -> bool:
     """Return whether the data saved with a Stable-Baselines3 model show that training normalised the observations.
 
     The result is True if the last saved observation lies outside the observation space, or if the model also saved this
-    observation as it was before normalisation. Models of off-policy algorithms always save the observation before
-    normalisation; for these models only the observation space is checked.
+    observation as it was before normalisation. The models of off-policy algorithms always save the observation as it
+    was before normalisation, so for these models only the observation space is checked.
     """
     if getattr(model, "_last_original_obs", None) is not None and not hasattr(model, "replay_buffer"):
         return True

@@ -27,7 +27,7 @@ AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping is the cont
 
 
 def feature_box(features: Sequence[Feature]) -> Box[np.float32]:
-    """Return the observation space for ``features``: a float32 box [F], bounded by the range of each feature."""
+    """Return the observation space for ``features``: a float32 box [F] with the bounds of each feature."""
     low, high = (np.array([getattr(f, side) for f in features], np.float32) for side in ("low", "high"))
     return Box(low, high, dtype=np.float32)
 

@@ -138,7 +138,7 @@ class Trace:
         engine.watch(self, () if alert is None else self.begun((), alert, np.arange(alert.n)))
 
     def begun(self, memory: Memory, alert: Worlds, rows: Ints) -> Memory:
-        """Return the recorded motions after new episodes have started in the worlds with the indices ``rows``.
+        """Return the recorded motions, updated for new episodes that have started in the worlds ``rows``.
 
         Args:
             memory: the motions recorded before this call.

@@ -110,8 +110,8 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         max_episode_steps: number of steps after which an episode is truncated; None: an episode is truncated at the
             horizon only.
         actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete, and an action is
-            an index from 0 to K - 1. The indices stand for K evenly spaced numbers from -1 (full braking capacity) to 1
-            (full driving capacity).
+            an index from 0 to K - 1. Index k selects number k of K evenly spaced numbers from -1 (full braking
+            capacity) to 1 (full driving capacity), counted from 0.
         reward_vector: None: each world has a number as its reward, so that rewards are [n]. ``vehicles``: rewards are
             [n, N], with minus the harm that each vehicle bears in the step. A list of K components: rewards are [n, K]
             (see docs/environments.md).

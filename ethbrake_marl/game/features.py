@@ -416,9 +416,9 @@ def side_of(name: str) -> tuple[str, int] | None:
 
 
 def registered_in(names: Iterable[str]) -> dict[str, RegisteredFeature]:
-    """Return a dictionary of those features in ``names`` (full names) that have a function of their own.
+    """Return those features in ``names`` (full names) that have a function of their own, as a dictionary.
 
-    A key of this dictionary is a name without the neighbour: the key of ``front_1.age`` is ``age``.
+    A key of the dictionary does not contain the neighbour: for ``front_1.age`` the key is ``age``.
     """
     own = [name.partition(".")[2] or name for name in names]
     return {name: FEATURES[name] for name in own if name in FEATURES}

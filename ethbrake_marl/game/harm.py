@@ -84,7 +84,7 @@ class Ledger:
         return replace(self, **{name: getattr(self, name) - getattr(before, name) for name in names})
 
     def take(self, rows: Ints | Bools | Sequence[int]) -> Ledger:
-        """Return the ledger of only the worlds that ``rows`` selects (indices, or a mask [n])."""
+        """Return a ledger that contains only the worlds selected by ``rows`` (indices, or a mask [n])."""
         return Ledger(*(getattr(self, column.name)[rows] for column in fields(self)))
 
     def pair_harm(self, harm_count: HarmCount) -> Floats:

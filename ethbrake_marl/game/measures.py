@@ -9,8 +9,8 @@ step     ``StepOutcome``     value of the measure in the step            sum of 
 impacts  ``EpisodeImpacts``  change of the measure during the step       value for all impacts of the episode
 =======  ==================  ==========================================  ====================================
 
-The sum of a reward term over an episode equals the number that an evaluation shows, minus the value that the measure
-already had before the first decision.
+For each measure, the sum of its reward terms over an episode equals the number that an evaluation shows minus the value
+of the measure before the first decision.
 """
 
 from __future__ import annotations
@@ -52,7 +52,8 @@ class NamedMeasure:
     def built_in(self, step: StepOutcome, params: Any) -> Floats:
         """Return the value of a built-in measure in one step, [n] or [n, N].
 
-        ``params`` is the reward. The measure's function gets the fields of ``params`` that ``settings`` names.
+        ``params`` is the reward. ``settings`` names the fields of ``params`` that the measure's function needs as
+        arguments.
         """
         assert self.function is not None
         value: Floats = self.function(step, *(getattr(params, name) for name in self.settings))

@@ -108,7 +108,7 @@ class ObservationSpec:
 
     @property
     def whole(self) -> tuple[Feature, ...]:
-        """All features of the built-in groups that the observation uses, in order; it observes some of these."""
+        """All features, in order, of the built-in groups from which the features of this observation are selected."""
         groups = [("own", GROUPS.own), *((prefix, GROUPS.neighbour) for prefix, _ in self.sides)]
         groups += [("role", GROUPS.role)] if self.role else []
         groups += [("obstacle", GROUPS.obstacle)] if self.obstacle else []
@@ -136,7 +136,7 @@ class ObservationSpec:
         return _plan(self, tuple(registered_in(self.chosen).items()) if self.chosen else ())
 
     def at_steps_of(self, time_step_s: float) -> ObservationSpec:
-        """Return a copy with this ``time_step_s`` (s), if the specification needs a time step and has none so far."""
+        """Return a copy with the time step ``time_step_s`` (s) if this specification needs a time step and has none."""
         return replace(self, time_step_s=time_step_s) if self.contact and self.time_step_s is None else self
 
 
@@ -173,7 +173,7 @@ def choose_observation(listed: Observation, time_step_s: float | None = None) ->
 
 
 def _reach(names: Sequence[str]) -> tuple[int, int, bool, bool, bool]:
-    """Return the fields front, rear, role, obstacle and contact of the observation whose features are ``names``."""
+    """Return the ``ObservationSpec`` fields front, rear, role, obstacle and contact for the features ``names``."""
     sides = [side for name in names if (side := side_of(name)) is not None]
     front, rear = (max((k for at, k in sides if at == wanted), default=0) for wanted in ("front", "rear"))
     groups = {name.partition(".")[0] for name in names}
