@@ -69,7 +69,7 @@ class Watch(Protocol):
     """Observer, whose method ``see`` is called after every step of a batch of episodes."""
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Receive the motion of all n worlds in one step. The method must not change the arguments.
+        """Receive how the vehicles of all n worlds have moved during one time interval.
 
         The first step lasts from the alert to the first decision. If a script decides in the middle of a step, the step
         consists of several intervals, and this method is called once for each interval.

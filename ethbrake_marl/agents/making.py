@@ -149,7 +149,7 @@ def _make(entry: Entry, argument: str | None, settings: AgentSettings, *inside: 
     Args:
         entry: the registry entry of the agent or wrapper to make.
         argument: text after the colon in the specification; None if there is no colon.
-        settings: settings, which are passed to the factory.
+        settings: settings for the factory (the function that makes the agent).
         inside: for a shield or a search: the agent or team to wrap; for an agent: nothing.
 
     """

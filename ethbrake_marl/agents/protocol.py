@@ -262,7 +262,7 @@ class Shielding(Protocol):
     def guard(self, engine: Engine, policies: Mapping[int, Agent]) -> Guard:
         """Return the guard: the object that checks commands in ``engine`` for the shield.
 
-        ``policies`` maps the index of each learner to the agent that proposes its commands.
+        ``policies`` maps the index of each learner to the agent that proposes the learner's commands.
         """
 
 

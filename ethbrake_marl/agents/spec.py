@@ -97,7 +97,7 @@ def split_names(text: str, is_one: Callable[[str], bool] = os.path.lexists) -> l
 
 
 def split_specs(text: str) -> list[str]:
-    """Split a comma-separated list of agent specifications, such as ``coast,ppo``, but not existing paths."""
+    """Split a list of agent specifications, such as ``coast,ppo``, at each comma outside existing paths."""
     return split_names(text, _is_one_spec)
 
 

@@ -145,7 +145,7 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
         reward: reward of a step: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams``
             object.
         observation: features that every vehicle observes, or a mapping from each vehicle's name to its features; None:
-            the features that belong to the scenario.
+            the features that the scenario declares or, if it declares none, default features.
         agents: which vehicles are agents: ``all`` vehicles or only the ``learners``. Choose ``learners`` for training
             libraries that train every agent.
         max_cycles: number of steps after which an episode is truncated; None: an episode is truncated at the horizon

@@ -1,4 +1,4 @@
-"""Registration of the environments in Gymnasium and PettingZoo. The modules of the environments are not imported."""
+"""Registers the environments in Gymnasium and PettingZoo. This module does not import these environments."""
 
 from __future__ import annotations
 

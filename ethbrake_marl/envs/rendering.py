@@ -34,7 +34,11 @@ LATE_S = 3.0  # longest latency that is considered when the length of road is ch
 
 
 class View(NamedTuple):
-    """The part of the road that a picture shows. Positions are distances (m) from Vehicle 1's front at the alert."""
+    """The part of the road that a picture shows.
+
+    Positions are distances (m) from the place of Vehicle 1's front bumper at the alert, positive in the direction of
+    travel.
+    """
 
     left_m: float  # position of the left end (m)
     right_m: float  # position of the right end (m)

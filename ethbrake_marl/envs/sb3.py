@@ -60,8 +60,8 @@ def make_sb3_vec_env(
         learners: vehicles that learn, by name (``vehicle_2``) or index (0 = front); None: the learners of the scenario.
         reward: reward of a step: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams``
             object.
-        observation: features that the learners observe; None: the features that belong to the scenario
-            (``observation_for``).
+        observation: features that the learners observe; None: the features that the scenario declares or, if it
+            declares none, default features (``observation_for``).
         horizon_is_end: True: an episode that reaches the horizon is reported as ended, not as truncated. Therefore the
             algorithm does not add an estimate of the return after the horizon. An estimate of the return after the
             horizon could grow without limit, because harm after the horizon is not counted (see docs/train.md). False:
@@ -259,7 +259,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set the attribute ``attr_name`` of this environment. Raises ``InvalidInput`` if ``indices`` omits a row."""
+        """Set the attribute ``attr_name`` to ``value``. Raises ``InvalidInput`` if ``indices`` omits a row."""
         self._refuse_some_rows("set_attr", indices)
         setattr(self, attr_name, value)
 

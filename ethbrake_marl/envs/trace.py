@@ -36,7 +36,7 @@ class Motion:
 
     The motion that was recorded last is *open*: its end is not yet known. ``closed`` returns a copy of the motion that
     ends with the engine's present state and contains the ``parts`` that ``scenes`` needs. All positions are distances
-    (m) from Vehicle 1's front at the alert.
+    (m) from the place of Vehicle 1's front bumper at the alert, positive in the direction of travel.
     """
 
     start: Worlds  # the n worlds at the start

@@ -113,8 +113,8 @@ def command_of(action: float, braking: float, driving: float) -> float:
 def action_of(command: float, braking: float, driving: float) -> float:
     """Return the action for a command (m/s2), clipped to [-1, 1]; 0 if the needed capacity is 0.
 
-    The needed capacity is the braking capacity for a command below 0, otherwise the driving capacity. ``braking`` is the
-    largest deceleration of the vehicle, and ``driving`` its largest forward acceleration (m/s2).
+    The needed capacity is the braking capacity for a command below 0, otherwise the driving capacity. ``braking`` is
+    the largest deceleration of the vehicle, and ``driving`` its largest forward acceleration (m/s2).
     """
     capacity = braking if command < 0.0 else driving
     return min(max(command / capacity, -1.0), 1.0) if capacity > 0.0 else 0.0

@@ -48,7 +48,7 @@ def observe_contacts(
     state: Floats, params: Floats, observers: Ints, time_step: float, commands: Ints, features: Floats,
     out: NDArray[np.float32], failed: Bools,
 ) -> None:  # fmt: skip
-    """Write the contact features of each observer into ``out``, and mark worlds whose forecast failed in ``failed``.
+    """Write the contact features of each observer into ``out``; set ``failed`` for worlds in which a forecast failed.
 
     Args:
         state: time, motion and harm of the worlds, one row per world, [n, S] (layout: ``physics.columns``).

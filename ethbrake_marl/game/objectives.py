@@ -316,8 +316,9 @@ def _social(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
 def _social_weights(angle_deg: float) -> tuple[float, float]:
     """Return the weight of own harm, cos(angle), and the weight of the other vehicles' harm, sin(angle).
 
-    At 90 degrees the weights are exactly 0 and 1. The power series of cosine and sine are summed in exact fractions and
-    rounded once, because results of the C library differ between processors in the last bits.
+    At 90 degrees the weight of own harm is exactly 0, and the weight of the other vehicles' harm is exactly 1. The
+    power series of cosine and sine are summed in exact fractions and rounded once, because results of the C library
+    differ between processors in the last bits.
     """
     if angle_deg == 90.0:
         return 0.0, 1.0

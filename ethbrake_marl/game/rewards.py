@@ -143,8 +143,8 @@ class RewardParams(FileModel):
         """Raise an error if weights are given without the weight of harm, or if an objective is given although
         harm has weight 0.
 
-        If the weight of harm is not given, it is 1. If this were no error, a user who gives only the weights of other terms
-        would get a reward that also includes harm.
+        If the weight of harm is not given, it is 1. If this were no error, a user who gives only the weights of other
+        terms would get a reward that also includes harm.
         """
         names = {*self.model_fields_set, *(self.terms if "terms" in self.model_fields_set else ())}
         beside = [name for name, weight in self.weights.items() if weight != 0.0 and name in names]

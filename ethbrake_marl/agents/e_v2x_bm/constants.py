@@ -57,7 +57,7 @@ def make_line(
     mass: Floats, limit: Floats, in_force: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats,
     time: float, restitution: float, horizon: float, vehicle: int, total: bool,
 ) -> Line:  # fmt: skip
-    """Return one world of N vehicles as tables. Call ``share_start`` next.
+    """Return the tables of one world of N vehicles. Call ``share_start`` next.
 
     Args:
         gap: gap of each pair, [N - 1] m, bumper to bumper.

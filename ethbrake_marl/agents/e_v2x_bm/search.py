@@ -122,8 +122,8 @@ def look_evenly(line: Line, room: Room, breakpoints: Floats, capacity: float) ->
     """Step 1: simulate evenly spaced decelerations and the ``breakpoints`` [CANDIDATES] (m/s2) in the world ``line``.
 
     The samples of the evenly spaced decelerations (the *grid*) are written to ``room.one``. The samples of grid and
-    breakpoints together are written to ``room.two``, sorted by deceleration. The grid ends at ``capacity`` (m/s2).
-    Returns ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed.
+    breakpoints together are written to ``room.two``, sorted by deceleration. The largest deceleration of the grid is
+    ``capacity`` (m/s2). Returns ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed.
     """
     grid, new = room.one, room.few
     for k in range(GRID):
