@@ -230,11 +230,11 @@ def policy_agent(
             - a torch module, called without gradients;
             - an ONNX session, or the path of an ``.onnx`` file.
         name: name of the agent in tables and messages; None: the name of the function or class.
-        scenario: scenario (or its name) in which the policy was trained; it determines what the policy observes. None:
-            unknown.
+        scenario: scenario (or its name) in which the policy was trained; the scenario determines what the policy
+            observes. None: unknown.
         observation: features that the policy observes, instead of the scenario's observation (see
-            ``choose_observation``). None: the scenario's observation. If ``scenario`` is None as well: the observation
-            of the model's training environment or of the policy, if known; otherwise the default observation.
+            ``choose_observation``). None: the scenario's observation. If ``scenario`` is also None: the observation of
+            the model's training environment or of the policy, if known; otherwise the default observation.
         initial_state: function that returns the policy's memory at the start of n episodes: an array with one row per
             world, or tuples and mappings of such arrays. None: the policy has no memory, or is a model with
             ``predict``.

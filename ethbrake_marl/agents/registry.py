@@ -88,7 +88,7 @@ class Entry:
 
 
 def around_entry(each: str) -> Entry:
-    """Return the registry entry of the shield or search that the text ``each`` after the ``+`` selects."""
+    """Return the registry entry of the shield or search in ``each``, a text that stands after a ``+``."""
     return SHIELDS[each.partition(":")[0]]
 
 

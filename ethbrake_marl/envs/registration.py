@@ -1,4 +1,4 @@
-"""Registers the environments in Gymnasium and PettingZoo. This module does not import these environments."""
+"""Register the environments in Gymnasium and PettingZoo, without importing the modules of the environments."""
 
 from __future__ import annotations
 

@@ -56,8 +56,8 @@ def observe_contacts(
         observers: indices of the observing vehicles (0 = front).
         time_step: time between two decisions of a vehicle, s.
         commands: the observer's own commands for which to forecast, as indices into CONTACT_COMMANDS.
-        features: scaling of the features: three rows (1 / scale, low, high) with one column per feature. There are 30
-            features, or 42 with the group contact_far.
+        features: scaling of the features: three rows (``1 / scale``, ``low``, ``high``) with one column per feature.
+            There are 30 features, or 42 with the group contact_far.
         out: array that receives the result, [n, observers, features]. Features of commands that are not in ``commands``
             do not change.
         failed: mask [n] that is set to True for each world in which a check of the physics failed.
@@ -164,7 +164,7 @@ def _write_features(
     at the end of a time step belongs to this time step, as in the engine.
 
     Args:
-        table: one world after the forecast, one column per vehicle (layout: ``physics.rows``).
+        table: one world at the end of the forecast, one column per vehicle (layout: ``physics.rows``).
         found: forecast of the next impact of each pair, as ``forecast_contacts`` returns it.
         own: column of the observing vehicle in ``table``.
         first: first column, in ``table``, of a vehicle that the observer knows.

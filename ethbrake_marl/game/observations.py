@@ -338,7 +338,8 @@ def _plan(spec: ObservationSpec, registered: tuple[tuple[str, RegisteredFeature]
 
 
 def _scales(features: Sequence[Feature]) -> Floats:
-    """Return the scaling of the features, [3, F]: the rows 1 / scale, low and high, with one column per feature."""
+    """Return the scaling of the features, [3, F]: the rows ``1 / scale``, ``low`` and ``high``, with a column per
+    feature."""
     return np.array([[1.0 / f.scale for f in features], [f.low for f in features], [f.high for f in features]])
 
 
@@ -358,7 +359,8 @@ def _observe_rows(
         offsets: index of each observed neighbour minus index of the observer; -1 is the next vehicle ahead.
         role: whether vehicles observe their own place in the line (``GROUPS.role``).
         with_obstacle: whether vehicles observe the obstacle ahead (``GROUPS.obstacle``).
-        features: scaling of the features, [3, F]: the rows 1 / scale, low and high, with one column per feature.
+        features: scaling of the features, [3, F]: the rows ``1 / scale``, ``low`` and ``high``, with one column per
+            feature.
         out: array that receives the result, [n, observers, F].
 
     """

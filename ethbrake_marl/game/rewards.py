@@ -66,8 +66,8 @@ class RewardParams(FileModel):
 
     Args:
         harm, collision, risk, jerk, terminal, shaping: weights of the built-in terms, at least 0. The docstring of the
-            module ``game.rewards`` shows the formula of each term. If you give a weight for any other term, you must
-            also give the weight of harm.
+            module ``game.rewards`` shows the formula of each term. If you give a weight for any term other than harm,
+            you must also give the weight of harm.
         harm_count: ``first``: the term harm uses first-impact harm; ``total``: the term harm uses total harm.
         objective: objective of all vehicles, or a list with one objective per vehicle; None: the objective of the
             scenario.
@@ -235,9 +235,9 @@ class RewardParams(FileModel):
         """Return the potential of the shaping term, [n] m2/s2: minus the least harm with constant braking from now on.
 
         For the potential, each learner is assumed to brake with a constant deceleration, and all other vehicles fully.
-        Nine decelerations are tried, from 0 to the learner's braking capacity in equal steps. A single learner takes
-        the deceleration with the least harm. Several learners begin with full braking and choose their decelerations
-        one after the other, front to rear, in two rounds; all learners get the same potential.
+        For each learner nine decelerations are tried, from 0 to the learner's braking capacity in equal steps. A single
+        learner takes the deceleration with the least harm. Several learners begin with full braking and choose their
+        decelerations one after the other, front to rear, in two rounds; all learners get the same potential.
 
         Args:
             worlds: n worlds of N vehicles.

@@ -5,7 +5,7 @@ methods save computing time:
 
 - The motion until the vehicle's command takes effect is the same for all decelerations, so it is simulated only once.
 - A simulation ends as soon as no pair can have another impact (``will_stay_apart``).
-- A simulation ends as soon as its harm reaches a given number, because the harm never decreases again.
+- A simulation ends as soon as its harm reaches a given number, because the harm can only grow.
 """
 
 from __future__ import annotations

@@ -181,8 +181,8 @@ def contacts_of_worlds(gaps: Floats, speeds: Floats, deceleration: Floats, onset
     """Write to ``out`` [n, P] the squared closing speed (m2/s2) at each pair's first impact, or 0 without an impact.
 
     It is assumed that impacts change no speed, so that pairs do not influence each other. The worlds have the gaps
-    ``gaps`` [n, P] m and the speeds ``speeds`` [n, N] m/s. In world k, vehicle j brakes with the constant
-    ``deceleration[k, j]`` m/s2 from ``onset[k, j]`` seconds on.
+    ``gaps`` [n, P] m and the speeds ``speeds`` [n, N] m/s. In world k, vehicle j coasts for ``onset[k, j]`` seconds and
+    then brakes with the constant ``deceleration[k, j]`` m/s2.
     """
     for k in range(gaps.shape[0]):
         for p in range(gaps.shape[1]):

@@ -259,8 +259,8 @@ def narrow_minima(line: Line, room: Room) -> int:
 def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, to: int) -> int:
     """Narrow an interval around a local minimum of the harm until it is at most 1e-9 m/s2 wide.
 
-    Each round divides the interval on each side of the minimum into three parts. Returns ``FLAG.DONE`` or, if a
-    simulation failed, the code of the physics check that failed.
+    Each round divides the interval on each side of the best deceleration so far into three parts. Returns ``FLAG.DONE``
+    or, if a simulation failed, the code of the physics check that failed.
 
     Args:
         line: the world.
