@@ -265,8 +265,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         self.engine.renew(np.flatnonzero(rows))
 
     def _final_infos(self, step: Step) -> dict[str, Any]:
-        """Return the infos ``final_obs`` and ``final_info`` of the episodes that ended in this step, each with its
-        mask."""
+        """Return the infos ``final_obs`` and ``final_info`` of the episodes that ended in this step, and their masks."""
         ended = step.ended
         observations = self.engine.observe(self.learner)
         final = np.full(self.num_envs, None, dtype=object)

@@ -338,8 +338,7 @@ def _plan(spec: ObservationSpec, registered: tuple[tuple[str, RegisteredFeature]
 
 
 def _scales(features: Sequence[Feature]) -> Floats:
-    """Return the scaling of the features, [3, F]: the rows ``1 / scale``, ``low`` and ``high``, with a column per
-    feature."""
+    """Return the scaling of the features, [3, F]: rows ``1 / scale``, ``low`` and ``high``; one column per feature."""
     return np.array([[1.0 / f.scale for f in features], [f.low for f in features], [f.high for f in features]])
 
 
