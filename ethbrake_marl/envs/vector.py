@@ -265,7 +265,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         self.engine.renew(np.flatnonzero(rows))
 
     def _final_infos(self, step: Step) -> dict[str, Any]:
-        """Return the infos ``final_obs`` and ``final_info`` of the episodes that ended in this step, and their masks."""
+        """Return the infos ``final_obs`` and ``final_info`` of the episodes that ended in this step, with masks."""
         ended = step.ended
         observations = self.engine.observe(self.learner)
         final = np.full(self.num_envs, None, dtype=object)

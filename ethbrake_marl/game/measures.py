@@ -136,8 +136,8 @@ def register_measure(name: str, function: MeasureFunction, *, unit: str = "1", b
     """Register a measure: rewards can give it a weight under ``name``, and later evaluations show it.
 
     An installed package registers a measure with an entry point of the group ``ethbrake_marl.measures``. The entry
-    point names the function, a ``Part`` that contains it, or a mapping from names to functions or parts. If a measure
-    comes from an entry point, evaluations show the measure only on request.
+    point names the function, a ``Part`` that contains it, or a mapping from names to functions or parts. Evaluations
+    show measures from entry points only on request.
 
     Registering the same measure again changes nothing. Raises ``AlreadyExists`` if the name belongs to another measure,
     and ``InvalidInput`` for invalid arguments, or if the function, called for two test worlds, fails or returns a wrong
