@@ -69,10 +69,11 @@ class Watch(Protocol):
     """Observer, whose method ``see`` is called after every step of a batch of episodes."""
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Receive the motion of all n worlds in one step. The method must not change the arguments.
+        """Receive how the vehicles of all n worlds have moved during one time interval.
 
         The first step lasts from the alert to the first decision. If a script decides in the middle of a step, the step
-        consists of several intervals, and this method is called once for each interval.
+        consists of several intervals, and this method is called once for each interval. The method must not change the
+        arguments.
 
         Args:
             before: the worlds at the start of the interval.
@@ -103,9 +104,9 @@ def episode_engine(
     """Return an engine in which agents drive whole episodes; call ``engine.step({})`` until all episodes have ended.
 
     The agents decide for the first time as soon as the latency of one controlled vehicle has elapsed, and then at every
-    time step, like learners. The agents' commands are applied without rounding. If the team has a shield, the agents
-    only propose commands, and the engine treats the controlled vehicles as learners. An agent that looks ahead knows
-    the scripts, and assumes that other controlled vehicles brake fully.
+    time step, like learners. The engine executes the agents' commands without rounding them. If the team has a shield,
+    the agents only propose commands, and the engine treats the controlled vehicles as learners. An agent that looks
+    ahead knows the scripts, and assumes that other controlled vehicles brake fully.
 
     Args:
         worlds: n worlds at the alert.
@@ -158,8 +159,8 @@ def drive(
         watched_by: observers (``Watch``), whose method ``see`` is called after every step.
         summed: names of reward terms to sum over each episode; the terms have the default settings of ``RewardParams``.
 
-    Raises ``PhysicsError``, which names the worlds, if the physics failed in some worlds; without these worlds, a new
-    call succeeds.
+    Raises ``PhysicsError``, which names the worlds, if the physics failed in some worlds; a new call without these
+    worlds succeeds.
 
     """
     reward: Reward = {"harm": 1.0} | dict.fromkeys(summed, 1.0) if summed else "harm"

@@ -230,11 +230,11 @@ def policy_agent(
             - a torch module, called without gradients;
             - an ONNX session, or the path of an ``.onnx`` file.
         name: name of the agent in tables and messages; None: the name of the function or class.
-        scenario: scenario (or its name) in which the policy was trained; it determines what the policy observes. None:
-            unknown.
+        scenario: scenario (or its name) in which the policy was trained; the scenario determines what the policy
+            observes. None: unknown.
         observation: features that the policy observes, instead of the scenario's observation (see
-            ``choose_observation``). None: the scenario's observation. If ``scenario`` is None as well: the observation
-            of the model's training environment or of the policy, if known; otherwise the default observation.
+            ``choose_observation``). None: the scenario's observation. If ``scenario`` is also None: the observation of
+            the model's training environment or of the policy, if known; otherwise the default observation.
         initial_state: function that returns the policy's memory at the start of n episodes: an array with one row per
             world, or tuples and mappings of such arrays. None: the policy has no memory, or is a model with
             ``predict``.
@@ -246,8 +246,9 @@ def policy_agent(
         ignore_wrappers: whether to accept a model if wrappers of its training environment may have changed observations
             or actions, if its actions have bounds other than -1 and 1, or if its ``VecNormalize`` statistics are
             missing.
-        actions: number of discrete actions, for a policy that returns the index of an action. None: the number in the
-            model's training environment, if known; otherwise the policy returns actions in [-1, 1].
+        actions: number of discrete actions, for a policy that returns the index of an action. None: the number of
+            discrete actions in the model's training environment, if known; otherwise the policy returns actions in [-1,
+            1].
 
     Raises ``InvalidInput`` if ``policy`` is of another kind, if it was trained with another number of features than the
     observation has, or if wrappers of its training environment may have changed observations or actions.
@@ -418,7 +419,7 @@ class PolicyAgent:
         return to_array(action), checked_memory(state, len(rows))
 
     def _find_failing(self, seen: Observations, state: State) -> int | None:
-        """Return the index of a world for which the policy fails even without the other worlds; None: no such world.
+        """Return the index of a world for which the policy fails when called for this world alone; None: no such world.
 
         ``seen`` [n, F] are the observations in all n worlds; ``state`` is the policy's memory for all n worlds.
         """

@@ -1,8 +1,8 @@
 """Find wrappers in a Stable-Baselines3 model's training environment that may change observations or actions.
 
-The agent made from the model does not apply these wrappers. Therefore the model would get other observations than in
-training, or its actions would have other effects. The checks run without importing Stable-Baselines3 or the libraries
-of the wrappers.
+The agent made from the model does not apply the wrappers of the training environment. Therefore the model would get
+other observations than in training, or its actions would have other effects. The checks run without importing
+Stable-Baselines3 or the libraries of the wrappers.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def training_environment(model: Any, name: str, *, ignore_wrappers: bool = False
     Args:
         model: any policy. The result is None if the policy was not trained in an environment of this package.
         name: name of the agent in error messages.
-        ignore_wrappers: whether to return the environment without checking its wrappers.
+        ignore_wrappers: True: the wrappers of the training environment are not checked.
 
     A model may be trained in several copies of an environment at the same time. Raises ``InvalidInput`` if a wrapper of
     any copy may change observations or actions, if the copies differ in their features or number of actions, or if the
@@ -122,8 +122,8 @@ def _was_normalised(model: Any) -> bool:
     """Return whether the data saved with a Stable-Baselines3 model show that training normalised the observations.
 
     The result is True if the last saved observation lies outside the observation space, or if the model also saved this
-    observation as it was before normalisation. Models of off-policy algorithms always save the observation before
-    normalisation; for these models only the observation space is checked.
+    observation as it was before normalisation. The models of off-policy algorithms always save the observation as it
+    was before normalisation, so for these models only the observation space is checked.
     """
     if getattr(model, "_last_original_obs", None) is not None and not hasattr(model, "replay_buffer"):
         return True

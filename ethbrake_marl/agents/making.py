@@ -44,8 +44,8 @@ def make_agent(
         horizon_s: time after the alert until which an agent looks ahead, s; None: the scenario's horizon, or 8 s.
         most_candidates: a search tries at most this number of plans; a small number makes a quick trial possible. None:
             no limit.
-        uncertainty: how far gaps, speeds and so on may differ from their stated values, for a shield that takes this
-            into account, for example ``"gaps_m=0.5"``.
+        uncertainty: how far gaps, speeds and other quantities may differ from their stated values, for example
+            ``"gaps_m=0.5"``; some shields require this argument.
         time_step_s: time between two decisions of agents that search or follow a control law, s; None: the scenario's
             time step, or 0.1 s.
 
@@ -147,9 +147,9 @@ def _make(entry: Entry, argument: str | None, settings: AgentSettings, *inside: 
     If a factory from outside this package raises an error, ``_make`` raises ``InvalidInput`` in its place.
 
     Args:
-        entry: the registry entry.
+        entry: the registry entry of the agent or wrapper to make.
         argument: text after the colon in the specification; None if there is no colon.
-        settings: settings, which are passed to the factory.
+        settings: settings for the factory (the function that makes the agent).
         inside: for a shield or a search: the agent or team to wrap; for an agent: nothing.
 
     """

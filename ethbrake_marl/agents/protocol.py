@@ -33,7 +33,7 @@ class Source(StrEnum):
 
 
 class Knowledge(tuple[Source, ...]):
-    """Sources of knowledge of one or several agents: different ``Source`` values, in the order of ``Source``."""
+    """Sources of knowledge of one or several agents: each ``Source`` at most once, in the order of ``Source``."""
 
     @classmethod
     def of(cls, *agents: object, also: Source | None = None) -> Knowledge:
@@ -73,7 +73,7 @@ class Knowledge(tuple[Source, ...]):
 
 @runtime_checkable
 class Agent(Script, Protocol):
-    """Interface of an agent: a ``Script`` with a name, which drives one vehicle in each of n worlds at the same time.
+    """Interface of an agent, which drives one vehicle in each of n worlds: the interface ``Script``, and a name.
 
     The attribute ``knows`` may state the agent's sources of knowledge (``Source``). For an agent without this
     attribute, tables show "not stated". An agent without a memory has one method, ``act(worlds, vehicle)``:
@@ -202,7 +202,7 @@ def policy_sha256(agent: object) -> str | None:
 
 
 class AgentAround(ByPolicy):
-    """Base class of agents that wrap another agent, which is the attribute ``policy``.
+    """Base class of agents that wrap another agent. The wrapped agent is the attribute ``policy``.
 
     By default ``begin`` and ``act`` call the wrapped agent; a subclass overrides one or both of them. The class
     attribute ``adds`` is a source of knowledge that the subclass uses in addition to the wrapped agent's sources, for
@@ -222,7 +222,7 @@ class AgentAround(ByPolicy):
 
     @property
     def knows(self) -> Knowledge:
-        """Sources of knowledge of the wrapped agent, and the source ``adds``."""
+        """Sources of knowledge of the wrapped agent, together with the source in the attribute ``adds``."""
         return Knowledge.of(self.policy, also=self.adds)
 
     @property
@@ -248,7 +248,7 @@ class AgentAround(ByPolicy):
 
 @runtime_checkable
 class Shielding(Protocol):
-    """Interface of an agent or team behind a shield. The method ``on`` chooses which vehicles are driven."""
+    """Interface of an agent or team behind a shield. The method ``on`` selects the vehicles that the team drives."""
 
     name: str  # name of the agent or team in tables and messages
 
@@ -262,7 +262,7 @@ class Shielding(Protocol):
     def guard(self, engine: Engine, policies: Mapping[int, Agent]) -> Guard:
         """Return the guard: the object that checks commands in ``engine`` for the shield.
 
-        ``policies`` maps the index of each learner to the agent that proposes its commands.
+        ``policies`` maps the index of each learner to the agent that proposes the learner's commands.
         """
 
 

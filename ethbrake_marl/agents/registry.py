@@ -38,7 +38,7 @@ class Entry:
 
     @property
     def is_ours(self) -> bool:
-        """Whether the agent is part of this package. Errors in other agents are reported with the agent's name."""
+        """Whether the agent is part of this package. If not, its errors are reported with the name of the agent."""
         is_from_file = ":" in self.name
         return str(getattr(self.make, "__module__", "")).startswith("ethbrake_marl.") and not is_from_file
 
@@ -46,8 +46,8 @@ class Entry:
     def whole_form(self) -> str:
         """``form`` followed by each registered variant in brackets, for example ``e_v2x_bm[:pairwise][:estimated]``.
 
-        A variant, such as ``:estimated``, is the last word of a specification. The variant selects another function
-        that makes the agent or wrapper.
+        A variant, such as ``:estimated``, is the last word of a specification. Each variant has a function of its own,
+        which makes the agent or wrapper.
         """
         return self.form + "".join(f"[:{variant}]" for variant in variants_of(self.name))
 
@@ -55,7 +55,8 @@ class Entry:
     def words(self) -> tuple[str, ...]:
         """All texts that can follow ``+`` to select this wrapper, for example ``("step", "step:estimated")``.
 
-        If ``form`` does not list every allowed argument, the texts with the unlisted arguments are missing.
+        If ``form`` contains ``[:ARGUMENT]``, any argument is allowed, and the result contains no text for each single
+        argument.
         """
         name, *options = re.findall(r"[^\[\]+]+", self.whole_form)
         words = [name]
@@ -87,7 +88,7 @@ class Entry:
 
 
 def around_entry(each: str) -> Entry:
-    """Return the registry entry of the shield or search whose text after the ``+`` is ``each``."""
+    """Return the registry entry of the shield or search in ``each``, a text that stands after a ``+``."""
     return SHIELDS[each.partition(":")[0]]
 
 
@@ -141,7 +142,7 @@ def shield_forms() -> tuple[str, ...]:
 
 
 def around_one_vehicle() -> list[str]:
-    """Return the names of the searches, then of the shields, that cannot wrap a team."""
+    """Return the names of the searches and shields that cannot wrap a team, searches first."""
     return [entry.name for inner in (True, False) for entry in SHIELDS.usable().values()
             if entry.inner is inner and not entry.teams]  # fmt: skip
 
@@ -159,8 +160,8 @@ def shield_modes() -> dict[str, Any]:
 def variants_of(name: str) -> tuple[str, ...]:
     """Return the variants of the agent or shield called ``name``, for example ``("estimated",)``.
 
-    In a specification the variant is the last word, as in ``episode:pairwise:estimated``. The variant selects another
-    function that makes the agent or shield.
+    In a specification the variant is the last word, as in ``episode:pairwise:estimated``. Each variant has a function
+    of its own, which makes the agent or shield.
     """
     keys = (key.rpartition(".") for key in VARIANTS)
     return tuple(variant for of, _, variant in keys if of == name)
@@ -297,7 +298,7 @@ def register_variant(key: str, make: Factory | Wrapper, *, about: str = "a varia
     Args:
         key: ``name.variant``; for example, ``step.mine`` registers ``step:mine``, a variant of the shield ``step``.
         make: function that is called in place of the factory or wrapper ``name``, with the same arguments. The
-            ``argument`` that this function receives does not contain the name of the variant.
+            ``argument`` that the function ``make`` receives does not contain the name of the variant.
         about: description in one line, which ``ethbrake agent list`` shows.
 
     Raises ``AlreadyExists`` if another variant is registered under ``key``.

@@ -97,7 +97,7 @@ def split_names(text: str, is_one: Callable[[str], bool] = os.path.lexists) -> l
 
 
 def split_specs(text: str) -> list[str]:
-    """Split a comma-separated list of agent specifications, such as ``coast,ppo``, but not existing paths."""
+    """Split a list of agent specifications, such as ``coast,ppo``, at each comma outside existing paths."""
     return split_names(text, _is_one_spec)
 
 
@@ -114,7 +114,7 @@ def _existing_file(core: str) -> str:
 
 
 def _python_file(core: str) -> str:
-    """Return the path of the Python file with which ``core`` begins, even if it does not exist; "" if there is none."""
+    """Return the path of the Python file with which ``core`` begins, or "". The file need not exist."""
     return _existing_file(core) or (core.partition(":")[0] if _BEGINS_WITH_FILE.fullmatch(core) else "")
 
 
@@ -158,7 +158,7 @@ def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
 def _is_meant_around(before: str, core: str, last: str) -> bool:
     """Return whether an unknown word after a ``+`` is probably a misspelt search or shield.
 
-    If the result is False, the word is part of an argument or a path.
+    If the result is False, the unknown word is part of an argument or a path.
 
     Args:
         before: the specification up to the ``+``, without the ``+``.

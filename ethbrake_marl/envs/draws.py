@@ -1,6 +1,7 @@
 """Columns that describe what was drawn at random for each world: initial states, vehicle types and scenarios.
 
-Scenario, seed and number determine a world completely. Therefore a world is not stored but drawn again on request.
+The scenario, the seed and the number of a world determine the world completely. Therefore a world is not stored but
+drawn again on request.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ def describe_worlds(engine: Engine) -> Columns:
     the infos with these names.
 
     Raises ``InvalidInput`` if the caller passed the worlds and the environment was later restored from a snapshot,
-    because a snapshot does not contain these worlds. Also raises ``InvalidInput`` if the physics failed in a world
-    before its first decision, so that another world replaced it.
+    because a snapshot does not contain these worlds. Also raises ``InvalidInput`` if the physics failed in a drawn
+    world before its first decision, so that another world replaced the drawn world.
     """
     numbers, placed = engine.roster.numbers, engine.roster.given
     named = {"world_seed": np.full(engine.n, engine.roster.seed), "world": numbers.copy()}
@@ -56,7 +57,7 @@ def describe_worlds(engine: Engine) -> Columns:
 
 
 def _drawn_again(engine: Engine, numbers: Ints) -> Sample:
-    """Draw the worlds with these ``numbers`` in the training stream again; return them in the order of ``numbers``.
+    """Draw again the worlds that have the ``numbers`` in the training stream; return them in this order.
 
     Raises ``InvalidInput`` if a drawn world differs from the running world. The two worlds differ if the physics failed
     in the drawn world before its first decision, so that another world replaced the drawn world.

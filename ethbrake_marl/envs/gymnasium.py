@@ -34,7 +34,7 @@ from ethbrake_marl.scenario.schema import Scenario
 
 
 class Specified:
-    """Mixin for environments of ``gymnasium.make``, whose ``spec`` stores all settings as plain data for JSON.
+    """Mixin for environments of ``gymnasium.make``: the attribute ``spec`` stores all settings as plain data for JSON.
 
     For instance, ``spec`` stores a scenario object as a mapping, and a path as a text.
     """
@@ -99,13 +99,13 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
             learner of the scenario.
         reward: reward of a step: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams``
             object.
-        observation: features that the learner observes; None: the features that belong to the scenario
-            (``observation_for``).
+        observation: features that the learner observes; None: the features that the scenario declares or, if it
+            declares none, default features (``observation_for``).
         actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete, and an action is
-            an index from 0 to K - 1. The indices stand for K evenly spaced numbers from -1 (full braking capacity) to 1
-            (full driving capacity).
-        reward_vector: None: a reward is a number. ``vehicles``: a reward is an array [N] with minus the harm that each
-            vehicle bears in the step. A list of components: a reward is an array with these components (see
+            an index from 0 to K - 1. Index k selects number k of K evenly spaced numbers from -1 (full braking
+            capacity) to 1 (full driving capacity), counted from 0.
+        reward_vector: None: a reward is a number. ``vehicles``: a reward is an array [N] that contains minus the harm
+            that each vehicle bears in the step. A list of components: a reward is an array with these components (see
             docs/environments.md).
 
     Raises ``InvalidInput`` if the number of learners is not one.

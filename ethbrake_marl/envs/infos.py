@@ -182,8 +182,8 @@ class Report(NamedTuple):
         Args:
             vehicle: index of the vehicle whose infos are returned (0 = front).
             rows: mask [n], True for the worlds whose infos have values.
-            stepped: mask [n], True for the worlds whose running episode includes the last step. In all other worlds
-                ``cost`` and the reward terms are 0.
+            stepped: mask [n], True for each world in which the last step belongs to the running episode, not to the
+                episode before it. In all other worlds ``cost`` and the reward terms are 0.
 
         """
         columns: dict[str, NDArray[Any]] = {name: info[:, vehicle] for name, info in self.columns().items()}
@@ -269,8 +269,8 @@ class Begun:
     def np_random(self) -> np.random.Generator:
         """Random generator that wrappers may use. The worlds depend on ``np_random_seed`` only.
 
-        If you set another generator, each ``reset`` without a seed draws a new seed from the generator that you set.
-        The next ``reset`` with a seed replaces your generator.
+        If you set another generator, each ``reset`` without a seed draws a new seed from your generator. The next
+        ``reset`` with a seed replaces your generator.
         """
         if self._np_random is None:
             self._set_seed(chosen_seed(None))

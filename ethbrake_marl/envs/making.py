@@ -27,7 +27,7 @@ AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping is the cont
 
 
 def feature_box(features: Sequence[Feature]) -> Box[np.float32]:
-    """Return the observation space for ``features``: a float32 box [F], bounded by the range of each feature."""
+    """Return the observation space for ``features``: a float32 box [F] with the bounds of each feature."""
     low, high = (np.array([getattr(f, side) for f in features], np.float32) for side in ("low", "high"))
     return Box(low, high, dtype=np.float32)
 
@@ -78,7 +78,7 @@ def make_engine(
         reward: reward of a step: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams``
             object.
         observation: features that every vehicle observes, or a mapping from each vehicle's name to its features; None:
-            the features that belong to the scenario.
+            the features that the scenario declares or, if it declares none, default features.
         seed: seed of the stream of worlds.
         reward_vector: components of a vector reward. The result of a step contains the vector reward as ``vector``, in
             addition to ``reward``. None: there is no vector reward.
@@ -189,8 +189,9 @@ def wanted_worlds(engine: Engine, options: Mapping[str, Any]) -> Worlds | None:
     """Return the worlds that the ``options`` of a reset choose, one for each of the engine's worlds.
 
     With the key ``initial_state``, all worlds start in this state. With the key ``listed_world``, the worlds are
-    consecutive worlds of an evaluation list. Without these keys the result is None: the stream supplies the worlds.
-    Raises ``InvalidInput`` if ``options`` contains both keys, or if the value of a key is invalid.
+    consecutive worlds of an evaluation list. If ``options`` contains neither key, the result is None: the stream
+    supplies the worlds. Raises ``InvalidInput`` if ``options`` contains both ``initial_state`` and ``listed_world``, or
+    if the value of a key is invalid.
     """
     if LISTED_WORLD not in options:
         if INITIAL_STATE not in options:

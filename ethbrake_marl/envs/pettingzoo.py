@@ -145,16 +145,16 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
         reward: reward of a step: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams``
             object.
         observation: features that every vehicle observes, or a mapping from each vehicle's name to its features; None:
-            the features that belong to the scenario.
+            the features that the scenario declares or, if it declares none, default features.
         agents: which vehicles are agents: ``all`` vehicles or only the ``learners``. Choose ``learners`` for training
             libraries that train every agent.
         max_cycles: number of steps after which an episode is truncated; None: an episode is truncated at the horizon
             only.
         actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete, and an action is
-            an index from 0 to K - 1. The indices stand for K evenly spaced numbers from -1 (full braking capacity) to 1
-            (full driving capacity).
-        reward_vector: None: a reward is a number. ``vehicles``: a reward is an array [N] with minus the harm that each
-            vehicle bears in the step. A list of components: a reward is an array with these components (see
+            an index from 0 to K - 1. Index k selects number k of K evenly spaced numbers from -1 (full braking
+            capacity) to 1 (full driving capacity), counted from 0.
+        reward_vector: None: a reward is a number. ``vehicles``: a reward is an array [N] that contains minus the harm
+            that each vehicle bears in the step. A list of components: a reward is an array with these components (see
             docs/environments.md).
 
     >>> import ethbrake_marl as eb
@@ -252,9 +252,9 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
     ) -> tuple[dict[str, Observations], dict[str, Any], dict[str, bool], dict[str, bool], Infos]:
         """Advance by one time step; return observations, rewards, terminations, truncations and infos of all agents.
 
-        ``actions`` is a mapping from the names of agents to their actions, each [1] in [-1, 1]. The results are
-        mappings from the names of agents as well. Raises ``InvalidInput``, which names the learner, if the action of a
-        learner is missing or invalid.
+        ``actions`` is a mapping from the names of agents to their actions, each [1] in [-1, 1]. Each of the five
+        results is a mapping from the names of agents, too. Raises ``InvalidInput``, which names the learner, if the
+        action of a learner is missing or invalid.
         """
         if not self.agents:
             raise InvalidInput("step: no episode is running; call reset first")

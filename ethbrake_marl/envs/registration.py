@@ -1,4 +1,4 @@
-"""Registration of the environments in Gymnasium and PettingZoo. The modules of the environments are not imported."""
+"""Register the environments in Gymnasium and PettingZoo, without importing the modules of the environments."""
 
 from __future__ import annotations
 

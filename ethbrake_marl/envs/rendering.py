@@ -34,7 +34,11 @@ LATE_S = 3.0  # longest latency that is considered when the length of road is ch
 
 
 class View(NamedTuple):
-    """The part of the road that a picture shows. Positions are distances (m) from Vehicle 1's front at the alert."""
+    """The part of the road that a picture shows.
+
+    Positions are distances (m) from the place of Vehicle 1's front bumper at the alert, positive in the direction of
+    travel.
+    """
 
     left_m: float  # position of the left end (m)
     right_m: float  # position of the right end (m)
@@ -84,7 +88,7 @@ class Scene(NamedTuple):
 
     @property
     def shield_words(self) -> str:
-        """Whether the shield replaced an action in this step: "shield: stepped in" or "shield: let it pass"."""
+        """Text about the shield in this step: "shield: stepped in" (replaced an action) or "shield: let it pass"."""
         return "shield: stepped in" if self.shield else "shield: let it pass"
 
     def command_words(self, i: int) -> str:
@@ -193,7 +197,7 @@ _BRAKE, _DRIVE, _FLASH, _SHIELD = "#c1121f", "#2a7f3f", "#ffd60a", "#6a3d9a"
 
 
 class _Pen:
-    """Pen that draws on a picture ``_FINE`` times as large as the final one, so that reducing it makes edges smooth.
+    """Pen that draws on a picture ``_FINE`` times as large as the final one; shrinking the picture smooths the edges.
 
     All coordinates are in pixels of the final picture.
     """
@@ -250,7 +254,10 @@ def _draw_vehicle(pen: _Pen, scene: Scene, i: int) -> None:
 
 
 def _draw_panel(pen: _Pen, scene: Scene, i: int) -> None:
-    """Draw the panel of vehicle ``i``. The panel's bar extends to the left for braking and to the right for driving."""
+    """Draw the panel of vehicle ``i``.
+
+    A bar in the panel shows the command: the bar extends to the left for braking and to the right for driving.
+    """
     left, width = _panel(scene, i)
     pen.box(left, _PANEL_TOP, left + 20, _PANEL_TOP + 18, vehicle_colour(i))
     middle, half, top = left + width / 2, width / 2, _PANEL_TOP + 62

@@ -60,12 +60,12 @@ def make_sb3_vec_env(
         learners: vehicles that learn, by name (``vehicle_2``) or index (0 = front); None: the learners of the scenario.
         reward: reward of a step: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams``
             object.
-        observation: features that the learners observe; None: the features that belong to the scenario
-            (``observation_for``).
+        observation: features that the learners observe; None: the features that the scenario declares or, if it
+            declares none, default features (``observation_for``).
         horizon_is_end: True: an episode that reaches the horizon is reported as ended, not as truncated. Therefore the
-            algorithm does not add an estimate of the return after the horizon. An estimate of this return could grow
-            without limit, because harm after the horizon is not counted (see docs/train.md). False: an episode that
-            reaches the horizon is reported as truncated (``TimeLimit.truncated`` is true).
+            algorithm does not add an estimate of the return after the horizon. An estimate of the return after the
+            horizon could grow without limit, because harm after the horizon is not counted (see docs/train.md). False:
+            an episode that reaches the horizon is reported as truncated (``TimeLimit.truncated`` is true).
         appended: numbers to append to each observation. ``number``: the learner's number, counted among the learners of
             its world from the front, from 0. ``state``: the full state of the line (``game.full_state.full_state``),
             for a central critic. None: no numbers.
@@ -73,8 +73,8 @@ def make_sb3_vec_env(
             the last step of an episode returns all infos.
         render_mode: ``rgb_array`` or None. ``render`` and ``VecVideoRecorder`` show all worlds side by side.
         actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete, and an action is
-            an index from 0 to K - 1. The indices stand for K evenly spaced numbers from -1 (full braking capacity) to 1
-            (full driving capacity).
+            an index from 0 to K - 1. Index k selects number k of K evenly spaced numbers from -1 (full braking
+            capacity) to 1 (full driving capacity), counted from 0.
 
     >>> import ethbrake_marl as eb
     >>> eb.make_sb3_vec_env("paper-random", 4, seed=7).reset().shape
@@ -259,7 +259,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set the attribute ``attr_name`` of this environment. Raises ``InvalidInput`` if ``indices`` omits a row."""
+        """Set the attribute ``attr_name`` to ``value``. Raises ``InvalidInput`` if ``indices`` omits a row."""
         self._refuse_some_rows("set_attr", indices)
         setattr(self, attr_name, value)
 

@@ -35,8 +35,8 @@ class Motion:
     """Recorded motion of n worlds during one step, or from the alert to the first decision.
 
     The motion that was recorded last is *open*: its end is not yet known. ``closed`` returns a copy of the motion that
-    ends with the engine's present state and contains the ``parts`` that ``scenes`` needs. All positions are distances
-    (m) from Vehicle 1's front at the alert.
+    ends with the engine's present state and has the field ``parts``, which ``scenes`` needs. All positions are
+    distances (m) from the place of Vehicle 1's front bumper at the alert, positive in the direction of travel.
     """
 
     start: Worlds  # the n worlds at the start
@@ -128,8 +128,8 @@ class Trace:
     Args:
         engine: the engine whose worlds are recorded, from the engine's next reset on.
         whole: True: keep all steps of the episode (only for engines with one world). False: keep the latest step only.
-        alert: the running worlds at the alert, to record episodes that have already started; the engine must have just
-            reached the first decision. None: recording starts at the next reset.
+        alert: for episodes that have already started: the running worlds as they were at the alert; the engine must
+            have just reached the first decision. None: recording starts at the next reset.
 
     """
 
@@ -138,7 +138,7 @@ class Trace:
         engine.watch(self, () if alert is None else self.begun((), alert, np.arange(alert.n)))
 
     def begun(self, memory: Memory, alert: Worlds, rows: Ints) -> Memory:
-        """Return the recorded motions after new episodes have started in the worlds with the indices ``rows``.
+        """Return the recorded motions, updated for new episodes that have started in the worlds ``rows``.
 
         Args:
             memory: the motions recorded before this call.

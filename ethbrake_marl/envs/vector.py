@@ -99,22 +99,22 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
             learner of the scenario.
         reward: reward of a step: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams``
             object.
-        observation: features that the learner observes; None: the features that belong to the scenario
-            (``observation_for``).
+        observation: features that the learner observes; None: the features that the scenario declares or, if it
+            declares none, default features (``observation_for``).
         autoreset_mode: Gymnasium's autoreset mode: what happens in a row whose episode ends. ``NextStep`` (default):
-            the step returns the last observation of the episode. The next step ignores the row's action, starts a new
-            episode in the row, and returns the reward 0 for the row. ``SameStep``: the step itself starts the new
-            episode and returns its first observation; ``infos["final_obs"]`` and ``infos["final_info"]`` contain the
-            last observation and infos of the old episode. ``Disabled``: no new episode starts; the caller must reset
-            the row before the next step.
+            the step that ends an episode returns the last observation of this episode. The next step ignores the row's
+            action, starts a new episode in the row, and returns the reward 0 for the row. ``SameStep``: the step that
+            ends an episode also starts the next episode and returns the first observation of the next episode;
+            ``infos["final_obs"]`` and ``infos["final_info"]`` contain the last observation and infos of the old
+            episode. ``Disabled``: no new episode starts; the caller must reset the row before the next step.
         max_episode_steps: number of steps after which an episode is truncated; None: an episode is truncated at the
             horizon only.
         actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete, and an action is
-            an index from 0 to K - 1. The indices stand for K evenly spaced numbers from -1 (full braking capacity) to 1
-            (full driving capacity).
+            an index from 0 to K - 1. Index k selects number k of K evenly spaced numbers from -1 (full braking
+            capacity) to 1 (full driving capacity), counted from 0.
         reward_vector: None: each world has a number as its reward, so that rewards are [n]. ``vehicles``: rewards are
-            [n, N], with minus the harm that each vehicle bears in the step. A list of K components: rewards are [n, K]
-            (see docs/environments.md).
+            [n, N] and contain minus the harm that each vehicle bears in the step. A list of K components: rewards are
+            [n, K] (see docs/environments.md).
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np

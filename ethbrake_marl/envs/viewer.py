@@ -53,7 +53,7 @@ class Viewer:
         return {"render_modes": list(self.modes), "render_fps": round(fps) if abs(fps - round(fps)) < 1e-9 else fps}
 
     def began(self) -> None:
-        """Show the motion up to the first decision, and empty the list of frames. Call this when an episode starts."""
+        """Show the motion up to the first decision, and empty the list of frames; call this at each episode's start."""
         self._shown = 0
         if self._window is not None:
             self._window.closed_by_user = False

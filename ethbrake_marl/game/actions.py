@@ -88,7 +88,7 @@ def action_to_command(action: Floats, vehicles: Vehicles, vehicle: int) -> Float
 def command_to_action(command_mps2: Floats, vehicles: Vehicles, vehicle: int) -> Floats:
     """Return the action that corresponds to a vehicle's command in each world, [n], clipped to [-1, 1].
 
-    The action is 0 if the capacity for this command is 0.
+    The action is 0 if the vehicle has no capacity in the direction of the command (braking or driving).
 
     Args:
         command_mps2: commanded acceleration of the vehicle in each world, [n] m/s2.
@@ -111,9 +111,10 @@ def command_of(action: float, braking: float, driving: float) -> float:
 
 @compiled
 def action_of(command: float, braking: float, driving: float) -> float:
-    """Return the action for a command (m/s2), clipped to [-1, 1]; 0 if the capacity for this command is 0.
+    """Return the action for a command (m/s2), clipped to [-1, 1]; 0 if the needed capacity is 0.
 
-    ``braking`` is the largest deceleration of the vehicle, and ``driving`` its largest forward acceleration (m/s2).
+    The needed capacity is the braking capacity for a command below 0, otherwise the driving capacity. ``braking`` is
+    the largest deceleration of the vehicle, and ``driving`` its largest forward acceleration (m/s2).
     """
     capacity = braking if command < 0.0 else driving
     return min(max(command / capacity, -1.0), 1.0) if capacity > 0.0 else 0.0

@@ -1,9 +1,9 @@
 """Contact features: a vehicle forecasts its next impacts for its own full braking, coasting and full driving.
 
-A forecast covers only the vehicles that the observer knows. The observer's own command takes effect after its latency.
-In the forecast, the other vehicles keep their present accelerations, with two exceptions. A vehicle without a command
-in force is assumed to brake fully after its latency. A braking vehicle whose brakes build up gradually is also assumed
-to brake fully, because its present deceleration does not show its command.
+A forecast covers only the vehicles that the observer knows. In the forecast, the observer's own command takes effect
+after the observer's latency. In the forecast, every other vehicle keeps its present acceleration, with two exceptions.
+A vehicle without a command in force is assumed to brake fully after its latency. A braking vehicle whose brakes build
+up gradually is also assumed to brake fully, because its present deceleration does not show its command.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def observe_contacts(
     state: Floats, params: Floats, observers: Ints, time_step: float, commands: Ints, features: Floats,
     out: NDArray[np.float32], failed: Bools,
 ) -> None:  # fmt: skip
-    """Write the contact features of each observer into ``out``, and mark worlds whose forecast failed in ``failed``.
+    """Write the contact features of each observer into ``out``; set ``failed`` for worlds in which a forecast failed.
 
     Args:
         state: time, motion and harm of the worlds, one row per world, [n, S] (layout: ``physics.columns``).
@@ -56,8 +56,8 @@ def observe_contacts(
         observers: indices of the observing vehicles (0 = front).
         time_step: time between two decisions of a vehicle, s.
         commands: the observer's own commands for which to forecast, as indices into CONTACT_COMMANDS.
-        features: scaling of the features: three rows (1 / scale, low, high) with one column per feature. There are 30
-            features, or 42 with the group contact_far.
+        features: scaling of the features: three rows (``1 / scale``, ``low``, ``high``) with one column per feature.
+            There are 30 features, or 42 with the group contact_far.
         out: array that receives the result, [n, observers, features]. Features of commands that are not in ``commands``
             do not change.
         failed: mask [n] that is set to True for each world in which a check of the physics failed.
@@ -103,11 +103,12 @@ def observe_contacts(
 def _place_known(table: Floats, state: Floats, params: Floats, k: int, i: int, at: int) -> tuple[int, int]:
     """Write one world into ``table`` as vehicle ``i`` knows it; return the first and last column of the known vehicles.
 
-    A vehicle is placed far away if vehicle ``i`` does not know it, or does not know all of its data that a forecast
-    needs. A known obstacle is treated as a known vehicle.
+    A vehicle is placed far away if vehicle ``i`` does not know this vehicle, or lacks data of this vehicle that a
+    forecast needs. A known obstacle is placed in the same way as a known vehicle.
 
     Args:
-        table: array to fill, one column per vehicle, [rows, N + at] (layout: ``physics.rows``).
+        table: array to fill, [rows, N + at] (layout: ``physics.rows``), with one column per vehicle and, if there is
+            an obstacle, column 0 for the obstacle.
         state: time, motion and harm of the worlds, one row per world, [n, S] (layout: ``physics.columns``).
         params: parameters of the vehicles, one row per world (layout: ``physics.columns``).
         k: index of the world.
@@ -163,8 +164,8 @@ def _write_features(
     at the end of a time step belongs to this time step, as in the engine.
 
     Args:
-        table: one world after the forecast, one column per vehicle (layout: ``physics.rows``).
-        found: forecast next impact of each pair, the result of ``forecast_contacts``.
+        table: one world at the end of the forecast, one column per vehicle (layout: ``physics.rows``).
+        found: forecast of the next impact of each pair, as ``forecast_contacts`` returns it.
         own: column of the observing vehicle in ``table``.
         first: first column, in ``table``, of a vehicle that the observer knows.
         last: last column, in ``table``, of a vehicle that the observer knows.

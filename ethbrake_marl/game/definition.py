@@ -77,5 +77,6 @@ class Game(Protocol):
     def sample(self, n: int, seed: int, *, first: int = 0, channel: Literal["list", "training"] = "list") -> Drawn:
         """Draw the worlds with the numbers ``first`` to ``first + n - 1`` from the endless list of worlds of ``seed``.
 
-        ``channel`` selects one of two independent lists: ``"list"`` for evaluation, ``"training"`` for training.
+        ``channel`` selects one of two independent lists of worlds: ``"list"`` for evaluation, ``"training"`` for
+        training.
         """

@@ -12,7 +12,8 @@ from ethbrake_marl.physics.state import Floats, Ints, real_numbers
 def index_to_action(indices: ArrayLike, count: int, names: str = "the learners") -> Floats:
     """Return the action ``(2 k - K + 1) / (K - 1)`` in [-1, 1] for each index k, where K is ``count``.
 
-    The result is float64 and has the shape of ``indices``. If K is odd, the action in the middle is exactly 0.
+    The result is float64 and has the shape of ``indices``. If the number of actions is odd, the action in the middle is
+    exactly 0.
 
     Args:
         indices: whole numbers from 0 (full braking) to ``count - 1`` (full driving), of any shape.

@@ -179,8 +179,8 @@ class RegisteredFeature:
             worlds: the n worlds in which to compute the feature.
             vehicle: index of the observing vehicle (0 = front).
             neighbour: index of the neighbour; None for a feature of the vehicle itself.
-            counts: whether to use the function's value in each world, a mask [n] or one truth value for all worlds.
-                Where ``counts`` is False, the feature has the value ``unknown``.
+            counts: mask [n] (or one truth value for all worlds), True for each world in which the function's value is
+                used. Where ``counts`` is False, the feature has the value ``unknown``.
             steps: number of steps that each episode has taken, [n], for error messages; None: not known.
 
         """
@@ -261,7 +261,7 @@ def _single(
 
 
 def _knows(piece: Piece) -> RegisteredFeature:
-    """Return the feature that is 1 if the observer knows one property of a neighbour, such as ``piece="mass"``."""
+    """Return the feature that is 1 if the observer knows the property ``piece`` of a neighbour, such as ``"mass"``."""
     meaning = f"1 if the neighbour's {piece.replace('_', ' ')} is known, from a message or from sensors"
     feature = Feature(f"{piece}_known", "1", 1.0, 0.0, 1.0, meaning)
     return RegisteredFeature(feature, _certain, "neighbour", 0.0, (1.0, 1.0, 1.0), (piece,))
@@ -416,9 +416,9 @@ def side_of(name: str) -> tuple[str, int] | None:
 
 
 def registered_in(names: Iterable[str]) -> dict[str, RegisteredFeature]:
-    """Return a dictionary of those features in ``names`` (full names) that have a function of their own.
+    """Return those features in ``names`` (full names) that have a function of their own, as a dictionary.
 
-    A key of this dictionary is a name without the neighbour: the key of ``front_1.age`` is ``age``.
+    A key of the dictionary does not contain the neighbour: for ``front_1.age`` the key is ``age``.
     """
     own = [name.partition(".")[2] or name for name in names]
     return {name: FEATURES[name] for name in own if name in FEATURES}

@@ -84,7 +84,7 @@ class Ledger:
         return replace(self, **{name: getattr(self, name) - getattr(before, name) for name in names})
 
     def take(self, rows: Ints | Bools | Sequence[int]) -> Ledger:
-        """Return the ledger of only the worlds that ``rows`` selects (indices, or a mask [n])."""
+        """Return a ledger that contains only the worlds selected by ``rows`` (indices, or a mask [n])."""
         return Ledger(*(getattr(self, column.name)[rows] for column in fields(self)))
 
     def pair_harm(self, harm_count: HarmCount) -> Floats:
@@ -180,8 +180,8 @@ def empty_ledger(worlds: Worlds) -> Ledger:
 def split(pair_harm: Floats, mass_t: Floats) -> Floats:
     """Divide the harm of each pair between its two vehicles; return the harm that each vehicle bears, [n, N] m2/s2.
 
-    The lighter vehicle of a pair bears more. ``pair_harm``: harm of each pair, [n, P] m2/s2. ``mass_t``: mass of each
-    vehicle, [n, N] t.
+    The lighter vehicle of a pair bears the larger part of the pair's harm. ``pair_harm``: harm of each pair, [n, P]
+    m2/s2. ``mass_t``: mass of each vehicle, [n, N] t.
     """
     n, vehicles = mass_t.shape
     harm = np.zeros((n, vehicles))

@@ -32,7 +32,8 @@ class EpisodeImpacts:
     def of(cls, worlds: Worlds, parts: Sequence[ImpactRows] = ()) -> EpisodeImpacts:
         """Return all impacts of the episodes that began in the states ``worlds``.
 
-        ``parts``: the impacts of these episodes, one item for each of several consecutive time intervals.
+        ``parts``: the impacts of the episodes that began in ``worlds``, one item for each of several consecutive time
+        intervals.
         """
         whole = [np.concatenate([getattr(rows, name) for rows in (_NO_ROWS, *parts)]) for name in _OF_ROWS]
         order = np.argsort(whole[0], kind="stable")
@@ -54,11 +55,12 @@ class EpisodeImpacts:
         return change
 
     def and_then(self, way: Iterable[tuple[Worlds, Floats, Floats]], some: Bools) -> EpisodeImpacts:
-        """Return these impacts and the impacts in the next segments (time intervals) of the same episodes.
+        """Return the impacts of this object together with the impacts in the next segments of the same episodes.
 
         Args:
-            way: consecutive segments from ``Engine.segments``. Each segment is a tuple: the worlds at the start of the
-                segment, the constant commands [n, N] m/s2, and the times [n] s at which the segment ends.
+            way: consecutive segments from ``Engine.segments``. Each segment (time interval) is a tuple: the worlds at
+                the start of the segment, the constant commands [n, N] m/s2, and the times [n] s at which the segment
+                ends.
             some: mask [n], True for each world whose new impacts are added.
 
         """
@@ -103,8 +105,8 @@ class EpisodeImpacts:
     def read(self, arrays: Mapping[str, NDArray[Any]]) -> EpisodeImpacts:
         """Return an ``EpisodeImpacts`` with the impacts in ``arrays``, a dictionary from ``EpisodeImpacts.arrays``.
 
-        The dictionary must have the same number of episodes as this object. Raises ``InvalidInput`` if an
-        array is missing or has a wrong shape.
+        ``arrays`` must contain the same number of episodes as this object. Raises ``InvalidInput`` if an array is
+        missing or has a wrong shape.
         """
         for name, own in self.arrays().items():
             have = arrays.get(name)

@@ -9,8 +9,8 @@ step     ``StepOutcome``     value of the measure in the step            sum of 
 impacts  ``EpisodeImpacts``  change of the measure during the step       value for all impacts of the episode
 =======  ==================  ==========================================  ====================================
 
-The sum of a reward term over an episode equals the number that an evaluation shows, minus the value that the measure
-already had before the first decision.
+For each measure, the values of its reward term, summed over an episode, equal the number that an evaluation shows minus
+the value of the measure before the first decision.
 """
 
 from __future__ import annotations
@@ -52,7 +52,8 @@ class NamedMeasure:
     def built_in(self, step: StepOutcome, params: Any) -> Floats:
         """Return the value of a built-in measure in one step, [n] or [n, N].
 
-        ``params`` is the reward. The measure's function gets the fields of ``params`` that ``settings`` names.
+        ``params`` is the reward. ``settings`` names the fields of ``params`` that the measure's function needs as
+        arguments.
         """
         assert self.function is not None
         value: Floats = self.function(step, *(getattr(params, name) for name in self.settings))
@@ -66,7 +67,7 @@ class NamedMeasure:
 
         Args:
             given: the data from which the measure is computed: a step, or the impacts of an episode.
-            counts: whether to use the value in each world, a mask [n]; the result is 0 where ``counts`` is False. If
+            counts: mask [n], True for each world in which the value is used; in the other worlds the result is 0. If
                 ``counts`` is None, the value is used in all worlds.
             steps: number of steps that each episode has taken, [n], for error messages.
 
@@ -136,7 +137,7 @@ def register_measure(name: str, function: MeasureFunction, *, unit: str = "1", b
 
     An installed package registers a measure with an entry point of the group ``ethbrake_marl.measures``. The entry
     point names the function, a ``Part`` that contains it, or a mapping from names to functions or parts. Evaluations
-    show a measure from an entry point only on request.
+    show measures from entry points only on request.
 
     Registering the same measure again changes nothing. Raises ``AlreadyExists`` if the name belongs to another measure,
     and ``InvalidInput`` for invalid arguments, or if the function, called for two test worlds, fails or returns a wrong

@@ -55,7 +55,7 @@ class Objective(NamedTuple):
 
 
 class HarmSoFar(NamedTuple):
-    """Data from which an objective computes its amount, in n worlds of N vehicles since the start of the episode."""
+    """Data from which an objective computes the amount that a vehicle should minimise, in n worlds of N vehicles."""
 
     borne: Floats  # [n, N] harm that each vehicle bears, m2/s2
     whole: Floats  # [n] harm of all vehicles, m2/s2
@@ -241,8 +241,8 @@ def register_objective(name: str, function: ObjectiveFunction) -> None:
         name: name of the objective, 1 to 64 characters ``a-z``, ``0-9``, ``-`` and ``_``, beginning with a letter or
             digit.
         function: ``function(harm, vehicle)`` returns the amount that vehicle number ``vehicle`` (0 = front) should
-            minimise, [n] m2/s2. ``harm`` is a ``HarmSoFar``. The docstring of ``function`` is shown as the description
-            of the objective.
+            minimise, [n] m2/s2. The argument ``harm`` of this function is a ``HarmSoFar``. The docstring of
+            ``function`` is shown as the description of the objective.
 
     """
     if not isinstance(name, str) or _NAME.fullmatch(name) is None:
@@ -316,8 +316,9 @@ def _social(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
 def _social_weights(angle_deg: float) -> tuple[float, float]:
     """Return the weight of own harm, cos(angle), and the weight of the other vehicles' harm, sin(angle).
 
-    At 90 degrees the weights are exactly 0 and 1. The power series of cosine and sine are summed in exact fractions and
-    rounded once, because results of the C library differ between processors in the last bits.
+    At 90 degrees the weight of own harm is exactly 0, and the weight of the other vehicles' harm is exactly 1. The
+    power series of cosine and sine are summed in exact fractions and rounded once, because results of the C library
+    differ between processors in the last bits.
     """
     if angle_deg == 90.0:
         return 0.0, 1.0
@@ -329,11 +330,11 @@ def _social_weights(angle_deg: float) -> tuple[float, float]:
 
 
 def _injured(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
-    """Return the expected injuries in 1,000 lines, [n], summed over the vehicles; the same for every ``vehicle``.
+    """Return how many injuries are expected in 1,000 lines of vehicles, [n]; the number does not depend on ``vehicle``.
 
     For a vehicle that is hit at its front and at its rear, the larger of the two injury risks is used. The same change
-    of speed has different risks at front and rear. If the risk of the larger change of speed were used instead, a
-    further impact could lower the number of injuries.
+    of speed leads to different injury risks at the front and at the rear of a vehicle. If the risk of the larger change
+    of speed were used instead, a further impact could lower the number of injuries.
     """
     del vehicle
     front, rear = harm.front_change_mps, harm.rear_change_mps

@@ -108,7 +108,7 @@ class ObservationSpec:
 
     @property
     def whole(self) -> tuple[Feature, ...]:
-        """All features of the built-in groups that the observation uses, in order; it observes some of these."""
+        """All features, in order, of the built-in groups from which the features of this observation are selected."""
         groups = [("own", GROUPS.own), *((prefix, GROUPS.neighbour) for prefix, _ in self.sides)]
         groups += [("role", GROUPS.role)] if self.role else []
         groups += [("obstacle", GROUPS.obstacle)] if self.obstacle else []
@@ -136,7 +136,7 @@ class ObservationSpec:
         return _plan(self, tuple(registered_in(self.chosen).items()) if self.chosen else ())
 
     def at_steps_of(self, time_step_s: float) -> ObservationSpec:
-        """Return a copy with this ``time_step_s`` (s), if the specification needs a time step and has none so far."""
+        """Return a copy with the time step ``time_step_s`` (s) if this specification needs a time step and has none."""
         return replace(self, time_step_s=time_step_s) if self.contact and self.time_step_s is None else self
 
 
@@ -173,7 +173,7 @@ def choose_observation(listed: Observation, time_step_s: float | None = None) ->
 
 
 def _reach(names: Sequence[str]) -> tuple[int, int, bool, bool, bool]:
-    """Return the fields front, rear, role, obstacle and contact of the observation whose features are ``names``."""
+    """Return the ``ObservationSpec`` fields front, rear, role, obstacle and contact for the features ``names``."""
     sides = [side for name in names if (side := side_of(name)) is not None]
     front, rear = (max((k for at, k in sides if at == wanted), default=0) for wanted in ("front", "rear"))
     groups = {name.partition(".")[0] for name in names}
@@ -338,7 +338,7 @@ def _plan(spec: ObservationSpec, registered: tuple[tuple[str, RegisteredFeature]
 
 
 def _scales(features: Sequence[Feature]) -> Floats:
-    """Return the scaling of the features, [3, F]: the rows 1 / scale, low and high, with one column per feature."""
+    """Return the scaling of the features, [3, F]: rows ``1 / scale``, ``low`` and ``high``; one column per feature."""
     return np.array([[1.0 / f.scale for f in features], [f.low for f in features], [f.high for f in features]])
 
 
@@ -358,7 +358,8 @@ def _observe_rows(
         offsets: index of each observed neighbour minus index of the observer; -1 is the next vehicle ahead.
         role: whether vehicles observe their own place in the line (``GROUPS.role``).
         with_obstacle: whether vehicles observe the obstacle ahead (``GROUPS.obstacle``).
-        features: scaling of the features, [3, F]: the rows 1 / scale, low and high, with one column per feature.
+        features: scaling of the features, [3, F]: the rows ``1 / scale``, ``low`` and ``high``, with one column per
+            feature.
         out: array that receives the result, [n, observers, F].
 
     """

@@ -11,7 +11,8 @@ obstacle    minus the harm of impacts of Vehicle 1 with an obstacle ahead, m2/s2
 term name   value of a term of the reward before weighting, for instance ``jerk``
 ==========  ========================================================================================
 
-The setting ``harm_count`` of the reward selects whether the harms in this table are first-impact harm or total harm.
+The setting ``harm_count`` of the reward selects whether the components that are harms use first-impact harm or total
+harm.
 """
 
 from __future__ import annotations

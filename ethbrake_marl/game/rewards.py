@@ -66,8 +66,8 @@ class RewardParams(FileModel):
 
     Args:
         harm, collision, risk, jerk, terminal, shaping: weights of the built-in terms, at least 0. The docstring of the
-            module ``game.rewards`` shows the formula of each term. If you give a weight for any other term, you must
-            also give the weight of harm.
+            module ``game.rewards`` shows the formula of each term. If you give a weight for any term other than harm,
+            you must also give the weight of harm.
         harm_count: ``first``: the term harm uses first-impact harm; ``total``: the term harm uses total harm.
         objective: objective of all vehicles, or a list with one objective per vehicle; None: the objective of the
             scenario.
@@ -143,8 +143,8 @@ class RewardParams(FileModel):
         """Raise an error if weights are given without the weight of harm, or if an objective is given although
         harm has weight 0.
 
-        If the weight of harm is not given, it is 1. Without this error, harm would be added without notice to the terms
-        whose weights are given.
+        If the weight of harm is not given, it is 1. If this were no error, a user who gives only the weights of other
+        terms would get a reward that also includes harm.
         """
         names = {*self.model_fields_set, *(self.terms if "terms" in self.model_fields_set else ())}
         beside = [name for name, weight in self.weights.items() if weight != 0.0 and name in names]
@@ -202,7 +202,7 @@ class RewardParams(FileModel):
         return total
 
     def settled(self, of_scenario: Declared, vehicles: int) -> tuple[RewardParams, tuple[Objective, ...]]:
-        """Return a copy of this reward with the objective that it uses, and the parsed objective of each vehicle.
+        """Return a copy of this reward whose ``objective`` is the one in use, and the parsed objective of each vehicle.
 
         The objective comes from the reward or, if the reward has none, from the scenario. If all vehicles have the
         objective ``total``, or if harm has weight 0, ``objective`` becomes None and the tuple of parsed objectives is
@@ -232,12 +232,12 @@ class RewardParams(FileModel):
         return self.model_copy(update={"objective": declared}), objectives
 
     def potential(self, worlds: Worlds, learners: Sequence[int], horizon_s: float) -> Floats:
-        """Return the potential of the shaping term, [n] m2/s2: minus the least harm by constant braking from now on.
+        """Return the potential of the shaping term, [n] m2/s2: minus the least harm with constant braking from now on.
 
         For the potential, each learner is assumed to brake with a constant deceleration, and all other vehicles fully.
-        Nine decelerations are tried, from 0 to the learner's braking capacity in equal steps. A single learner takes
-        the deceleration with the least harm. Several learners begin with full braking and choose their decelerations
-        one after the other, front to rear, in two rounds; all learners get the same potential.
+        For each learner nine decelerations are tried, from 0 to the learner's braking capacity in equal steps. A single
+        learner takes the deceleration with the least harm. Several learners begin with full braking and choose their
+        decelerations one after the other, front to rear, in two rounds; all learners get the same potential.
 
         Args:
             worlds: n worlds of N vehicles.

@@ -5,7 +5,7 @@ methods save computing time:
 
 - The motion until the vehicle's command takes effect is the same for all decelerations, so it is simulated only once.
 - A simulation ends as soon as no pair can have another impact (``will_stay_apart``).
-- A simulation ends as soon as its harm reaches a given number, because the harm never decreases again.
+- A simulation ends as soon as its harm reaches a given number, because the harm can only grow.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def make_line(
     mass: Floats, limit: Floats, in_force: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats,
     time: float, restitution: float, horizon: float, vehicle: int, total: bool,
 ) -> Line:  # fmt: skip
-    """Return one world of N vehicles as tables. Call ``share_start`` next.
+    """Return the tables of one world of N vehicles. Call ``share_start`` next.
 
     Args:
         gap: gap of each pair, [N - 1] m, bumper to bumper.
@@ -106,8 +106,8 @@ def make_line(
 def share_start(line: Line) -> int:
     """Simulate the motion in ``line.shared`` until the controlled vehicle's command takes effect.
 
-    The time (s) until the command takes effect is written to ``line.clock``. Returns ``FLAG.DONE`` or, if the
-    simulation failed, the code of the physics check that failed.
+    The duration (s) of the simulated motion is written to ``line.clock``. Returns ``FLAG.DONE`` or, if the simulation
+    failed, the code of the physics check that failed.
     """
     table, clock = line.shared, line.clock
     copy_table(line.start, table)
@@ -220,11 +220,13 @@ def will_stay_apart(table: Floats) -> bool:
     Let f be the front vehicle and r the rear vehicle of a pair, with the gap g, the closing speed w, the speeds v_f and
     v_r, and the decelerations d_f and d_r. Each of the following conditions is enough to exclude an impact of the pair:
 
-    * Vehicle r is at rest, or both vehicles move as one body.
-    * ``w <= 0`` and ``d_r >= d_f``, so w stays at most 0 until r is at rest.
-    * The following three statements are all true, with margins for rounding errors. First, f and r do not touch, or the
-      gap grows. Second, the stopping point of r is behind the stopping point of f: ``g + v_f^2 / (2 d_f) > v_r^2 / (2
-      d_r)``. Third, if r closes in and brakes harder than f, the smallest gap is positive: ``w^2 < 2 (d_r - d_f) g``.
+    * Vehicle r is at rest, or vehicles r and f move as one body.
+    * The closing speed is at most 0 (``w <= 0``), and r brakes at least as hard as f (``d_r >= d_f``), so w stays at
+      most 0 until r is at rest.
+    * The following three statements are all true, with margins for rounding errors. First, front vehicle f and rear
+      vehicle r do not touch, or the gap between f and r grows. Second, without an impact, rear vehicle r would stop
+      behind front vehicle f: ``g + v_f^2 / (2 d_f) > v_r^2 / (2 d_r)``. Third, if r closes in and brakes harder than f,
+      the smallest gap is positive: ``w^2 < 2 (d_r - d_f) g``.
       (If r brakes less hard than f, the gap is smallest now or at the end of the motion: until f is at rest, the gap is
       a concave function of time; after that, the gap decreases.)
     """

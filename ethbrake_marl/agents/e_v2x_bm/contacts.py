@@ -2,16 +2,16 @@
 
 The following table defines the symbols. docs/internals/proofs/constant-deceleration.md derives every formula.
 
-=============  ===============================================================
+=============  ========================================================================
 l, f           leader (front vehicle), follower (rear vehicle)
 gap            bumper to bumper at the start [m], >= 0
 v_l, v_f       speeds at the start [m/s], >= 0
 a_l, a_f       decelerations [m/s2], >= 0, constant to standstill
-onset_l/_f     time from the start until the vehicle brakes [s]; before, it coasts
-tau            time from the leader's onset to the follower's [s], >= 0
-lead           time from the follower's onset to the leader's [s], > 0
+onset_l/_f     time from the start until the vehicle brakes [s]; until then it coasts
+tau            time from ``onset_l`` to ``onset_f`` if the leader brakes first [s], >= 0
+lead           time from ``onset_f`` to ``onset_l`` if the follower brakes first [s], > 0
 w              closing speed ``v_f - v_l`` [m/s]
-=============  ===============================================================
+=============  ========================================================================
 
 The formulas use only + - * / and sqrt. Therefore the result for a world has the same bits in every batch of worlds.
 """

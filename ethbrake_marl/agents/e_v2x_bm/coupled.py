@@ -60,10 +60,10 @@ def optimise_coupled(
 
     If the deceleration that the closed form (``optimise_pairwise``) chooses does no harm in a simulation, this
     deceleration is the result. If this deceleration does harm, the search simulates evenly spaced decelerations and the
-    breakpoints of the closed form. The harm may jump where the number of impacts changes. The jumps and local minima
-    with the least harm are located to 1e-9 m/s2; at a jump the result lies on the side with less harm. If several
-    decelerations have the least harm, those with the least harm under the other harm count remain, and the middle one
-    of these is the result. The result for a world does not depend on the other worlds.
+    breakpoints of the closed form. As a function of the deceleration, the harm may jump where the number of impacts
+    changes. The jumps and local minima with the least harm are located to 1e-9 m/s2; at a jump the result lies on the
+    side with less harm. If several decelerations have the least harm, those with the least harm under the other harm
+    count remain, and the middle one of these is the result. The result for a world does not depend on the other worlds.
 
     Args:
         worlds: n worlds of N vehicles.

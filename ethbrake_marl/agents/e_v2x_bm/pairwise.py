@@ -44,7 +44,7 @@ class PairwiseOptimum(NamedTuple):
 
 @compiled
 def early_breakpoints(gap: float, w: float, onset_l: float, onset_f: float) -> tuple[float, float]:
-    """Return two decelerations (m/s2) of the follower: the pair's harm has a kink at the first and jumps at the second.
+    """Return two decelerations (m/s2) of the follower: at the first, the pair's harm has a kink; at the second, a jump.
 
     Both decelerations are 0 unless the follower may brake before the leader (front vehicle). In the formulas, ``w`` is
     the closing speed, ``gap`` is the gap at the moment when the follower begins to brake, and ``lead`` is the time from
@@ -103,9 +103,9 @@ def find_breakpoints(
     """Write to ``at`` [6] the decelerations (m/s2) of vehicle ``i`` at which its predicted harm may be least.
 
     All decelerations in ``at`` are in [0, braking capacity]. Returns two more decelerations (m/s2), which may be
-    infinite: the smallest one without an impact in front, and the largest one without an impact behind. The world has
-    the gaps ``gap`` [P] m, the speeds ``speed`` [N] m/s and the braking capacities ``capacity`` [N] m/s2. Vehicle k may
-    brake after ``onset[k]`` seconds.
+    infinite: the smallest deceleration that avoids an impact with the vehicle in front, and the largest deceleration
+    that avoids an impact with the vehicle behind. The world has the gaps ``gap`` [P] m, the speeds ``speed`` [N] m/s
+    and the braking capacities ``capacity`` [N] m/s2. Vehicle k may brake after ``onset[k]`` seconds.
     """
     low, high = 0.0, math.inf
     at[:] = 0.0
@@ -129,7 +129,7 @@ def find_breakpoints(
 def minimise_over(
     at: Floats, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats
 ) -> tuple[float, float]:
-    """Return the deceleration (m/s2) of vehicle ``i`` with the least predicted harm, and this harm (m2/s2).
+    """Return the deceleration (m/s2) of vehicle ``i`` for which the predicted harm is least, and this harm (m2/s2).
 
     Only the six decelerations in ``at`` (m/s2) are compared. If several of these decelerations have the least harm,
     consider the middle between the smallest and the largest of them: if the middle has the least harm as well, the
@@ -181,8 +181,8 @@ def contacts_of_worlds(gaps: Floats, speeds: Floats, deceleration: Floats, onset
     """Write to ``out`` [n, P] the squared closing speed (m2/s2) at each pair's first impact, or 0 without an impact.
 
     It is assumed that impacts change no speed, so that pairs do not influence each other. The worlds have the gaps
-    ``gaps`` [n, P] m and the speeds ``speeds`` [n, N] m/s. In world k, vehicle j brakes with the constant
-    ``deceleration[k, j]`` m/s2 from ``onset[k, j]`` seconds on.
+    ``gaps`` [n, P] m and the speeds ``speeds`` [n, N] m/s. In world k, vehicle j coasts for ``onset[k, j]`` seconds and
+    then brakes with the constant ``deceleration[k, j]`` m/s2.
     """
     for k in range(gaps.shape[0]):
         for p in range(gaps.shape[1]):

@@ -31,7 +31,7 @@ class Samples(NamedTuple):
 
 @compiled
 def make_samples(most: int) -> Samples:
-    """Return arrays for ``most`` samples, whose values are not yet set."""
+    """Return arrays for at most ``most`` samples. The values of the arrays are not yet set."""
     return Samples(np.empty(most), np.empty(most), np.empty(most), np.empty(most))
 
 
@@ -107,7 +107,7 @@ def least_harm(samples: Samples, n: int) -> float:
 
 @compiled(bare=True)
 def find_smallest(values: Floats, n: int, places: Ints) -> None:
-    """Write to ``places`` the indices of the smallest of the first ``n`` entries of ``values``, smallest entry first.
+    """Write the indices of the smallest of the first ``n`` entries of ``values`` to ``places``, smallest entry first.
 
     The length of ``places``, at most ``n``, is the number of entries to find. Of equal values, the one with the lower
     index comes first.

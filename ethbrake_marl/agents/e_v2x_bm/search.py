@@ -81,7 +81,7 @@ class Room(NamedTuple):
 
 @compiled
 def make_room() -> Room:
-    """Return arrays for intermediate results of searches, whose values are not yet set."""
+    """Return arrays for the intermediate results of searches. The values of the arrays are not yet set."""
     return Room(
         make_samples(_MOST), make_samples(_MOST), make_samples(_MOST), make_samples(_FEW), np.empty(_MOST),
         np.empty(CELLS, np.int64), np.empty(BORDERS, np.int64), np.empty(MINIMA, np.int64),
@@ -122,8 +122,8 @@ def look_evenly(line: Line, room: Room, breakpoints: Floats, capacity: float) ->
     """Step 1: simulate evenly spaced decelerations and the ``breakpoints`` [CANDIDATES] (m/s2) in the world ``line``.
 
     The samples of the evenly spaced decelerations (the *grid*) are written to ``room.one``. The samples of grid and
-    breakpoints together are written to ``room.two``, sorted by deceleration. The grid ends at ``capacity`` (m/s2).
-    Returns ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed.
+    breakpoints together are written to ``room.two``, sorted by deceleration. The largest deceleration of the grid is
+    ``capacity`` (m/s2). Returns ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed.
     """
     grid, new = room.one, room.few
     for k in range(GRID):
@@ -143,7 +143,7 @@ def look_inside(line: Line, room: Room) -> int:
     """Step 2: simulate more decelerations in some cells (intervals between neighbouring decelerations of the grid).
 
     The search simulates more decelerations in a cell if the number of impacts changes in this cell, or if the estimated
-    least harm of the cell is below the harm of all samples so far. All samples, with the new ones, are written to
+    least harm of the cell is below the harm of all samples so far. All samples, old and new, are written to
     ``room.one``; the last sample is repeated until there are ``_LOOKED`` samples. Returns ``FLAG.DONE`` or, if a
     simulation failed, the code of the physics check that failed.
     """
@@ -187,9 +187,9 @@ def locate_borders(line: Line, room: Room) -> int:
     """Step 3: locate borders (decelerations at which the number of impacts changes) near which the harm may be least.
 
     Between two borders the harm has no jumps. Therefore, if the harm falls towards a border, the harm is least directly
-    at this border. For each located border, two samples that are at most 1e-9 m/s2 apart are found, one on each side.
-    All samples, with the new ones, are written to ``room.two``. Returns ``FLAG.DONE`` or, if a simulation failed, the
-    code of the physics check that failed.
+    at this border. For each located border, the search finds two samples that are at most 1e-9 m/s2 apart, one on each
+    side of the border. All samples, old and new, are written to ``room.two``. Returns ``FLAG.DONE`` or, if a simulation
+    failed, the code of the physics check that failed.
     """
     looked, new, few, places, bounds = room.one, room.new, room.few, room.borders, room.values
     best = least_harm(looked, _LOOKED)
@@ -259,14 +259,14 @@ def narrow_minima(line: Line, room: Room) -> int:
 def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, to: int) -> int:
     """Narrow an interval around a local minimum of the harm until it is at most 1e-9 m/s2 wide.
 
-    Each round divides the interval on each side of the minimum into three parts. Returns ``FLAG.DONE`` or, if a
-    simulation failed, the code of the physics check that failed.
+    Each round divides the interval on each side of the best deceleration so far into three parts. Returns ``FLAG.DONE``
+    or, if a simulation failed, the code of the physics check that failed.
 
     Args:
         line: the world.
         few: array of samples, which is overwritten with intermediate results.
-        low: lower end of the initial interval, m/s2.
-        high: upper end of the initial interval, m/s2.
+        low: lower end, at the start of the search, of the interval to narrow, m/s2.
+        high: upper end, at the start of the search, of the interval to narrow, m/s2.
         found: samples, of which sample ``to`` has the least harm in the interval so far. Sample ``to`` is overwritten
             whenever a deceleration with less harm is found.
         to: index in ``found`` of the sample with the least harm so far.
