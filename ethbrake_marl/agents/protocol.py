@@ -299,7 +299,7 @@ class Team:
 
     @property
     def knows(self) -> Knowledge:
-        """Sources of knowledge of the agents and of the shield together; empty for a team without agents and shield."""
+        """All sources of knowledge of agents and shield; empty if the team has neither agents nor a shield."""
         return Knowledge.of(*self.drivers.values(), *(() if self.shield is None else (self.shield,)))
 
     @staticmethod

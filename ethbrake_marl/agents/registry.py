@@ -219,7 +219,7 @@ def register_agent(
     refers to the factory, or to a ``Part(factory, about=...)``, which can have further arguments of ``register_agent``.
 
     Args:
-        name: name of the agent or wrapper in specifications, without an argument.
+        name: name of the agent as users write it, such as ``idm``, without the colon and the argument after it.
         factory: function ``factory(argument, settings)`` that makes the agent. ``argument`` is the text after the colon
             of the specification, or None; ``settings`` is an ``AgentSettings``.
         about: description in one line, which ``ethbrake agent list`` shows.
@@ -262,7 +262,7 @@ def register_shield(
     ``register_shield``.
 
     Args:
-        name: name of the agent or wrapper in specifications, without an argument.
+        name: name as users write it after ``+``, such as ``step`` in ``ppo+step``, without the colon and the argument.
         wrapper: function ``wrapper(agent, argument, settings)`` that returns an agent around ``agent``. ``argument`` is
             the text after the colon, or None; ``settings`` is an ``AgentSettings``.
         about: description in one line, which ``ethbrake agent list`` shows.

@@ -65,7 +65,7 @@ class Way(NamedTuple):
 
 
 class OwnGrid:
-    """Scripts that have a memory and decide between the beginning and the end of an engine's steps.
+    """Scripts that have a memory and may decide in the middle of an engine's step, not only at its beginning.
 
     Each script first decides when the latency of its vehicle has elapsed, and then once in every time step. An engine's
     step leads from one decision of its deciders (the learners or the evaluated agent's vehicles) to their next

@@ -1,11 +1,11 @@
 """Verdicts on whether the paper's numbers and statements agree with our results.
 
-The *chance difference* is how much two results may differ only because they come from two different random lists of
-worlds.
+The *chance difference* is the largest difference of two results that can be due to chance alone: the two results come
+from two different random lists of worlds.
 
-- A number that the paper prints *agrees* with our number if the difference is at most ``TOLERANCE`` of the printed
-  number. The printed number also agrees if the difference is at most the chance difference, and the chance difference
-  is at most ``WIDE`` of the larger of the two numbers.
+- A number that the paper prints *agrees* with our number if the difference is at most ``TOLERANCE`` times the
+  printed number. The printed number also agrees if two conditions hold. The difference is at most the chance
+  difference, and the chance difference is at most ``WIDE`` times the larger of the two numbers.
 - A printed number that does not agree is *undecided* if its difference from our number is at most the chance
   difference.
 - A printed number *cannot agree* if it is below a proven lower bound for all strategies by more than the chance

@@ -90,7 +90,7 @@ class Planner:
     learners brake fully. ``predicted_harm`` [n] is the harm of the plan made at the alert, m2/s2. If the other vehicles
     do what the planner expects, the simulated harm is at most ``predicted_harm``. Raises ``InvalidInput`` if
     ``argument`` is not a whole number from 1 to ``MOST_CANDIDATES``, or if ``harm_count`` is unknown. ``begin`` raises
-    ``InvalidInput`` if the command of another vehicle's script is not fixed at the alert.
+    ``InvalidInput`` if the script of another vehicle may react to what happens after the alert.
 
     Args:
         argument: number of profiles that are simulated in each world at each decision, as text; None: ``CANDIDATES``.

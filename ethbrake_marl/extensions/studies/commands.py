@@ -235,7 +235,8 @@ def falsify_command(
     again: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE.yaml", help="Do not search; evaluate again in the worlds of this file (from --output)."
+            metavar="FILE.yaml",
+            help="Do not search; evaluate again in the worlds of FILE.yaml, which an earlier search wrote (--output).",
         ),
     ] = None,
     force: ForceOption = False,
