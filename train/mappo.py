@@ -188,7 +188,8 @@ def train(settings: Settings, folder: Path) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     for field in fields(Settings):
-        parser.add_argument(f"--{field.name.replace('_', '-')}", type=type(field.default), default=field.default)
+        option = f"--{field.name.replace('_', '-')}"
+        parser.add_argument(option, type=type(field.default), default=field.default, help=f"default: {field.default}")
     settings = Settings(**vars(parser.parse_args()))
     try:
         for name in ("steps", "copies", "rollout", "epochs", "minibatch", "hidden"):
