@@ -145,7 +145,7 @@ def test_tutorial__own_worlds_give_the_printed_harms(tmp_path: Path, monkeypatch
     worlds.write_text(
         "gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps\n10,8,20,18,20\n5,9,22,18,20\n7,7,20,18,20\n"
     )
-    (program,) = re.findall(r"```python\n(.*mine\.csv.*?)```", TUTORIAL, re.DOTALL)
+    (program,) = re.findall(r"```python\n([^`]*mine\.csv[^`]*)```", TUTORIAL)
     exec(program, {})
     assert worlds.read_text() in TUTORIAL
     printed = re.search(r"\n(agent,world,[^`]+)```", TUTORIAL)
