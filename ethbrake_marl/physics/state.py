@@ -361,8 +361,8 @@ class Worlds:
             )
         if slow.any():
             raise InvalidInput(
-                f"{who}: in world {int(np.argmax(slow))} brakes build up at a finite rate, for which the result would"
-                " not be exact; leave out brake_rate_mps3 and release_rate_mps3"
+                f"{who}: the result would not be exact, because brakes in world {int(np.argmax(slow))} build up at a"
+                " finite rate; leave out brake_rate_mps3 and release_rate_mps3"
             )
 
     def first_decision_s(self, deciders: Sequence[int]) -> Floats:

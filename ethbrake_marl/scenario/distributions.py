@@ -58,7 +58,7 @@ class Uniform(_Distribution):
         return self.uniform
 
     def value(self, u: Floats) -> Floats:
-        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape: ``low + (high - low) u``.
+        """Turn uniform ``u`` in [0, 1) into values of this distribution, in the same shape: ``low + (high - low) u``.
 
         No value is above high. Because u is at most 1 - 2^-53, the rounded product (high - low) u is below the rounded
         difference high - low.
@@ -88,7 +88,7 @@ class LogUniform(_Distribution):
         return self.loguniform
 
     def value(self, u: Floats) -> Floats:
-        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape: ``low (high / low)^u``."""
+        """Turn uniform ``u`` in [0, 1) into values of this distribution, in the same shape: ``low (high / low)^u``."""
         low, high = self.loguniform
         return np.clip(low * exp_each((u * log(high / low)).ravel()).reshape(u.shape), low, high)
 
@@ -130,7 +130,7 @@ class Normal(_Distribution):
         return self.normal.low, self.normal.high
 
     def value(self, u: Floats) -> Floats:
-        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
+        """Turn uniform ``u`` in [0, 1) into values of this distribution, in the same shape.
 
         A value is ``mean + sd Q(p_low + (p_high - p_low) u)``, where Q is the quantile function of the standard normal
         distribution. The numbers p_low and p_high are the probabilities that a value of the untruncated normal
@@ -176,7 +176,7 @@ class LogNormal(_Distribution):
         return self.lognormal.low, self.lognormal.high
 
     def value(self, u: Floats) -> Floats:
-        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
+        """Turn uniform ``u`` in [0, 1) into values of this distribution, in the same shape.
 
         A value is ``exp(x)``, where x has a normal distribution truncated to [log(low), log(high)].
         """
@@ -205,7 +205,7 @@ class Choice(_Distribution):
         return min(self.choice), max(self.choice)
 
     def value(self, u: Floats) -> Floats:
-        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
+        """Turn uniform ``u`` in [0, 1) into values of this distribution, in the same shape.
 
         The value for ``u`` is the first entry of ``choice`` whose cumulative weight, normalised to a total of 1, is
         above ``u``.
@@ -239,7 +239,7 @@ class TableColumn:
         return replace(self, rows=self.rows[order][[np.searchsorted(shares, 0.5)]], cumulative=np.ones(1))
 
     def value(self, u: Floats) -> NDArray[Any]:
-        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
+        """Turn uniform ``u`` in [0, 1) into values of this distribution, in the same shape.
 
         The value for ``u`` stands in the first row whose cumulative weight, normalised to a total of 1, is above ``u``.
         """

@@ -156,7 +156,7 @@ def _restore_replay(memory: Any, place: Any, arrays: Arrays) -> None:
 
     Args:
         memory: the replay buffer of Stable-Baselines3, whose content is replaced.
-        place: captured pair (position of the buffer's next entry, whether the buffer is full).
+        place: the saved values (position of the replay buffer's next entry, whether the buffer is full).
         arrays: captured arrays by name; the names of the buffer's arrays begin with ``replay.``.
 
     Raises ``ValueError`` if the position in ``place`` is invalid, or if an array does not fit the buffer.

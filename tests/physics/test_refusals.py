@@ -106,8 +106,8 @@ SAMPLED: dict[str, Callable[[], object]] = {
     "advance_sampled: world 0 has an obstacle ahead (obstacle_gap_m = 10)": lambda: advance_sampled(
         line([5.0], [9.0, 9.0], obstacle_gap_m=10.0), -6.0, until_s=1.0
     ),
-    "advance_sampled: in world 0 brakes build up at a finite rate, for which the result would not": lambda: (
-        advance_sampled(line([5.0], [9.0, 9.0], brake_rate_mps3=9.0), [[0.0, 0.0]], until_s=1.0)
+    "advance_sampled: the result would not be exact, because brakes in world 0 build up": lambda: advance_sampled(
+        line([5.0], [9.0, 9.0], brake_rate_mps3=9.0), [[0.0, 0.0]], until_s=1.0
     ),
     "advance_sampled: a vehicle of world 0 follows a braking profile, for which the result would not be": lambda: (
         advance_sampled(line([5.0], [9.0, 9.0]).play_pieces({1: [(0, 3), (1, 5)]}), [[0.0, 0.0]], until_s=1.0)

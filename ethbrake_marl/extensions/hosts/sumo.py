@@ -164,7 +164,7 @@ class FoundHost(NamedTuple):
         at_once: int = 100,
         on_progress: Callable[[str, int], None] = lambda agent, done: None,
     ) -> tuple[Evaluation, dict[str, Bools | None]]:
-        """Let several agents drive the scenario's learners in a host, all in the same worlds.
+        """Let one agent after the other drive the scenario's learners in SUMO, each in the same worlds.
 
         Args:
             sample: the worlds at the alert.

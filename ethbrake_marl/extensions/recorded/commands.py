@@ -33,10 +33,11 @@ def from_data_command(
         str,
         typer.Option(
             metavar="ROLE=COLUMN,...",
-            help="For --format table: names of columns, as time=T,vehicle=V,lane=L,front=X,length=B,speed=S,units=m."
-            " time is in s; write T/1000 for ms, or T/25 for frames at 25 Hz. front is the position of the front bumper"
-            " and must increase in the direction of travel. units=m: lengths in m, speeds in m/s; ft: in ft and ft/s;"
-            " km/h: in m and km/h.",
+            help="For --format table: which column of the file has which role, for instance"
+            " time=T,vehicle=V,lane=L,front=X,length=B,speed=S,units=m if the columns are called T, V, L, X, B and S."
+            " Time must be in s: write time=T/1000 if T is in ms, and time=T/25 if T counts frames at 25 Hz. front is"
+            " the position of the front bumper, which must increase in the direction of travel. units is m (lengths in"
+            " m, speeds in m/s), ft (ft and ft/s) or km/h (m and km/h).",
         ),
     ] = "",
     based_on: Annotated[

@@ -240,7 +240,7 @@ AGENTS: dict[str, Callable[[], object]] = {
     "scenario 'mixture-delays' is a mixture of scenarios": lambda: make_agent(
         "e_v2x_bm:estimated", scenario=eb.load_scenario("mixture-delays")
     ),
-    ":estimated: in world 0 brakes build up at a finite rate, for which the result would not be exact; leave": lambda: (
+    ":estimated: the result would not be exact, because brakes in world 0 build up at a finite rate; leave": lambda: (
         evaluated(make_agent("full_brake+step:estimated", scenario=SLOW), SLOW)
     ),
     ":estimated: a vehicle of world 0 follows a braking profile, for which the result would not be exact;": lambda: (

@@ -514,7 +514,7 @@ def test_host__that_does_not_fit_is_refused_before_anything_moves(host, message)
         (
             "paper-random-buildup",
             None,
-            "host: in world 0 brakes build up at a finite rate, for which the result would not",
+            "host: the result would not be exact, because brakes in world 0 build up at a finite rate",
         ),
         (PAPER.with_learners([]), None, "host: scenario 'paper-random' has no learner; give one with a learner"),
         (PAPER, PAPER, "is not an agent"),

@@ -72,7 +72,7 @@ PROOFS: dict[str, Callable[[], object]] = {
     "team_bound: vehicle_1 follows the script 'coast'; must be 'full_brake'": lambda: team_bound(
         TEAM, (1, 2), scripts={0: "coast"}
     ),
-    "avoidability: in world 0 brakes build up at a finite rate, for which the result would not be exact;": lambda: (
+    "avoidability: the result would not be exact, because brakes in world 0 build up at a finite rate;": lambda: (
         avoidability(PAPER.replace(brake_rate_mps3=9).sample(2, 7).worlds)
     ),
     "avoidability: a vehicle of world 0 follows a braking profile, for which the result would not be exact;": lambda: (
