@@ -230,8 +230,8 @@ def write_dataset(
 
     Args:
         path: file (``.parquet``) or folder (``NAME-v0``) to write.
-        agents: names of agents as on the command line, or a mapping from names to agents or teams. Each agent drives
-            the learners of the scenario. The function does not change the agents.
+        agents: names of agents as on the command line, or a mapping from names to agents or teams. In its
+            own episodes, each agent drives all learners of the scenario. The function does not change the agents.
         scenario: a ``Scenario``, or its name or path.
         episodes: number of worlds in which each agent drives: the worlds 0 to ``episodes`` - 1 of ``seed``.
         seed: seed from which the worlds are drawn.
