@@ -85,7 +85,7 @@ def run_command(
     """
     with Out(as_json=as_json, force=force, remains=REMAINS) as out:
         # torch takes seconds to load, here and in the other commands that learn
-        from ethbrake_marl.training.experiment import run_experiment
+        from ethbrake_marl.training.experiment import HYBRID, SHIELDED_TEAM, run_experiment
         from ethbrake_marl.training.progress import objective_in_words
 
         plan = training.load_recipe(recipe or quickest())
@@ -111,9 +111,10 @@ def run_command(
         own = objective_in_words(trained.training)
         count = "total" if plan.reward.harm_count == "total" else "first-impact"
         what = "policy" if len(chosen.learners) == 1 else f"team (scheme {trained.training.scheme})"
+        shielded = HYBRID if len(chosen.learners) == 1 else SHIELDED_TEAM
         headline = (
             f"Trained by recipe {plan.name}, seed {plan.seed if seed is None else seed}: {trained.steps:,} decisions in"
-            f" {trained.wall_s:.0f} s ({trained.status}). hybrid: the trained {what} behind its shield. All agents"
+            f" {trained.wall_s:.0f} s ({trained.status}). {shielded}: the trained {what} with a shield. All agents"
             f" minimise {count} harm{f', except that the trained {what} minimises {own}' if own else ''}.\n"
         )
         out.result(result.results, Text(headline), *result.tables)

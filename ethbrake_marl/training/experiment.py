@@ -39,7 +39,8 @@ BASELINES = ("full_brake", "e_v2x_bm", "e_v2x_bm:pairwise")
 
 TEAM_BASELINES = ("full_brake", "e_v2x_bm")  # baselines that can drive several learners
 
-SHIELDED = "hybrid"  # name of the trained policy or team with a shield
+HYBRID = "hybrid"  # name of the trained policy with the paper's shield
+SHIELDED_TEAM = "shielded team"  # name of the trained team with a shield in step mode
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,9 +201,9 @@ def compared_agents(
     """Return the agents to compare, by name: baselines, and the trained policy or team with and without a shield.
 
     With one learner, the trained agent is ``trained policy``, and ``hybrid`` is this policy with the paper's shield.
-    With several learners, the trained agent is ``trained team``, and ``hybrid`` is this team with a shield in step
-    mode. For several learners there is also a team ``all but vehicle_i`` for each learner i, in which vehicle i brakes
-    fully.
+    With several learners, the trained agent is ``trained team``, and ``shielded team`` is this team with a shield in
+    step mode. For several learners there is also a team ``all but vehicle_i`` for each learner i, in which vehicle i
+    brakes fully.
 
     Args:
         trained: the trained policy, or one trained policy for each learner.
@@ -217,7 +218,7 @@ def compared_agents(
     agents = make_lineup(specs, scenario, harm_count=harm_count)
     if not several:
         agent = LearnedAgent(next(iter(trained.drivers.values())), TRAINED_POLICY)
-        return {**agents, TRAINED_POLICY: agent, SHIELDED: HybridAgent(agent, scenario, harm_count=harm_count)}
+        return {**agents, TRAINED_POLICY: agent, HYBRID: HybridAgent(agent, scenario, harm_count=harm_count)}
     drivers: dict[int, Agent] = {
         i: LearnedAgent(trained.drivers[scenario.vehicle_names[i]], TRAINED_TEAM) for i in scenario.learners
     }
@@ -227,7 +228,7 @@ def compared_agents(
     for i in scenario.learners:
         name = without(scenario.vehicle_names[i])
         agents[name] = Team({**drivers, i: braking}, name)
-    return {**agents, SHIELDED: shielded(team, scenario, "step", harm_count=harm_count)}
+    return {**agents, SHIELDED_TEAM: shielded(team, scenario, "step", harm_count=harm_count)}
 
 
 def without(vehicle: str) -> str:

@@ -38,7 +38,14 @@ from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.registry import Registry
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.training.experiment import SHIELDED, Experiment, RunReport, compared_agents, write_results
+from ethbrake_marl.training.experiment import (
+    HYBRID,
+    SHIELDED_TEAM,
+    Experiment,
+    RunReport,
+    compared_agents,
+    write_results,
+)
 from ethbrake_marl.training.progress import objective_in_words
 
 BESIDE = ("full_brake", "e_v2x_bm")  # agents shown together with the policy in the figures and the other two tests
@@ -234,11 +241,13 @@ def _page(
     how = f"{manifest.algorithm}, scheme {trained.training.scheme}"
     which = (
         f"The {experiment.learned} was trained with {manifest.algorithm if len(trained.policies) == 1 else how}. It was"
-        f" saved after {manifest.steps:,} steps, when its harm on the list of the recipe was least"
+        f" saved after {manifest.steps:,} steps, when it did the least harm in the worlds that the recipe names"
     )
-    summary = f"{which}. The agent “{SHIELDED}” is the same with a shield."
     if experiment.learned == TRAINED_TEAM:
+        summary = f"{which}. The agent “{SHIELDED_TEAM}” is the trained team with a shield in step mode."
         summary += " In the agent “all but” a vehicle, this vehicle brakes fully instead."
+    else:
+        summary = f"{which}. The agent “{HYBRID}” is the trained policy with the paper's shield."
     if beside:
         summary += f" {TESTS[name]} The results of the other two tests are further below."
     stopped = f"The training was interrupted. This is the {experiment.learned} after {manifest.steps:,} steps."

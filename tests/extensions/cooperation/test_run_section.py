@@ -69,7 +69,7 @@ def test_who_bears_what__is_what_the_trained_vehicles_do(folder: Path, count: st
     for name, vehicle in zip(LEARNERS, SCENARIO.learners, strict=True):
         drivers[f"{name} alone"] = alone(folder, name)
         drivers[f"all but {name}"] = Team({**team.drivers, vehicle: BRAKING}, name)
-    assert rows.keys() == drivers.keys() | {"e_v2x_bm", "hybrid"}
+    assert rows.keys() == drivers.keys() | {"e_v2x_bm", "shielded team"}
     for name, driver in drivers.items():
         each = harm(SCENARIO, driver, count).mean(axis=0)
         cells = [rows[name][key] for key in (*SCENARIO.vehicle_names, "line")]
