@@ -122,7 +122,7 @@ def test_table__of_a_run_that_is_damaged_is_named(again, capsys, damage: bytes) 
     damaged.write_bytes(damage)
     assert sweep(file, folder) == 2
     (told,) = capsys.readouterr().err.splitlines()
-    assert f"{damaged}: is damaged (" in told and told.endswith("; delete the run's folder to train again")
+    assert f"{damaged}: the file is damaged (" in told and told.endswith("; delete the run's folder to train again")
 
 
 def test_run__of_another_training_is_not_done(again, capsys) -> None:
@@ -371,14 +371,14 @@ def test_dry_run__tells_how_many_trials_of_what_and_a_command_that_trains_the_fi
         f"7 trials ({TRIALS} of them begun): recipe {recipe} in scenario paper-random;"
         " 512 decisions per trial that is not pruned"
     )
-    assert last.startswith(f"the first: ethbrake train --scenario paper-random --recipe {recipe} --seed 0 --set ")
+    assert last.startswith(f"the first trial: ethbrake train --scenario paper-random --recipe {recipe} --seed 0 --set ")
     settings = [word for word in shlex.split(last) if "=" in word]
     trained = read_settings(settings, [load_recipe(recipe)]).change(load_recipe(recipe))
     identity = Training.of(trained, eb.load_scenario("paper-random")).identity
     assert identity == read(finished_tuning / TRIALS_TABLE)[0]["hash"]
     other = write_tuning(search={"max_grad_norm": {"low": 0.6, "high": 0.9}})  # the recipe has 0.5
     assert tune(other, tmp_path / "new", "--dry-run") == 0
-    assert "\nfor example: ethbrake train " in capsys.readouterr().out and not (tmp_path / "new").exists()
+    assert "\nexample of a trial: ethbrake train " in capsys.readouterr().out and not (tmp_path / "new").exists()
 
 
 def test_pruned_trials__stop_early_with_more_harm_than_the_median_had(finished_tuning: Path) -> None:
