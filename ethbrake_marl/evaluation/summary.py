@@ -162,8 +162,8 @@ class SummaryTable(list[SummaryRow]):
         if not self:
             return ""
         ours = (
-            f"Ours: {self[0].parameters.line}. Harms are means per world in m²/s². The 95 % interval of a value is in"
-            " brackets or below the value. A decrease is relative to full braking."
+            f"Worlds: {self[0].parameters.line}. Harms are means per world in m²/s². The 95 % interval of a value is in"
+            " brackets or below the value. A decrease is relative to the baseline, by default full braking."
         )
         return "\n\n".join([ours, *(text for _, text in self.notes())])
 

@@ -162,9 +162,9 @@ class LimitMeasures(MeasureSet):
         known = row.more[NAME]["known_best_share"]
         if known is not None and known < 1.0:
             lines.append(
-                f"The best known harm of {100.0 * known:.1f} % of the worlds comes from an earlier search. In the other"
-                " worlds it is the least harm of the agents above, so regrets are lower bounds, and the share of the"
-                " possible reduction is omitted."
+                f"An earlier search covers {100.0 * known:.1f} % of the worlds. Elsewhere the best known harm is only the"
+                " least harm of the agents above, so regrets are lower bounds, and the share of the possible reduction is"
+                " omitted."
             )
         counts = {each.agent: each.more[NAME]["below_best_known"] for each in rows}
         below = [f"{agent} in {count_of(count, 'world')}" for agent, count in counts.items() if count]
@@ -206,7 +206,7 @@ def _best(row: SummaryRow, first: float, total: float) -> str:
     ]
     return (
         f"Mean best known harm: {first:.2f} first-impact, {total:.2f} total. Proven lower bound: {least:.2f}."
-        f" Gap: {' and '.join(gaps)}."
+        f" Best known harm minus this bound: {gaps[0]} first-impact, {gaps[1]} total."
     )
 
 

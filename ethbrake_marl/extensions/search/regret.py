@@ -92,8 +92,8 @@ class Between:
         if self.mean_first is None or self.harmless_rate is None:
             return text
         return (
-            f"{text} Their mean best known harm is {self.mean_first:.2f}; in {100 * self.harmless_rate:.0f} % of them"
-            " it is practically 0."
+            f"{text} The mean best known harm of these worlds is {self.mean_first:.2f}; in"
+            f" {100 * self.harmless_rate:.0f} % of these worlds it is practically 0."
         )
 
     @classmethod

@@ -250,7 +250,7 @@ def test_distance__a_best_that_is_not_known_everywhere_realises_nothing(four: Ev
     table = summarise(four).markdown()
     assert "WARNING: the table of best known harm contains 2 of the 4 worlds" in table and "≥ 0.75" in table
     assert (
-        "The best known harm of 75.0 % of the worlds comes from an earlier search" in table
+        "An earlier search covers 75.0 % of the worlds. Elsewhere" in table
         and "Less harm than the earlier best known harm: a in 1 world." in table
     )
 
