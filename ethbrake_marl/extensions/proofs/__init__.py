@@ -3,10 +3,10 @@
 Most files look at one controlled vehicle and its two neighbours. The front vehicle is also called *leader*, the
 controlled vehicle *follower*. In names of arguments the index l marks the front vehicle, f the controlled vehicle and r
 the rear vehicle; v is a speed (m/s), a > 0 a braking capacity and u >= 0 a driving capacity (m/s2). The *front pair* is
-the front and the controlled vehicle; the *rear pair* is the controlled and the rear vehicle. Time 0 is the moment at
-which the controlled vehicle may act. The *first contact* is the first contact of the controlled vehicle with either
-neighbour. The *extreme command* is full drive after a first contact with the front vehicle, and full braking after a
-first contact with the rear vehicle.
+the front and the controlled vehicle; the *rear pair* is the controlled and the rear vehicle. The *first contact* is the
+first contact of the controlled vehicle with either neighbour. The *extreme command* is full drive after a first contact
+with the front vehicle, and full braking after a first contact with the rear vehicle. Time 0 is the moment at which the
+controlled vehicle may act; all times are in s after time 0.
 
 These arguments have the same meaning in all files, unless a docstring says otherwise:
 

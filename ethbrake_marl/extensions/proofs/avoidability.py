@@ -5,14 +5,14 @@ trajectory that stays behind the front vehicle. Contact with the rear vehicle ca
 vehicle stays behind the largest trajectory.
 
 Symbols: the index l marks the front vehicle (leader), f the controlled vehicle (follower), r the rear vehicle. A gap is
-in m, a speed v in m/s, a braking capacity a > 0 and a driving capacity u >= 0 in m/s2. The leader already brakes when
-the controlled vehicle may act. docs/internals/proofs/avoidable-contact.md derives every formula. The formulas use only
-+ - * / and sqrt, so they give the same bits on every machine.
+in m, a speed v in m/s, a braking capacity a > 0 and a driving capacity u >= 0 in m/s2. Time 0 is the moment at which
+the controlled vehicle may act; the leader already brakes at time 0. docs/internals/proofs/avoidable-contact.md derives
+every formula. The formulas use only + - * / and sqrt, so they give the same bits on every machine.
 
-Arguments that several functions share: the arrays ``gap`` [P] (m), ``speed`` [N] (m/s), ``braking``, ``driving``
-(capacities, m/s2) and ``limit`` (speed limit, m/s) [N] describe one world; ``onset`` [N] has the time (s from now) from
-which on each vehicle may act. ``i`` is the index of the controlled vehicle. ``out`` [RESULT_WIDTH] is the verdict,
-which the functions write (``decide_world``).
+Arrays that several functions share: ``gap`` [P], ``speed`` [N], ``braking`` and ``driving`` [N] (capacities, m/s2) and
+``limit`` [N] (speed limit, m/s) describe one world; ``onset`` [N] has the time (s from now) from which on each vehicle
+may act. ``i`` is the index of the controlled vehicle. ``out`` [RESULT_WIDTH] is the verdict, into which the functions
+write (columns: see ``decide_world``).
 """
 
 from __future__ import annotations
@@ -270,8 +270,8 @@ class Avoidability:
     # full braking leads to contact with the front vehicle. 3, rear: the rear vehicle reaches the largest trajectory
     reason: Ints
     margin_m: Floats  # [n] smallest gap to the rear vehicle, m; negative if contact is unavoidable
-    switch_s: Floats  # [n, 3] times from which on the commands of the witness apply, s
-    command_mps2: Floats  # [n, 3] commands of the witness, m/s2
+    switch_s: Floats  # [n, 3] times from which on the commands apply, s
+    command_mps2: Floats  # [n, 3] commands that avoid contact, m/s2
 
     @property
     def avoidable(self) -> Bools:

@@ -3,8 +3,10 @@
 A first contact has a time and a closing speed. The harm of a first contact is its squared closing speed plus the harm
 that must follow (``obstacle.after``). A *cell* is a set of first contacts: a range of times and a range of closing
 speeds. The search halves cells until the smallest bound of any cell is close to the smallest harm that the search has
-reached. docs/internals/proofs/lower-bound.md has the proof; ``proofs/__init__.py`` explains arguments that functions
-share. ``count`` is the number of cells on the heap. Row 0 of the heap is always the cell with the smallest bound.
+reached. docs/internals/proofs/lower-bound.md has the proof.
+
+``proofs/__init__.py`` explains the arguments that functions share. ``count`` is the number of cells on the heap. Row 0
+of the heap is always the cell with the smallest bound.
 """
 
 from __future__ import annotations

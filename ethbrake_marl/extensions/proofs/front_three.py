@@ -3,9 +3,11 @@
 For first contacts with the leader, the module uses ``lower_bound.front_first``, the bound for one controlled vehicle.
 This bound assumes that the rear vehicle brakes fully. The bound for full braking also holds for a rear vehicle that may
 do anything, because a rear vehicle that arrives earlier never lowers the harm. For first contacts with the rear vehicle
-there is a separate search (``free_rear.meetings_behind``). docs/internals/proofs/team-bound.md has the proofs;
-``proofs/__init__.py`` and ``free_rear`` explain arguments that functions share. ``first`` is the earliest time (s) of a
-first contact with the front vehicle. ``pair`` [PAIR_WIDTH] is working memory for the values of one pair; overwritten.
+there is a separate search (``free_rear.meetings_behind``). docs/internals/proofs/team-bound.md has the proofs.
+
+``proofs/__init__.py`` and ``free_rear`` explain the arguments that functions share. ``first`` is the earliest time (s)
+of a first contact with the front vehicle. ``pair`` [PAIR_WIDTH] is working memory for the values of one pair;
+overwritten.
 """
 
 from __future__ import annotations

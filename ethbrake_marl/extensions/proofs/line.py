@@ -1,5 +1,7 @@
 """Columns of the arrays that describe worlds in the proofs, and the motion of a front or rear vehicle that nothing
 pushes.
+
+``at`` is the state of one world: a row of such an array, [LINE.WIDTH].
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """``lower_bound``: a proven lower bound on the harm of every world, whatever the controlled vehicle does.
 
-``proofs/__init__.py`` explains arguments that functions share. ``front`` and ``rear`` are lower bounds on the harm of
-the front pair alone and of the rear pair alone, m2/s2.
+``proofs/__init__.py`` explains the arguments that functions share. ``front`` and ``rear`` are lower bounds on the harm
+of the front pair alone and of the rear pair alone, m2/s2.
 """
 
 from __future__ import annotations

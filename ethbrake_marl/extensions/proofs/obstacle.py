@@ -2,8 +2,8 @@
 
 ``beyond`` is the squared speed (m2/s2) at which the leader hits the obstacle. The leader's speed at the obstacle limits
 how far ahead the leader can be at any time. Position 0 is the place of the controlled vehicle at the moment at which it
-may act. Masses are in units of the controlled vehicle's mass. docs/internals/proofs/lower-bound-obstacle.md has the
-proofs; ``proofs/__init__.py`` explains arguments that functions share.
+may act. Masses are in units of the controlled vehicle's mass. ``proofs/__init__.py`` explains the other arguments that
+functions share. docs/internals/proofs/lower-bound-obstacle.md has the proofs.
 """
 
 from __future__ import annotations

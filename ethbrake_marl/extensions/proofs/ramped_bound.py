@@ -1,6 +1,6 @@
 """Compute the lower bound on harm if brakes build up at finite rates.
 
-``proofs/__init__.py`` explains arguments that functions share.
+``proofs/__init__.py`` explains the arguments that functions share.
 """
 
 from __future__ import annotations
@@ -102,9 +102,9 @@ def bound_ramped(states: Floats, has_front: Bools, has_rear: Bools, both: Bools,
 def ramped_states(worlds: Worlds, i: int, until: Floats) -> Floats:
     """Return worlds with brake build-up as an array with the columns of ``line.LINE``, [n, LINE.WIDTH].
 
-    The state of ``worlds`` is their state at the moment when vehicle ``i``, the controlled vehicle, may act. ``until``
-    [n] is the horizon in s from this moment. A controlled vehicle that already brakes or drives is treated as if its
-    brakes built up and released at once.
+    The worlds are in their state at the moment when the controlled vehicle ``i`` may act. ``until`` [n] is the horizon,
+    in s from this moment. A controlled vehicle that already brakes or drives is treated as if its brakes built up and
+    released at once.
     """
     v, at = worlds.vehicles, onset_states(worlds, i, None)
     moved = worlds.command_mps2[:, i] != 0.0

@@ -2,12 +2,14 @@
 
 ``sign`` is 1 for first contacts with the leader and -1 for first contacts with the rear vehicle. The functions treat
 contacts with the rear vehicle as the mirror image of contacts with the leader. Here *force* means force per mass, which
-is an acceleration (m/s2). ``sign`` times the controlled vehicle's force first rises and later falls: the *switch* is
+is an acceleration (m/s2). ``sign`` times the controlled vehicle's force first rises and later falls; the *switch* is
 the time (s) at which it begins to fall. For a contact with the leader the controlled vehicle drives and then brakes;
-for a contact with the rear vehicle it brakes and then drives. ``place`` is a position times ``sign`` (m). ``final`` is
-the required value of ``sign`` times the force at the time of the contact (m/s2), or -inf if no value is required.
-``proofs/__init__.py`` explains further arguments that functions share. docs/internals/proofs/lower-bound-cases.md has
-the proofs.
+for a contact with the rear vehicle it brakes and then drives. docs/internals/proofs/lower-bound-cases.md has the
+proofs.
+
+``place`` is a position times ``sign`` (m). ``final`` is the required value of ``sign`` times the force at the time of
+the contact (m/s2), or -inf if no value is required. ``proofs/__init__.py`` explains the other arguments that functions
+share.
 """
 
 from __future__ import annotations
@@ -284,7 +286,8 @@ class LowerBound:
 
     @property
     def impact_proven(self) -> Bools:
-        """True in worlds in which every command of the controlled vehicle certainly leads to an impact, [n].
+        """Boolean mask [n]: True for worlds in which every command of the controlled vehicle certainly leads to an
+        impact.
 
         False means that no impact is proven; an impact may be unavoidable nevertheless.
         """
@@ -372,9 +375,9 @@ def rounding(worlds: Worlds, vehicle: int | Ints, way_m: Floats | float = 0.0) -
 def onset_states(worlds: Worlds, i: int, time_step_s: float | Floats | None) -> Floats:
     """Return the worlds as an array with the columns of ``line.LINE``, [n, LINE.WIDTH].
 
-    The state of ``worlds`` is their state at the moment when vehicle ``i``, the controlled vehicle, may act. If this
-    vehicle has no front or no rear vehicle, the columns of this neighbour are 0. ``time_step_s`` is the time between
-    two decisions, s; one number, or [n]. None, or 0 in an array, means that commands may change at any time.
+    The worlds are in their state at the moment when the controlled vehicle ``i`` may act. If this vehicle has no front
+    or no rear vehicle, the columns of this neighbour are 0. ``time_step_s`` is the time between two decisions, s; one
+    number, or [n]. None, or 0 in an array, means that commands may change at any time.
     """
     v = worlds.vehicles
     at = np.zeros((worlds.n, LINE.WIDTH))

@@ -114,7 +114,7 @@ class TeamBound:
 
     @property
     def impact_proven(self) -> Bools:
-        """True in worlds in which an impact is certain whatever the controlled vehicles do, [n].
+        """Boolean mask [n]: True for worlds in which an impact is certain whatever the controlled vehicles do.
 
         False means that no impact is proven; an impact may be unavoidable nevertheless.
         """
