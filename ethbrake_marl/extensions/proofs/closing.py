@@ -3,8 +3,10 @@
 The bound compares every motion of the pair with one extreme motion of each vehicle. The leader (front vehicle) goes as
 far ahead as it can: it drives fully if it is controlled, and brakes fully otherwise. The follower brakes fully, so it
 stays as far behind as it can. If the extreme motions lead to contact, every other motion of the pair leads to contact
-at the same time or earlier. In this file ``at`` describes one pair, [PAIR_WIDTH], in the columns ``PAIR_GAP`` to
-``FOLLOWER_A``. docs/internals/proofs/team-bound.md has the proof.
+at the same time or earlier. docs/internals/proofs/team-bound.md has the proof.
+
+In this file ``at`` describes one pair, [PAIR_WIDTH], in the columns ``PAIR_GAP`` to ``FOLLOWER_A``. ``plan`` and
+``other`` are working memory, arrays from ``empty_plan``.
 """
 
 from __future__ import annotations

@@ -64,18 +64,14 @@ AHEAD_M = 1e-9  # an overlap below this does not count as contact with the other
 
 @compiled
 def leader(at: Floats, time: float) -> tuple[float, float]:
-    """Return speed (m/s) and travelled distance (m) of the front vehicle at ``time`` (s) if no other vehicle pushes
-    it.
-    """
+    """Return speed (m/s) and travelled distance (m) of the front vehicle at ``time`` if no other vehicle pushes it."""
     speed, way, _ = solo_motion(at[LINE.V_L], -at[LINE.A_L], 0.0, math.inf, time)
     return speed, way
 
 
 @compiled
 def follower(at: Floats, time: float) -> tuple[float, float]:
-    """Return speed (m/s) and travelled distance (m) of the rear vehicle at ``time`` (s) if no other vehicle pushes
-    it.
-    """
+    """Return speed (m/s) and travelled distance (m) of the rear vehicle at ``time`` if no other vehicle pushes it."""
     speed, way, _ = solo_motion(at[LINE.V_R], -at[LINE.A_R], at[LINE.ONSET_R], math.inf, time)
     return speed, way
 

@@ -90,10 +90,10 @@ def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, o
     """Return the latest time (s), at most ``last``, at which a contact with the neighbour ``kind`` can come before any
     contact with the other neighbour.
 
-    The function finds this time by bisection, from a time ``first`` (s) at which this is possible: the later the first
-    contact, the nearer is the other neighbour. The later the contact with the front vehicle, the shorter the controlled
-    vehicle drives, so the rear vehicle comes nearer. The later the contact with the rear vehicle, the shorter the
-    controlled vehicle brakes, so the controlled vehicle comes nearer to the front vehicle.
+    The function finds this time by bisection, beginning with ``first`` (s), a time at which such a contact is possible.
+    The later the first contact, the nearer is the other neighbour. The later the contact with the front vehicle, the
+    shorter the controlled vehicle drives, so the rear vehicle comes nearer. The later the contact with the rear
+    vehicle, the shorter the controlled vehicle brakes, so the controlled vehicle comes nearer to the front vehicle.
     """
     if is_first(kind, at, last, plan, other):
         return last

@@ -43,7 +43,7 @@ def combined_ramped(
 
     The first contact may be with the front or the rear vehicle. The result is 0 if nothing is proven. ``until`` is the
     horizon (s), after which harm does not count. ``front`` and ``rear`` are lower bounds on the harm of each pair alone
-    (m2/s2). ``contact_s`` is the time by which some contact is certain, or infinite.
+    (m2/s2). ``contact_s`` is the time by which some contact is certain, infinite if no contact is known to be certain.
     """
     if min(at[LINE.GAP_L], at[LINE.GAP_R]) <= TOUCHING_M:
         return 0.0
