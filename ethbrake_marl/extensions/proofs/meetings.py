@@ -5,8 +5,8 @@ Times are measured from the moment at which the controlled vehicle may act. The 
 The rear vehicle coasts until its latency has elapsed, and then brakes. All speeds and gaps are at least 0.
 docs/internals/proofs/lower-bound.md has the proofs.
 
-``proofs/__init__.py`` explains the arguments that functions share. ``drive`` is the time (s) for which a vehicle drives
-before it brakes; ``brake`` is the time (s) for which a vehicle brakes before it drives.
+``proofs/__init__.py`` explains the arguments that functions share. ``drive`` is how long (s) a vehicle drives before it
+brakes, and ``brake`` how long (s) a vehicle brakes before it drives.
 """
 
 from __future__ import annotations

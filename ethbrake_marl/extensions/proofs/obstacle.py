@@ -67,8 +67,8 @@ def least_beyond(
     """Return the smallest squared speed (m2/s2) at which the front vehicle, pushed at ``early``, hits the obstacle.
 
     The bound uses the centre of mass of all three vehicles, which cannot reach the obstacle before the front vehicle
-    does. ``place`` is its smallest possible position (m) and ``speed`` its speed (m/s) at ``late``. The result is at
-    least ``least``, a lower bound that is known already.
+    does. At ``late``, ``place`` is the smallest possible position (m) and ``speed`` the speed (m/s) of this centre of
+    mass. The result is at least ``least``, a lower bound that is known already.
     """
     if not speed > 0.0:
         return least
