@@ -8,6 +8,11 @@ Symbols: the index l marks the front vehicle (leader), f the controlled vehicle 
 in m, a speed v in m/s, a braking capacity a > 0 and a driving capacity u >= 0 in m/s2. Time 0 is the moment at which
 the controlled vehicle may act; the leader already brakes at time 0. docs/internals/proofs/avoidable-contact.md derives
 every formula. The formulas use only + - * / and sqrt, so they give the same bits on every machine.
+
+Arrays that several functions share: ``gap`` [P], ``speed`` [N], ``braking`` and ``driving`` [N] (capacities, m/s2) and
+``limit`` [N] (speed limit, m/s) describe one world; ``onset`` [N] has the time (s from now) from which on each vehicle
+may act. ``i`` is the index of the controlled vehicle. ``out`` [RESULT_WIDTH] is the verdict, into which the functions
+write (columns: see ``decide_world``).
 """
 
 from __future__ import annotations
@@ -39,18 +44,11 @@ REASON, MARGIN, SPARE, DRIVE, TOUCH, FOLLOW, RESULT_WIDTH = range(7)  # columns 
 
 @compiled
 def spare_gap(gap: float, v_l: float, a_l: float, v_f: float, a_f: float) -> float:
-    """Return the smallest gap (m) if the follower and the front vehicle both brake fully from now on. A negative result
-    means that the two vehicles make contact. If the follower comes to rest last, the smallest gap is the gap at rest.
-    If the follower does not come to rest last, the gap is smallest when both speeds are equal, or now if the leader is
-    at least as fast as the follower.
+    """Return the smallest gap (m) if the follower and the leader both brake fully from now on.
 
-    Args:
-        gap: gap between the two vehicles, m.
-        v_l: speed of the front vehicle (leader), m/s.
-        a_l: braking capacity of the leader, m/s2.
-        v_f: speed of the follower, m/s.
-        a_f: braking capacity of the follower, m/s2.
-
+    A negative result means that the two vehicles make contact. If the follower comes to rest last, the smallest gap is
+    the gap at rest. Otherwise the gap is smallest when both speeds are equal, or now if the leader is at least as fast
+    as the follower.
     """
     if v_f * a_l >= v_l * a_f:
         return gap - max(0.0, v_f * v_f / (2.0 * a_f) - v_l * v_l / (2.0 * a_l))
@@ -65,22 +63,13 @@ def drive_before_braking(
 ) -> tuple[float, float, bool]:
     """Return how long a vehicle can drive before it must brake fully to stay behind the leader.
 
-    While it drives, the vehicle has the constant acceleration ``u >= 0``. The leader is the vehicle in front; it brakes
-    from now on. The function requires ``spare_gap >= 0``: full braking from now on avoids an overlap with the leader.
+    The vehicle drives with the constant acceleration ``u``. The leader brakes from now on. The function requires
+    ``spare_gap >= 0``: full braking from now on avoids an overlap with the leader.
 
     The results are the duration of the drive (s), the time at which the gap becomes 0 (s), and whether both vehicles
-    still move at that time. If both vehicles still move when the gap becomes 0, then ``a_f > a_l`` and both have the
-    same speed. If at least one vehicle is at rest when the gap becomes 0, the follower comes to rest behind the leader,
-    which is already at rest. The first two results are infinite if the follower never moves.
-
-    Args:
-        gap: gap to the leader, m.
-        v_l: speed of the leader, m/s.
-        a_l: braking capacity of the leader, m/s2.
-        v_f: speed of the following vehicle, m/s.
-        a_f: braking capacity of the following vehicle, m/s2.
-        u: driving acceleration of the following vehicle, m/s2.
-
+    still move at that time. If both vehicles still move, then ``a_f > a_l`` and both have the same speed. Otherwise the
+    follower comes to rest behind the leader, which is already at rest. The first two results are infinite if the
+    follower never moves.
     """
     w, closing, relief = v_f - v_l, u + a_l, a_f - a_l
     if relief > 0.0 and v_l > 0.0:
@@ -106,21 +95,7 @@ def drive_before_braking(
 def largest_behind(
     gap: float, v_l: float, a_l: float, v_f: float, a_f: float, u: float, limit: float
 ) -> tuple[float, float, bool]:
-    """Return how long a vehicle with a speed limit can drive before it must brake fully to stay behind the leader.
-
-    The leader is the vehicle in front; it brakes from now on. The function also returns the time at which the gap
-    becomes 0 (s), and whether both vehicles still move at that time.
-
-    Args:
-        gap: gap to the leader, m.
-        v_l: speed of the leader, m/s.
-        a_l: braking capacity of the leader, m/s2.
-        v_f: speed of the following vehicle, m/s.
-        a_f: braking capacity of the following vehicle, m/s2.
-        u: driving acceleration of the following vehicle, m/s2.
-        limit: speed limit of the following vehicle, m/s.
-
-    """
+    """Return the results of ``drive_before_braking`` for a follower with the speed limit ``limit`` (m/s)."""
     cap = time_to_limit(v_f, u, limit)
     if cap > 0.0:
         meeting = drive_before_braking(gap, v_l, a_l, v_f, a_f, u)
@@ -135,19 +110,11 @@ def largest_behind(
 
 @compiled
 def lowest_while_coasting(gap: float, v_f: float, v_r: float, a_r: float, onset_r: float, until: float) -> float:
-    """Return the smallest gap (m), until the time ``until``, between a coasting vehicle and the vehicle behind it.
+    """Return the smallest gap (m), until the time ``until`` (s), between a coasting vehicle and the vehicle behind it,
+    which brakes from ``onset_r`` (s) on.
 
     The gap is a convex function of time. Therefore the gap is smallest when both vehicles have the same speed, or at
     the start or end of the coasting.
-
-    Args:
-        gap: present gap between the two vehicles, m.
-        v_f: speed of the coasting vehicle, m/s.
-        v_r: speed of the vehicle behind, m/s.
-        a_r: braking capacity of the vehicle behind, m/s2.
-        onset_r: time from which on the vehicle behind brakes, s.
-        until: time until which the vehicle in front coasts, s.
-
     """
     w = v_r - v_f
     if w <= 0.0:
@@ -167,20 +134,11 @@ def met(gap: float, closing: float) -> bool:
 def leader_at_onset(
     gap: float, v_l: float, a_l: float, onset_l: float, v_f: float, start: float
 ) -> tuple[float, float]:
-    """Return the gap to the leader (m) and the speed of the leader (m/s) at ``start``, if the follower coasts until
-    ``start``.
+    """Return the gap to the leader (m) and the speed of the leader (m/s) at ``start`` (s), if the follower coasts until
+    then.
 
     The leader brakes from the time ``onset_l`` on; ``onset_l`` must not be after ``start``. Until ``start`` the gap is
     a concave function of time: if the gap is not negative at ``start``, the gap was not negative at any earlier time.
-
-    Args:
-        gap: present gap between the two vehicles, m.
-        v_l: speed of the leader (front vehicle), m/s.
-        a_l: braking capacity of the leader, m/s2.
-        onset_l: time from which on the leader brakes, s.
-        v_f: speed of the follower, m/s.
-        start: time at which the follower may act, s.
-
     """
     after, way, _ = solo_motion(v_l, -a_l, onset_l, math.inf, start)
     return gap + (way - v_f * start), after
@@ -188,17 +146,8 @@ def leader_at_onset(
 
 @compiled
 def decide_front(gap: Floats, speed: Floats, onset: Floats, braking: Floats, i: int, out: Floats) -> bool:
-    """Return whether full braking may keep vehicle ``i`` behind the front vehicle; False if contact is certain.
-
-    Args:
-        gap: [P] gap of each pair, m.
-        speed: [N] speed of each vehicle, m/s.
-        onset: [N] time from which on each vehicle may act, s.
-        braking: [N] braking capacity of each vehicle, m/s2.
-        i: index of the controlled vehicle, at least 1.
-        out: [RESULT_WIDTH] verdict, into which the function writes the columns REASON (a code), MARGIN (m) and SPARE
-            (m).
-
+    """Return whether full braking may keep vehicle ``i`` (at least 1) behind the front vehicle; False if contact is
+    certain.
     """
     a_l, v_f, a_f = braking[i - 1], speed[i], braking[i]
     ahead, v_l = leader_at_onset(gap[i - 1], speed[i - 1], a_l, onset[i - 1], v_f, onset[i])
@@ -218,25 +167,11 @@ def plan_behind(
     gap: Floats, speed: Floats, onset: Floats, braking: Floats, driving: Floats, limit: Floats, i: int, keep: float,
     plan: Floats, out: Floats,
 ) -> None:  # fmt: skip
-    """Write to ``plan`` the trajectory of vehicle i that is farthest ahead, but stays ``keep`` metres behind vehicle i
-    - 1.
+    """Write to ``plan`` [2, PIECES] the trajectory of vehicle ``i`` that is farthest ahead, but stays ``keep`` metres
+    behind vehicle ``i - 1``.
 
-    Vehicle i drives as hard as it can, then brakes fully, then follows the vehicle in front at the distance ``keep``.
-
-    Args:
-        gap: [P] gap of each pair, m.
-        speed: [N] speed of each vehicle, m/s.
-        onset: [N] time from which on each vehicle may act, s.
-        braking: [N] braking capacity of each vehicle, m/s2.
-        driving: [N] driving capacity of each vehicle, m/s2.
-        limit: [N] speed limit of each vehicle, m/s.
-        i: index of the controlled vehicle.
-        keep: distance to keep to the vehicle in front, m.
-        plan: [2, PIECES] array into which the function writes the ends (s) and the accelerations (m/s2) of the
-            trajectory's intervals of constant acceleration.
-        out: [RESULT_WIDTH] verdict, into which the function writes the columns DRIVE (s; end of the drive), TOUCH (s;
-            end of the full braking after the drive) and FOLLOW (m/s2; the command after the full braking).
-
+    Vehicle ``i`` drives as hard as it can, then brakes fully, then follows the vehicle in front at the distance
+    ``keep``. The function also writes the columns DRIVE, TOUCH and FOLLOW of ``out``.
     """
     a_f, u = braking[i], driving[i]
     if i > 0:
@@ -251,18 +186,7 @@ def plan_behind(
 
 @compiled
 def meets_rear_early(gap: Floats, speed: Floats, onset: Floats, braking: Floats, i: int, out: Floats) -> bool:
-    """Return whether the vehicle behind vehicle ``i`` has contact with vehicle ``i`` before vehicle ``i`` may act.
-
-    Args:
-        gap: [P] gap of each pair, m.
-        speed: [N] speed of each vehicle, m/s.
-        onset: [N] time from which on each vehicle may act, s.
-        braking: [N] braking capacity of each vehicle, m/s2.
-        i: index of the controlled vehicle.
-        out: [RESULT_WIDTH] verdict; if there is contact, the function writes the columns REASON (a code) and MARGIN
-            (m).
-
-    """
+    """Return whether the vehicle behind vehicle ``i`` has contact with vehicle ``i`` before vehicle ``i`` may act."""
     v_f, v_r, a_r, start = speed[i], speed[i + 1], braking[i + 1], onset[i]
     lowest = lowest_while_coasting(gap[i], v_f, v_r, a_r, onset[i + 1], start)
     after, way, _ = solo_motion(v_r, -a_r, onset[i + 1], math.inf, start)
@@ -282,20 +206,7 @@ def decide_world(
     Columns of the verdict: REASON (AVOIDABLE, EARLY, FRONT or REAR), MARGIN (m; as in ``Avoidability``), SPARE (m; part
     of the gap that remains under full braking), DRIVE (s; end of the drive), TOUCH (s; end of the full braking after
     the drive), FOLLOW (m/s2; the command after the full braking). DRIVE and TOUCH are times after the moment at which
-    vehicle ``i`` may act.
-
-    Args:
-        gap: [P] gap of each pair, m.
-        speed: [N] speed of each vehicle, m/s.
-        onset: [N] time from which on each vehicle may act, s.
-        braking: [N] braking capacity of each vehicle, m/s2.
-        driving: [N] driving capacity of each vehicle, m/s2.
-        limit: [N] speed limit of each vehicle, m/s.
-        i: index of the controlled vehicle.
-        plan: working memory for the motion of vehicle ``i``, [2, PIECES]; overwritten.
-        rear: working memory for the motion of the rear vehicle, [2, PIECES]; overwritten.
-        out: [RESULT_WIDTH] array into which the function writes the verdict.
-
+    vehicle ``i`` may act. ``plan`` and ``rear`` are working memory, arrays from ``empty_plan``.
     """
     out[REASON], out[MARGIN], out[SPARE] = AVOIDABLE, math.inf, math.inf
     out[DRIVE], out[TOUCH], out[FOLLOW] = math.inf, math.inf, -braking[i]
@@ -329,16 +240,7 @@ def decide_worlds(
 ) -> None:
     """Decide for each of ``n`` worlds whether vehicle ``i`` can avoid contact, and write the verdicts to ``out``.
 
-    Args:
-        gaps: [n, P] gap of each pair, m.
-        speeds: [n, N] speed of each vehicle, m/s.
-        onset: [n, N] time from which on each vehicle may act, s.
-        braking: [n, N] braking capacity of each vehicle, m/s2.
-        driving: [n, N] driving capacity of each vehicle, m/s2.
-        limit: [n, N] speed limit of each vehicle, m/s.
-        i: index of the controlled vehicle.
-        out: [n, RESULT_WIDTH] array into which the function writes the verdicts; ``decide_world`` explains the columns.
-
+    All arrays have one row for each world: ``gaps`` is [n, P], ``out`` [n, RESULT_WIDTH], the others [n, N].
     """
     plan, rear = empty_plan(), empty_plan()
     for k in range(gaps.shape[0]):
@@ -354,23 +256,22 @@ class Avoidability:
 
     The *largest trajectory* of the controlled vehicle is farther ahead at every time than any other trajectory that
     stays behind the front vehicle. ``margin_m`` is the smallest gap between the largest trajectory and the rear
-    vehicle. If the controlled vehicle has no rear vehicle, ``margin_m`` is the part of the gap to the front vehicle
-    that remains under full braking. ``margin_m`` is negative if contact is unavoidable. If the reason is *front*,
-    ``margin_m`` is minus the distance by which the gap to the front vehicle is too short for full braking. If the
-    reason is *early*, ``margin_m`` is minus the overlap before the vehicle may act.
+    vehicle. Without a rear vehicle, ``margin_m`` is the part of the gap to the front vehicle that remains under full
+    braking. ``margin_m`` is negative if contact is unavoidable. If the reason is *front*, ``margin_m`` is minus the
+    distance by which the gap to the front vehicle is too short for full braking. If the reason is *early*, ``margin_m``
+    is minus the overlap before the vehicle may act.
 
     ``command_mps2`` and ``switch_s`` are commands that show how to avoid contact, and their times: in a simulation
     these commands cause no impact. Each command applies from its time (s after the alert) until the time of the next
-    command. A command whose time in ``switch_s`` is infinite never applies. ``switch_s`` and ``command_mps2`` are NaN
-    in worlds where contact is unavoidable.
+    command; it never applies if its time is infinite. Both arrays are NaN in worlds where contact is unavoidable.
     """
 
     # [n] 0: contact is avoidable. 1, early: a pair has contact before the controlled vehicle may act. 2, front: even
     # full braking leads to contact with the front vehicle. 3, rear: the rear vehicle reaches the largest trajectory
     reason: Ints
     margin_m: Floats  # [n] smallest gap to the rear vehicle, m; negative if contact is unavoidable
-    switch_s: Floats  # [n, 3] times from which on the commands of the witness apply, s
-    command_mps2: Floats  # [n, 3] commands of the witness, m/s2
+    switch_s: Floats  # [n, 3] times from which on the commands apply, s
+    command_mps2: Floats  # [n, 3] commands that avoid contact, m/s2
 
     @property
     def avoidable(self) -> Bools:
@@ -394,13 +295,12 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
     Args:
         worlds: the ``n`` worlds in their present state.
         vehicle: index of the controlled vehicle, from 0.
-        scripts: maps the index of each vehicle that is not controlled to the name of its script, as in
-            ``Scenario.roles``. The only script allowed is full_brake. If ``scripts`` is None, all vehicles that are not
-            controlled brake fully.
+        scripts: script of each vehicle that is not controlled, by index, as in ``Scenario.roles``; only full_brake is
+            allowed. None: all of them brake fully.
 
-    Raises ``InvalidInput`` for a line other than those described above, and for a script other than full_brake. The
-    function also raises ``InvalidInput`` if the front vehicle may brake only after the controlled vehicle may act, if a
-    vehicle moves backward, or if vehicle_1 could reach an obstacle (``obstacle_gap_m``) before any contact.
+    Raises ``InvalidInput`` for any other line, for a script other than full_brake, if the front vehicle may brake only
+    after the controlled vehicle may act, if a vehicle moves backward, or if vehicle_1 could reach an obstacle
+    (``obstacle_gap_m``) before any contact.
 
     """
     worlds.refuse_build_up("avoidability")
@@ -423,16 +323,7 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
 
 
 def check_covered(worlds: Worlds, vehicle: int, scripts: Mapping[int, str] | None) -> None:
-    """Raise ``InvalidInput`` for worlds that ``avoidability`` does not cover. The function does not check whether
-    brakes build up.
-
-    Args:
-        worlds: the worlds, [n].
-        vehicle: index of the controlled vehicle, from 0.
-        scripts: maps the index of each vehicle that is not controlled to the name of its script; None if all of them
-            brake fully.
-
-    """
+    """Raise ``InvalidInput`` for worlds that ``avoidability`` does not cover. Brake build-up is not checked."""
     # An obstacle that Vehicle 1 does not reach under full braking has no effect: only a push could bring Vehicle 1
     # there, and a push begins with an impact.
     check_whole_number("avoidability: vehicle", vehicle, 0, worlds.N - 1)

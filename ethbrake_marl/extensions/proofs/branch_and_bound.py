@@ -4,6 +4,9 @@ A first contact has a time and a closing speed. The harm of a first contact is i
 that must follow (``obstacle.after``). A *cell* is a set of first contacts: a range of times and a range of closing
 speeds. The search halves cells until the smallest bound of any cell is close to the smallest harm that the search has
 reached. docs/internals/proofs/lower-bound.md has the proof.
+
+``proofs/__init__.py`` explains the arguments that functions share. ``count`` is the number of cells on the heap. Row 0
+of the heap is always the cell with the smallest bound.
 """
 
 from __future__ import annotations
@@ -35,17 +38,8 @@ def gentlest_between(kind: int, at: Floats, early: float, late: float) -> float:
     """Return the smallest closing speed (m/s) of first contacts between the times ``early`` and ``late``.
 
     The later the contact, the smaller (or equal) is the smallest closing speed, with one exception. If the leader
-    (front vehicle) brakes harder than the controlled vehicle, the smallest closing speed may rise by at most the
-    difference of the two braking capacities in each second.
-
-    Args:
-        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
-            build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
-            act.
-        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
-
+    brakes harder than the controlled vehicle, the smallest closing speed may rise by at most the difference of the two
+    braking capacities in each second.
     """
     if kind >= RAMPED_FRONT:
         return gentlest_ramped_between(kind, at, early, late)
@@ -61,12 +55,6 @@ def decision_around(at: Floats, early: float, late: float) -> tuple[float, float
 
     The function returns ``late`` as start and as end if there are no decision steps, or if ``early`` and ``late`` lie
     in different decision steps.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: start of the time interval around which the function looks for a decision step, s.
-        late: end of the time interval that starts at ``early``, s.
-
     """
     step = at[LINE.TIME_STEP]
     if step <= 0.0:
@@ -84,21 +72,9 @@ def lacking(kind: int, at: Floats, early: float, late: float, softest: float, ha
 
     If the first contact is with the front vehicle, braking before this contact makes it gentle, and driving after this
     contact softens a later impact from behind. If the first contact is with the rear vehicle, driving is best before
-    the contact and braking after it. The command is the same in the whole decision step, so this command cannot be the
-    best command both before and after the contact.
-
-    Args:
-        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
-            build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
-            act.
-        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
-        softest: smallest closing speed that a first contact between ``early`` and ``late`` can have under any command,
-            m/s.
-        hard: largest closing speed that the first contact may have, m/s.
-        begin: start of the decision step in which the first contact happens, s.
-
+    the contact and braking after it. The command is the same in the whole decision step, which starts at ``begin`` (s),
+    so this command cannot be the best command both before and after the contact. ``softest`` is the smallest closing
+    speed (m/s) that a first contact between ``early`` and ``late`` can have under any command.
     """
     whole = at[LINE.U_F] + at[LINE.A_F]
     turn = gentlest(kind, at, early)[1]
@@ -122,23 +98,7 @@ def harm_of(
     kind: int, at: Floats, early: float, late: float, soft: float, hard: float, floor: float, plan: Floats,
     other: Floats,
 ) -> float:  # fmt: skip
-    """Return a lower bound (m2/s2) on the harm of the first contacts in a range of times and closing speeds.
-
-    Args:
-        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
-            build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
-            act.
-        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
-        soft: smallest closing speed that the first contact may have, m/s.
-        hard: largest closing speed that the first contact may have, m/s.
-        floor: known lower bound on the harm of the other pair (the pair that does not have the first contact), m2/s2.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan`` (with brake build-up from
-            ``empty_legs``); overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
-    """
+    """Return a lower bound (m2/s2) on the harm of the first contacts in a range of times and closing speeds."""
     begin, end = decision_around(at, early, late)
     lack = 0.0
     if end > late:
@@ -152,15 +112,9 @@ def harm_of(
 
 @compiled
 def room_for(heap: Floats, count: int, harm: float) -> int:
-    """Insert a row for a new cell (range of first contacts), whose bound is ``harm``, into the heap, and return the
-    index of the row. The function fills in only the column ``HARM`` of this row. Row 0 of the heap is always the cell
-    with the smallest bound.
+    """Insert a row for a new cell, whose bound is ``harm`` (m2/s2), into the heap, and return the index of the row.
 
-    Args:
-        heap: [CELLS, NEAR] binary heap with one row for each cell (range of first contacts); changed in place.
-        count: number of cells on the heap without the new cell.
-        harm: lower bound on the harm of the first contacts in the new cell, m2/s2.
-
+    The function fills in only the column ``HARM`` of this row. ``count`` does not include the new cell.
     """
     at = count
     while at > 0 and heap[(at - 1) // 2, HARM] > harm:
@@ -173,18 +127,7 @@ def room_for(heap: Floats, count: int, harm: float) -> int:
 
 @compiled(apart=True)
 def put(heap: Floats, count: int, harm: float, early: float, late: float, soft: float, hard: float) -> int:
-    """Add a cell (a range of times and closing speeds) to the heap, and return the new number of cells.
-
-    Args:
-        heap: [CELLS, NEAR] binary heap with one row for each cell (range of first contacts); changed in place.
-        count: number of cells on the heap without the new cell.
-        harm: lower bound on the harm of all first contacts in the new cell, m2/s2.
-        early: earliest time in the new cell (range of first contacts), s.
-        late: latest time in the new cell (range of first contacts), s.
-        soft: smallest closing speed in the new cell (range of first contacts), m/s.
-        hard: largest closing speed in the new cell (range of first contacts), m/s.
-
-    """
+    """Add a cell, whose bound is ``harm`` (m2/s2), to the heap, and return the new number of cells."""
     at = room_for(heap, count, harm)
     heap[at, EARLY], heap[at, LATE], heap[at, SOFT], heap[at, HARD] = early, late, soft, hard
     return count + 1
@@ -192,13 +135,7 @@ def put(heap: Floats, count: int, harm: float, early: float, late: float, soft: 
 
 @compiled(apart=True)
 def drop_first(heap: Floats, count: int) -> int:
-    """Remove row 0 (the cell that has the smallest bound) from the heap, and return the new number of cells.
-
-    Args:
-        heap: binary heap with one row for each cell (range of first contacts); changed in place.
-        count: number of cells (ranges of first contacts) on the heap before the removal.
-
-    """
+    """Remove row 0 (the cell that has the smallest bound) from the heap, and return the new number of cells."""
     count -= 1
     at, below = 0, 1
     while below < count:
@@ -218,22 +155,10 @@ def drop_first(heap: Floats, count: int) -> int:
 def divide(
     kind: int, at: Floats, floor: float, count: int, plan: Floats, other: Floats, heap: Floats
 ) -> tuple[int, float]:
-    """Split the cell (range of first contacts) that has the smallest bound into two halves.
+    """Split the cell that has the smallest bound into two halves.
 
     Returns the new number of cells on the heap, and the bound (m2/s2) for one single first contact in the split cell.
     The smallest bound of all first contacts is at most the bound for this one contact.
-
-    Args:
-        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
-            build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        floor: known lower bound on the harm of the other pair (the pair that does not have the first contact), m2/s2.
-        count: number of cells (ranges of first contacts) on the heap.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan`` (with brake build-up from
-            ``empty_legs``); overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-        heap: working memory for the search, [CELLS, NEAR]: one row for each cell (range of first contacts).
-
     """
     harm, early, late, soft, hard = (heap[0, HARM], heap[0, EARLY], heap[0, LATE], heap[0, SOFT], heap[0, HARD])
     count = drop_first(heap, count)
@@ -263,24 +188,8 @@ def least_harm(
     kind: int, at: Floats, first: float, last: float, floor: float, best: float, enough: float, plan: Floats,
     other: Floats, heap: Floats,
 ) -> float:  # fmt: skip
-    """Return a lower bound (m2/s2) on the harm of every first contact between the times ``first`` and ``last``, or
+    """Return a lower bound (m2/s2) on the harm of every first contact between the times ``first`` and ``last`` (s), or
     ``best`` if ``best`` is smaller.
-
-    Args:
-        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
-            build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        first: earliest time of the first contact, in s from the moment at which the controlled vehicle may act.
-        last: latest time of the first contact, in s from the moment at which the controlled vehicle may act.
-        floor: known lower bound on the harm of the other pair (the pair that does not have the first contact), m2/s2.
-        best: smallest harm that the search has reached so far, m2/s2.
-        enough: lower bound on the harm that is already proven in another way, m2/s2; the function returns 0 if the harm
-            that it proves for some first contact is not above ``enough``.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan`` (with brake build-up from
-            ``empty_legs``); overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-        heap: working memory for the search, [CELLS, NEAR]: one row for each cell (range of first contacts).
-
     """
     for k in range(_TRIED):
         time = first + (last - first) * k / (_TRIED - 1)
@@ -311,15 +220,7 @@ def next_split(kind: int, at: Floats, time: float, last: float) -> float:
     """Return the next time (s) after ``time`` at which a decision is due or the front vehicle comes to rest; at most
     ``last``.
 
-    With brake build-up, the result is at most 0.05 s (``_PART_S``) later than ``time``.
-
-    Args:
-        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
-            build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        time: start of the interval in which the function searches, s.
-        last: end of the interval in which the function searches, s; the result is at most ``last``.
-
+    With brake build-up, the result is at most ``_PART_S`` later than ``time``.
     """
     until = last if kind < RAMPED_FRONT else min(last, time + _PART_S)
     if at[LINE.TIME_STEP] > 0.0:

@@ -4,6 +4,9 @@ The bound compares every motion of the pair with one extreme motion of each vehi
 far ahead as it can: it drives fully if it is controlled, and brakes fully otherwise. The follower brakes fully, so it
 stays as far behind as it can. If the extreme motions lead to contact, every other motion of the pair leads to contact
 at the same time or earlier. docs/internals/proofs/team-bound.md has the proof.
+
+In this file ``at`` describes one pair, [PAIR_WIDTH], in the columns ``PAIR_GAP`` to ``FOLLOWER_A``. ``plan`` and
+``other`` are working memory, arrays from ``empty_plan``.
 """
 
 from __future__ import annotations
@@ -40,16 +43,12 @@ def least_on_piece(constant: float, pressing: float, since: float, until: float)
 @compiled(apart=True)
 def least_before(at: Floats, met: float, squared: float) -> float:
     """Return the smallest closing speed (m/s) of a pair's first contact until ``met``, for a leader that follows a
-    script. If the first contact happens at the time t (s), its closing speed is at least ``c(t) + (g(t) / t)``. Here
-    c(t) and g(t) are the closing speed (m/s) and the gap (m) at the time t if both vehicles brake fully. ``g(t) / t``
-    is the additional speed that the follower needs to close the gap g(t) by the time t.
+    script.
 
-    Args:
-        at: [PAIR_WIDTH] values of one pair, in the order ``PAIR_GAP`` to ``FOLLOWER_A``.
-        met: time of contact in the extreme motions (the leader goes as far ahead as it can, the follower brakes fully),
-            s.
-        squared: squared closing speed at the contact of the extreme motions, m2/s2.
-
+    If the first contact happens at the time t (s), its closing speed is at least ``c(t) + (g(t) / t)``. Here c(t) and
+    g(t) are the closing speed (m/s) and the gap (m) at the time t if both vehicles brake fully. ``g(t) / t`` is the
+    additional speed that the follower needs to close the gap g(t) by the time t. ``met`` is the time (s) of the contact
+    in the extreme motions, and ``squared`` its squared closing speed (m2/s2).
     """
     if met <= 0.0:
         return math.sqrt(squared)
@@ -78,14 +77,7 @@ def least_before(at: Floats, met: float, squared: float) -> float:
 def least_closing_of_pair(at: Floats, until: float, plan: Floats, other: Floats) -> tuple[float, float]:
     """Return the smallest closing speed (m/s) of a pair's first contact, and the latest time of that contact (s).
 
-    The results are 0 and infinity if contact is not certain.
-
-    Args:
-        at: [PAIR_WIDTH] values of one pair, in the order ``PAIR_GAP`` to ``FOLLOWER_A``.
-        until: horizon, s; later contacts do not count.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
+    The results are 0 and infinity if contact before the horizon ``until`` (s) is not certain.
     """
     onset = at[LEADER_ONSET]
     if at[LEADER_FREE] > 0.0:
@@ -102,13 +94,11 @@ def least_closing_of_pair(at: Floats, until: float, plan: Floats, other: Floats)
 
 @compiled
 def bound_pairs(pairs: Floats, until: Floats, out: Floats) -> None:
-    """Compute a lower bound on the harm of each of ``n`` pairs, whatever the vehicles do.
+    """Compute a lower bound (m2/s2) on the harm of each of ``n`` pairs, whatever the vehicles do, and write it to
+    ``out`` [n].
 
-    Args:
-        pairs: gap, speeds and capacities of each pair, [n, PAIR_WIDTH], in the columns ``PAIR_GAP`` to ``FOLLOWER_A``.
-        until: [n] horizon of each pair, s; later harm does not count.
-        out: [n] array into which the function writes the bounds, m2/s2; a contact without impact counts as 0.
-
+    ``pairs`` is [n, PAIR_WIDTH]; ``until`` [n] is the horizon (s), after which harm does not count. A contact without
+    impact counts as 0.
     """
     plan, other = empty_plan(), empty_plan()
     for k in range(pairs.shape[0]):

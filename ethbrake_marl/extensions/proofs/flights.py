@@ -1,11 +1,18 @@
 """Compute an upper bound on the speed of a vehicle relative to the centre of mass of its pair after a first contact.
 
-A *flight* is a period in which the controlled vehicle and the neighbour of its first contact are not in contact.
-``share`` is the mass of the *partner* (the neighbour of the first contact), divided by the total mass of the partner
-and the controlled vehicle. ``press`` is the acceleration (m/s2) of these two vehicles towards each other under the
-extreme command (full drive or full braking). ``reach`` is the largest amount (m/s2) by which a command other than the
-extreme command can lower ``press``. ``opening`` is the speed (m/s) at which the two vehicles separate after an impact.
-docs/internals/proofs/lower-bound.md has the proofs.
+Here the *pair* is the controlled vehicle and its *partner*, the neighbour of its first contact. A *flight* is a period
+in which the two vehicles of the pair are not in contact. docs/internals/proofs/lower-bound.md has the proofs.
+
+Arguments that several functions share:
+
+- ``share``: mass of the partner divided by the mass of the pair, 0 to 1.
+- ``press``: acceleration of the two vehicles towards each other under the extreme command (full drive or full braking),
+  m/s2.
+- ``reach``: largest amount by which another command can lower ``press``, m/s2; infinite if no limit is known.
+- ``bounce``: coefficient of restitution.
+- ``opening``: speed at which the two vehicles separate at the start of the flight, m/s.
+- ``lost``: speed that the controlled vehicle loses because it cannot change its command right after the first contact,
+  m/s.
 """
 
 from __future__ import annotations
@@ -20,24 +27,11 @@ def flight_lead(share: float, press: float, reach: float, opening: float, flight
     """Return the *lead* of a flight: the speed (m/s) that the controlled vehicle gains by the flight, minus the speed
     that it must give up for the flight.
 
-    A *flight* is a period in which the controlled vehicle and the neighbour of its first contact are not in contact.
-    The gain is the speed of the controlled vehicle minus the speed of the centre of mass of this vehicle and this
-    neighbour. For a flight that lasts L seconds and begins with the opening speed o (m/s), the lead is
-    ``share (press L - o) - G``. G is the speed (m/s) that the controlled vehicle must give up so that the two vehicles
-    stay apart for the time L: the smallest G with ``G L - G^2 / (2 reach) >= (press L^2 / 2) - o L``. In each second
-    the controlled vehicle can give up at most ``reach`` m/s. The result is -inf if no command keeps the vehicles apart
-    for the time L.
-
-    Args:
-        share: mass of the partner (the neighbour of the first contact), divided by the total mass of the partner and
-            the controlled vehicle, 0 to 1.
-        press: acceleration, m/s2, of the controlled vehicle and the neighbour of its first contact towards each other,
-            under the extreme command (full drive or full braking).
-        reach: largest amount by which a command other than the extreme command can lower the acceleration ``press``,
-            m/s2; infinite if no limit is known.
-        opening: speed at which the two vehicles of the pair separate at the start of the flight, m/s.
-        flight: duration of the flight, s.
-
+    The gain is the speed of the controlled vehicle minus the speed of the centre of mass of the pair. For a flight that
+    lasts L seconds (``flight``) and begins with the opening speed o (m/s), the lead is ``share (press L - o) - G``. G
+    is the speed (m/s) that the controlled vehicle must give up so that the two vehicles stay apart for the time L: the
+    smallest G with ``G L - G^2 / (2 reach) >= (press L^2 / 2) - o L``. In each second the controlled vehicle can give
+    up at most ``reach`` m/s. The result is -inf if no command keeps the vehicles apart for the time L.
     """
     relative = share * (press * flight - opening)
     if press * flight <= 2.0 * opening:
@@ -54,18 +48,6 @@ def flight_lead(share: float, press: float, reach: float, opening: float, flight
 def best_flight(share: float, press: float, reach: float, opening: float) -> float:
     """Return the duration (s) of the flight with the largest ``flight_lead``; infinite if a longer flight always has a
     larger lead.
-
-    A *flight* is a period in which the controlled vehicle and the neighbour of its first contact are not in contact.
-
-    Args:
-        share: mass of the partner (the neighbour of the first contact), divided by the total mass of the partner and
-            the controlled vehicle, 0 to 1.
-        press: acceleration, m/s2, of the controlled vehicle and the neighbour of its first contact towards each other,
-            under the extreme command (full drive or full braking).
-        reach: largest amount by which a command other than the extreme command can lower the acceleration ``press``,
-            m/s2; infinite if no limit is known.
-        opening: speed at which the two vehicles of the pair separate at the start of the flight, m/s.
-
     """
     if press <= 0.0:
         return math.inf
@@ -87,23 +69,8 @@ def lead(
 ) -> float:
     """Return the largest ``flight_lead`` (m/s) of all flights that last from ``shortest`` to ``longest`` seconds.
 
-    A *flight* is a period in which the controlled vehicle and the neighbour of its first contact are not in contact.
     The result is the maximum over all opening speeds up to ``opening``, because a smaller opening speed may lead to a
     larger result if the duration of the flight is limited.
-
-    Args:
-        share: mass of the partner (the neighbour of the first contact), divided by the total mass of the partner and
-            the controlled vehicle, 0 to 1.
-        press: acceleration, m/s2, of the controlled vehicle and the neighbour of its first contact towards each other,
-            under the extreme command (full drive or full braking).
-        reach: largest amount by which a command other than the extreme command can lower the acceleration ``press``,
-            m/s2; infinite if no limit is known.
-        opening: largest speed at which the two vehicles of the pair may separate at the start of the flight, m/s.
-        shortest: smallest duration of the flight, s.
-        longest: largest duration of the flight, s.
-        lost: speed that the controlled vehicle loses because it cannot change its command right after the first
-            contact, m/s.
-
     """
     if press > 0.0:
         opening = min(opening, 0.5 * press * longest)
@@ -121,18 +88,9 @@ def lead(
 @compiled
 def decays(share: float, press: float, reach: float, bounce: float) -> bool:
     """Return False if the controlled vehicle may gain speed in the following way: it accelerates less now, and
-    therefore bounces more strongly off its partner (the neighbour of its first contact) later. If the result is True,
-    ``reach`` limits the speed that the vehicle can gain in any flight (period without contact).
+    therefore bounces more strongly off its partner later.
 
-    Args:
-        share: mass of the partner (the neighbour of the first contact), divided by the total mass of the partner and
-            the controlled vehicle, 0 to 1.
-        press: acceleration, m/s2, of the controlled vehicle and the neighbour of its first contact towards each other,
-            under the extreme command (full drive or full braking).
-        reach: largest amount by which a command other than the extreme command can lower the acceleration ``press``,
-            m/s2; infinite if no limit is known.
-        bounce: coefficient of restitution.
-
+    If the result is True, ``reach`` limits the speed that the vehicle can gain in any flight.
     """
     if share <= 0.5:
         return True
@@ -148,33 +106,17 @@ def largest_lead(
     share: float, press: float, reach: float, bounce: float, opening: float, lost: float, late: float, end: float,
     since: float, until: float,
 ) -> float:  # fmt: skip
-    """Return an upper bound (m/s) on the speed of the controlled vehicle minus the speed of the centre of mass of a
+    """Return an upper bound (m/s) on the speed of the controlled vehicle minus the speed of the centre of mass of the
     pair.
 
-    The pair is the controlled vehicle and the neighbour of its first contact. The motion of the centre of mass is
-    computed as if the controlled vehicle executed the extreme command (full drive or full braking) from the first
-    contact on. In reality, the command of the earlier decision still applies in the *window* (the rest of the decision
-    step of the first contact). In the window the controlled vehicle loses the speed ``lost`` (m/s).
+    The motion of the centre of mass is computed as if the controlled vehicle executed the extreme command from the
+    first contact on. In reality, the command of the earlier decision still applies in the *window*, the rest of the
+    decision step of the first contact. The window lasts from ``late`` to ``end``; in the window the controlled vehicle
+    loses the speed ``lost``. ``opening`` is the speed at which the pair separates after the first contact.
 
-    A *flight* is a period in which the two vehicles of the pair are not in contact. The bound is the maximum over three
-    cases: the last flight before the contact with the neighbour outside the pair begins with the first impact, begins
-    within the window, or begins after the window.
-
-    Args:
-        share: mass of the partner (the neighbour of the first contact), divided by the total mass of the partner and
-            the controlled vehicle, 0 to 1.
-        press: acceleration, m/s2, of the controlled vehicle and the neighbour of its first contact towards each other,
-            under the extreme command (full drive or full braking).
-        reach: largest amount by which a command other than the extreme command can lower the acceleration ``press``,
-            m/s2; infinite if no limit is known.
-        bounce: coefficient of restitution.
-        opening: speed at which the two vehicles of the pair separate after the first contact, m/s.
-        lost: speed that the controlled vehicle loses in the window (the rest of the decision step), m/s.
-        late: start of the window (the rest of the decision step of the first contact), s.
-        end: end of the window (the rest of the decision step of the first contact), s.
-        since: earliest time of the controlled vehicle's contact with the neighbour outside the pair, s.
-        until: latest time of the controlled vehicle's contact with the neighbour outside the pair, s.
-
+    The bound is the maximum over three cases: the last flight before the contact with the neighbour outside the pair
+    begins with the first impact, begins within the window, or begins after the window. The contact with the neighbour
+    outside the pair comes between ``since`` and ``until``. All times are in s after the first contact.
     """
     if since < end:
         lost, end = 0.0, late
@@ -199,23 +141,13 @@ def widest_flight(
     share: float, slack: float, press: float, drive: float, bounce: float, closing: float, back: float, time: float
 ) -> float:
     """Return the largest value of ``sqrt(p^2 + 2 press s)`` (m/s) during the flights of the controlled vehicle and a
-    partner that brakes harder than this vehicle. Here p is the speed (m/s) at which vehicle and partner separate, and s
-    is the gap (m) between them. A *flight* is a period in which the controlled vehicle and the neighbour of its first
-    contact are not in contact. The result is infinite if no bound of this value is known.
+    partner that brakes harder than this vehicle.
 
-    Args:
-        share: mass of the partner (the neighbour of the first contact), divided by the total mass of the partner and
-            the controlled vehicle, 0 to 1.
-        slack: braking capacity of the partner (the neighbour of the first contact) minus braking capacity of the
-            controlled vehicle, m/s2.
-        press: acceleration, m/s2, of the controlled vehicle and the neighbour of its first contact towards each other,
-            under the extreme command (full drive or full braking).
-        drive: largest acceleration that the controlled vehicle can command, m/s2.
-        bounce: coefficient of restitution.
-        closing: closing speed of the first impact, m/s.
-        back: backward speed of the controlled vehicle after the first impact, m/s.
-        time: duration for which the result holds, s.
-
+    Here p is the speed (m/s) at which vehicle and partner separate, and s is the gap (m) between them. The result holds
+    for ``time`` seconds; it is infinite if no bound is known. ``slack`` is the braking capacity of the partner minus
+    the braking capacity of the controlled vehicle (m/s2). ``drive`` is the largest acceleration that the controlled
+    vehicle can command (m/s2). ``closing`` is the closing speed of the first impact, and ``back`` the backward speed of
+    the controlled vehicle after it (m/s).
     """
     if not slack > 0.0 or not bounce * bounce * press < slack:
         return math.inf

@@ -6,8 +6,8 @@ contact. The controlled vehicle moves faster or slower than this centre of mass 
 again; ``flights.largest_lead`` bounds the difference. docs/internals/proofs/lower-bound.md has the proofs.
 
 Each function computes one bound for all first contacts between the times ``early`` and ``late``, from the state at
-``early``. From ``late`` to ``end`` (the end of the decision step) the command of the earlier decision still applies.
-The command of the earlier decision differs from the extreme command by at least ``lack`` (m/s2).
+``early``. From ``late`` to ``end`` the command of the earlier decision still applies. ``proofs/__init__.py`` explains
+the arguments that functions share.
 """
 
 from __future__ import annotations
@@ -51,35 +51,12 @@ def least_closing(
 ) -> float:  # fmt: skip
     """Return the smallest closing speed (m/s) of the controlled vehicle's contact with its second neighbour.
 
-    The *first neighbour* is the vehicle with which the controlled vehicle had its first contact. The bound is a
-    difference of two speeds, v - d. Here v is the closing speed of the second neighbour relative to the centre of mass
-    of the controlled vehicle and its first neighbour, and d is the largest difference between the speeds of the
-    controlled vehicle and this centre of mass (``largest_lead``). In the *window* (the rest of the decision step of the
-    first contact) the command of the earlier decision still applies. In the window the controlled vehicle loses the
-    speed ``lost`` (m/s). All times are in s after the first contact.
-
-    Args:
-        start: closing speed, at the time of the first contact, of the second neighbour relative to the centre of mass
-            of the controlled vehicle and its first neighbour, m/s.
-        slope: rate at which the closing speed, which begins with ``start``, changes from the first contact on, m/s2.
-        turn: time at which the rate of change of the closing speed (``slope``) increases by ``bend``, s.
-        bend: increase of ``slope`` (rate of change of the closing speed) at the time ``turn``, m/s2; may be negative.
-        other_turn: time at which the rate of change of the closing speed (``slope``) increases by ``other_bend``, s.
-        other_bend: increase of ``slope`` (rate of change of the closing speed) at the time ``other_turn``, m/s2; may be
-            negative.
-        share: mass of the first neighbour, divided by the total mass of this neighbour and the controlled vehicle, 0 to
-            1.
-        press: acceleration, m/s2, of the controlled vehicle and the neighbour of its first contact towards each other,
-            under the extreme command (full drive or full braking).
-        reach: largest amount by which a command other than the extreme command can lower the acceleration ``press``,
-            m/s2; infinite if no limit is known.
-        bounce: coefficient of restitution.
-        opening: speed at which the controlled vehicle and its first neighbour separate after the first contact, m/s.
-        lost: speed that the controlled vehicle loses in the window (the rest of the decision step), m/s.
-        late: start of the window (the rest of the decision step of the first contact), s.
-        end: end of the window (the rest of the decision step of the first contact), s.
-        until: latest time of the contact with the second neighbour, s.
-
+    The bound is a difference of two speeds, v - d. Here v is the closing speed of the second neighbour relative to the
+    centre of mass of the controlled vehicle and the neighbour of its first contact, and d is the largest difference
+    between the speeds of the controlled vehicle and this centre of mass. The arguments ``start`` to ``other_bend``
+    describe v as a function of time (``least_of_line``); each bend may be negative. ``share`` to ``end`` are the
+    arguments of ``largest_lead``, which bounds d. ``until`` is the latest time of the contact. All times are in s after
+    the first contact.
     """
     best = least_of_line(start, slope, turn, bend, other_turn, other_bend, 0.0, until)
     best -= largest_lead(share, press, reach, bounce, opening, lost, late, end, 0.0, until)
@@ -99,26 +76,11 @@ def least_closing(
 def pushed_by_leader(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the smallest closing speed (m/s) of the rear pair (controlled and rear vehicle) after a first contact with
-    the front vehicle (leader).
+    """Return the smallest closing speed (m/s) of the rear pair after a first contact with the leader.
 
     The bound uses the centre of mass of the leader and the controlled vehicle. The result is 0 if nothing is proven. If
     the leader is at rest at ``early``, a later first contact leads to the same motion at a later time, so the function
     ignores ``late``, ``end`` and ``lack``.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
-            act.
-        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
-        closing: largest closing speed that the first contact may have, m/s.
-        end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
-        lack: smallest amount, m/s2, by which the controlled vehicle's command until ``end`` differs from the extreme
-            command (full drive after a first contact with the front vehicle, full braking after one with the rear
-            vehicle).
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
     """
     share, rest, press = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE], at[LINE.U_F] + at[LINE.A_L]
     v_l, way_l = leader(at, early)
@@ -151,21 +113,11 @@ def pushed_by_leader(
 
 @compiled(apart=True)
 def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: Floats, other: Floats) -> float:
-    """Return the smallest closing speed (m/s) of the rear pair (controlled and rear vehicle) after a first contact with
-    a leader that brakes harder than the controlled vehicle.
+    """Return the smallest closing speed (m/s) of the rear pair after a first contact with a leader that brakes harder
+    than the controlled vehicle.
 
-    The leader is the front vehicle. The controlled vehicle stays near the leader, because the leader brakes harder. The
-    result is 0 if nothing is proven.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
-            act.
-        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
-        closing: largest closing speed that the first contact may have, m/s.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
+    The controlled vehicle stays near the leader, because the leader brakes harder. The result is 0 if nothing is
+    proven.
     """
     share, rest, bounce = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE], at[LINE.RESTITUTION]
     v_l, way_l = leader(at, early)
@@ -205,25 +157,10 @@ def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: 
 def after_front(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the smallest squared closing speed (m2/s2) of the rear pair (controlled and rear vehicle) after the
-    controlled vehicle's first contact, which is with the front vehicle.
+    """Return the smallest squared closing speed (m2/s2) of the rear pair after a first contact with the front vehicle.
 
     The result is the largest of several lower bounds. If an obstacle may throw the vehicles back, the bounds that use
     the centre of mass of the front and the controlled vehicle do not hold, and are left out.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
-            act.
-        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
-        closing: largest closing speed that the first contact may have, m/s.
-        end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
-        lack: smallest amount, m/s2, by which the controlled vehicle's command until ``end`` differs from the extreme
-            command (full drive after a first contact with the front vehicle, full braking after one with the rear
-            vehicle).
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
     """
     share, rest = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE]
     v_l, way_l = leader(at, early)
@@ -249,14 +186,10 @@ def after_front(
 @compiled
 def obstacle_harm(at: Floats, late: float, closing: float) -> float:
     """Return the smallest squared speed (m2/s2) at which the front vehicle hits the obstacle after a push from behind.
-    After the push, the front vehicle is slowed only by its own brakes. The result is 0 if the front vehicle already
-    stands at the obstacle, because the push is then one impact of both vehicles and the obstacle.
 
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        late: latest time at which the follower pushes the front vehicle, s.
-        closing: smallest closing speed at which the follower meets the front vehicle, m/s.
-
+    The push comes at ``late`` or earlier, with a closing speed of at least ``closing``. After the push, the front
+    vehicle is slowed only by its own brakes. The result is 0 if the front vehicle already stands at the obstacle,
+    because the push is then one impact of both vehicles and the obstacle.
     """
     if not STRUCK_M < at[LINE.OBSTACLE] - at[LINE.V_L] * at[LINE.V_L] / (2.0 * at[LINE.A_L]) < math.inf:
         return 0.0
@@ -273,21 +206,12 @@ def obstacle_harm(at: Floats, late: float, closing: float) -> float:
 def braking_after(
     gap: float, least_gap: float, v_l: float, a_l: float, v_f: float, a_f: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the smallest squared closing speed (m2/s2) at which a braking vehicle reaches the vehicle in front.
+    """Return the smallest squared closing speed (m2/s2) at which a braking vehicle (f) reaches the vehicle in front
+    (l).
 
-    The vehicle brakes with at most ``a_f``; the vehicle in front brakes fully. The result is 0 if contact is not
-    certain.
-
-    Args:
-        gap: largest possible gap between the two vehicles, m.
-        least_gap: smallest possible gap between the two vehicles, m; used only if the vehicle in front brakes harder.
-        v_l: speed of the vehicle in front, m/s.
-        a_l: braking capacity of the vehicle in front, m/s2.
-        v_f: speed of the braking vehicle, m/s.
-        a_f: braking capacity of the braking vehicle, m/s2.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
+    The vehicle brakes with at most ``a_f``; the vehicle in front brakes fully. ``gap`` and ``least_gap`` are the
+    largest and the smallest possible gap (m); ``least_gap`` is used only if the vehicle in front brakes harder. The
+    result is 0 if contact is not certain.
     """
     fill_braking(plan, 0.0, a_l)
     fill_braking(other, 0.0, a_f)
@@ -303,26 +227,11 @@ def pushed_by_rear(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, gap: float, plan: Floats,
     other: Floats,
 ) -> float:  # fmt: skip
-    """Return the smallest closing speed (m/s) of the front pair (front and controlled vehicle) after the rear vehicle
-    has hit the controlled vehicle.
+    """Return the smallest closing speed (m/s) of the front pair after the rear vehicle has hit the controlled vehicle.
 
     The bound uses the centre of mass of the controlled vehicle and the rear vehicle. The braking capacity of the
-    controlled vehicle must be at least the braking capacity of the rear vehicle.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
-            act.
-        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
-        closing: largest closing speed that the first contact may have, m/s.
-        end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
-        lack: smallest amount, m/s2, by which the controlled vehicle's command until ``end`` differs from the extreme
-            command (full drive after a first contact with the front vehicle, full braking after one with the rear
-            vehicle).
-        gap: gap to the front vehicle at ``early``, m.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
+    controlled vehicle must be at least the braking capacity of the rear vehicle. ``gap`` is the gap to the front
+    vehicle at ``early``, m.
     """
     share, rest = at[LINE.REAR_SHARE], 1.0 - at[LINE.REAR_SHARE]
     v_l = leader(at, early)[0]
@@ -346,22 +255,11 @@ def pushed_by_rear(
 
 @compiled(apart=True)
 def slowed_by_rear(at: Floats, early: float, closing: float, gap: float, plan: Floats, other: Floats) -> float:
-    """Return the smallest closing speed (m/s) of the front pair (front and controlled vehicle) after the rear vehicle
-    has hit the controlled vehicle.
+    """Return the smallest closing speed (m/s) of the front pair after the rear vehicle has hit the controlled vehicle.
 
     The bound follows from the fact that the controlled vehicle stays ahead of the rear vehicle. The braking capacity of
     the controlled vehicle must be at least the braking capacity of the rear vehicle. The result is 0 if the closing
-    speed of the front pair may rise with time.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
-            act.
-        closing: largest closing speed that the first contact may have, m/s.
-        gap: gap to the front vehicle at ``early``, m.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
+    speed of the front pair may rise with time. ``gap`` is the gap to the front vehicle at ``early``, m.
     """
     share, v_l = at[LINE.REAR_SHARE], leader(at, early)[0]
     pooled = (1.0 - share) * at[LINE.A_F] + share * at[LINE.A_R]

@@ -5,6 +5,17 @@ the rear vehicle is the distance (m) by which it is farther ahead than under ful
 contact by its time, its lead and its closing speed. A *cell* is a set of first contacts: a range of times, a range of
 leads and a range of closing speeds. The search halves cells until the smallest bound of any cell is close to the
 smallest harm that the search has reached. docs/internals/proofs/team-bound.md has the proof.
+
+Arguments that several functions share, in addition to those in ``proofs/__init__.py``:
+
+- ``near``, ``far``: smallest and largest lead, m.
+- ``since``: time from which on the rear vehicle may brake less than fully, s.
+- ``power``: largest possible value of the rear vehicle's acceleration minus its acceleration under full braking, m/s2;
+  infinite if other vehicles may push the rear vehicle.
+- ``search``: the numbers SINCE, POWER, FLOOR and BEST (see below), [SEARCH]. The functions lower BEST when they reach a
+  smaller harm.
+- ``moved``: working memory for a changed copy of ``at``, [LINE.WIDTH]; overwritten.
+- ``heap``: heap of cells, [SEARCHED + 4, HEAP_WIDTH], of which the first ``count`` rows are used; changed in place.
 """
 
 from __future__ import annotations
@@ -43,14 +54,6 @@ _SHORT_S = 1e-3  # smallest time in a denominator
 def gained(near: float, time: float, since: float, power: float) -> float:
     """Return the smallest possible difference (m/s) between the rear vehicle's speed at ``time`` and the lower speed
     that this vehicle would have at ``time`` under full braking.
-
-    Args:
-        near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m.
-        time: time at which the rear vehicle's speed is compared with its speed under full braking, s.
-        since: time from which on the rear vehicle may brake less than fully, s.
-        power: largest possible value of the rear vehicle's acceleration minus its acceleration under full braking,
-            m/s2; infinite if other vehicles may push the rear vehicle.
-
     """
     if near <= 0.0 or time <= since:
         return 0.0
@@ -67,12 +70,6 @@ def behind_full_braking(at: Floats, early: float, late: float) -> float:
 
     A negative gap means an overlap: the rear vehicle's position at ``late`` is ahead of the controlled vehicle's
     position at ``early`` by this distance.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: time for which the controlled vehicle's position is computed, s.
-        late: time for which the rear vehicle's position is computed, s.
-
     """
     return float(
         at[LINE.GAP_R] + solo_motion(at[LINE.V_F], -at[LINE.A_F], 0.0, math.inf, early)[1] - follower(at, late)[1]
@@ -81,22 +78,8 @@ def behind_full_braking(at: Floats, early: float, late: float) -> float:
 
 @compiled
 def soft_behind(at: Floats, early: float, late: float, near: float, far: float, since: float, power: float) -> float:
-    """Return the smallest closing speed (m/s) of all first contacts with the rear vehicle in a range of times and a
-    range of leads.
-
-    The *lead* is the distance by which the rear vehicle is farther ahead than under its own full braking.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
-            act.
-        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
-        near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m.
-        far: largest distance by which the rear vehicle is farther ahead than if it braked fully, m.
-        since: time from which on the rear vehicle may brake less than fully, s.
-        power: largest possible value of the rear vehicle's acceleration minus its acceleration under full braking,
-            m/s2; infinite if other vehicles may push the rear vehicle.
-
+    """Return the smallest closing speed (m/s) of all first contacts with the rear vehicle in a range of times and
+    leads.
     """
     faster = gained(near, late, since, power)
     # the controlled vehicle arrives at that place with the largest speed if it brakes first and then drives
@@ -110,26 +93,12 @@ def after_behind(
     at: Floats, early: float, late: float, near: float, far: float, hard: float, faster: float, moved: Floats,
     plan: Floats, other: Floats,
 ) -> float:  # fmt: skip
-    """Return the smallest squared closing speed (m2/s2) of the front pair (front and controlled vehicle) after the
-    controlled vehicle's first contact, which is with the rear vehicle.
+    """Return the smallest squared closing speed (m2/s2) of the front pair after a first contact with the rear vehicle.
 
     The bound is computed for one motion of the controlled vehicle, which starts from a state at ``early``. After every
     first contact in the given ranges, the controlled vehicle is at every time at least as far ahead and at least as
-    fast as in the motion for which the bound is computed.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
-            act.
-        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
-        near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m.
-        far: largest distance by which the rear vehicle is farther ahead than if it braked fully, m.
-        hard: largest closing speed that the first contact may have, m/s.
-        faster: smallest possible value of the rear vehicle's speed minus its speed under full braking, m/s.
-        moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
+    fast as in this motion. ``faster`` is the smallest possible value of the rear vehicle's speed minus its speed under
+    full braking, m/s.
     """
     further = near - faster * (late - early)
     v_l, way_l = leader(at, early)
@@ -158,31 +127,8 @@ def put_behind(
     at: Floats, early: float, late: float, near: float, far: float, soft: float, hard: float, search: Floats,
     count: int, moved: Floats, plan: Floats, other: Floats, heap: Floats,
 ) -> int:  # fmt: skip
-    """Add a cell (range of first contacts with the rear vehicle) to the heap, if the cell may contain the contact with
-    the smallest harm.
-
-    Returns the new number of cells on the heap.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
-            act.
-        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
-        near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m.
-        far: largest distance by which the rear vehicle is farther ahead than if it braked fully, m.
-        soft: smallest closing speed that the first contact may have, m/s.
-        hard: largest closing speed that the first contact may have, m/s.
-        search: four numbers that the search needs, [SEARCH]. ``search[SINCE]`` (s) and ``search[POWER]`` (m/s2) are the
-            arguments ``since`` and ``power`` of the function ``gained``. ``search[FLOOR]`` is the lower bound on the
-            harm of the front pair alone (m2/s2). ``search[BEST]`` is the smallest harm that the search has reached so
-            far (m2/s2).
-        count: number of cells (ranges of first contacts) on the heap.
-        moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-        heap: [SEARCHED + 4, HEAP_WIDTH] binary heap with one row for each cell (range of first contacts); changed in
-            place.
-
+    """Add a cell to the heap, if the cell may contain the contact with the smallest harm, and return the new number of
+    cells.
     """
     since, power, floor = search[SINCE], search[POWER], search[FLOOR]
     room = at[LINE.GAP_L] + at[LINE.GAP_R] + leader(at, late)[1] - follower(at, early)[1]
@@ -209,20 +155,7 @@ def try_behind(
     """Lower ``search[BEST]`` to the harm of the gentlest first contact (smallest closing speed) with the rear vehicle
     at ``time``, if this harm is smaller.
 
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        time: time of the contact, s.
-        near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m; the function uses
-            a larger distance if no contact at ``time`` is possible with the distance ``near``.
-        far: largest distance by which the rear vehicle is farther ahead than if it braked fully, m.
-        search: four numbers that the search needs, [SEARCH]. ``search[SINCE]`` (s) and ``search[POWER]`` (m/s2) are the
-            arguments ``since`` and ``power`` of the function ``gained``. ``search[FLOOR]`` is the lower bound on the
-            harm of the front pair alone (m2/s2). ``search[BEST]`` is the smallest harm that the search has reached so
-            far (m2/s2); the function lowers ``search[BEST]`` if it reaches a smaller harm.
-        moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
+    The function uses a larger lead than ``near`` if no contact at ``time`` is possible with the lead ``near``.
     """
     near = max(near, behind_full_braking(at, time, time))
     if near > far or near > at[LINE.GAP_L] + at[LINE.GAP_R] + leader(at, time)[1] - follower(at, time)[1]:
@@ -237,25 +170,7 @@ def try_behind(
 def divide_behind(
     at: Floats, search: Floats, count: int, moved: Floats, plan: Floats, other: Floats, heap: Floats
 ) -> int:
-    """Split the cell that has the smallest bound into two halves, and return the new number of cells on the heap.
-
-    A cell is a range of times, leads and closing speeds of first contacts with the rear vehicle. The *lead* is the
-    distance by which the rear vehicle is farther ahead than under its own full braking.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        search: four numbers that the search needs, [SEARCH]. ``search[SINCE]`` (s) and ``search[POWER]`` (m/s2) are the
-            arguments ``since`` and ``power`` of the function ``gained``. ``search[FLOOR]`` is the lower bound on the
-            harm of the front pair alone (m2/s2). ``search[BEST]`` is the smallest harm that the search has reached so
-            far (m2/s2); the function lowers ``search[BEST]`` if it reaches a smaller harm.
-        count: number of cells (ranges of first contacts) on the heap.
-        moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-        heap: [SEARCHED + 4, HEAP_WIDTH] binary heap with one row for each cell (range of first contacts); changed in
-            place.
-
-    """
+    """Split the cell that has the smallest bound into two halves, and return the new number of cells on the heap."""
     early, late, near, far = heap[0, EARLY], heap[0, LATE], heap[0, NEAR], heap[0, FAR]
     soft, hard = heap[0, SOFT], min(heap[0, HARD], math.sqrt(search[BEST]))
     count = drop_first(heap, count)
@@ -285,21 +200,7 @@ def meetings_behind(
 ) -> float:
     """Return a lower bound (m2/s2) on the harm of all first contacts with the rear vehicle until ``last`` (s).
 
-    The result is at most ``search[BEST]``, the smallest harm that the search has reached.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        last: latest time of the first contact, in s from the moment at which the controlled vehicle may act.
-        search: four numbers that the search needs, [SEARCH]. ``search[SINCE]`` (s) and ``search[POWER]`` (m/s2) are the
-            arguments ``since`` and ``power`` of the function ``gained``. ``search[FLOOR]`` is the lower bound on the
-            harm of the front pair alone (m2/s2). ``search[BEST]`` is the smallest harm that the search has reached so
-            far (m2/s2); the function lowers ``search[BEST]`` if it reaches a smaller harm.
-        moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-        heap: working memory for the search, [SEARCHED + 4, HEAP_WIDTH]: one row for each cell (range of first
-            contacts).
-
+    The result is at most ``search[BEST]``.
     """
     since, hard, count = min(search[SINCE], last), math.sqrt(search[BEST]), 0
     if since > 0.0:

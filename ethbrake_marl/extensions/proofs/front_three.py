@@ -4,6 +4,10 @@ For first contacts with the leader, the module uses ``lower_bound.front_first``,
 This bound assumes that the rear vehicle brakes fully. The bound for full braking also holds for a rear vehicle that may
 do anything, because a rear vehicle that arrives earlier never lowers the harm. For first contacts with the rear vehicle
 there is a separate search (``free_rear.meetings_behind``). docs/internals/proofs/team-bound.md has the proofs.
+
+``proofs/__init__.py`` and ``free_rear`` explain the arguments that functions share. ``first`` is the earliest time (s)
+of a first contact with the front vehicle. ``pair`` [PAIR_WIDTH] is working memory for the values of one pair;
+overwritten.
 """
 
 from __future__ import annotations
@@ -41,16 +45,8 @@ def all_at_once(at: Floats, first: float, last: float, pair: Floats, plan: Float
 
     Let W be the smallest closing speed that the rear vehicle can have relative to the front vehicle at a contact of all
     three vehicles. The closing speeds of the two pairs add up to at least W. The closing speed of the front pair is at
-    least the smallest closing speed of any first contact with the front vehicle.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        first: earliest time of a first contact with the front vehicle, s.
-        last: latest time of a first contact with the front vehicle, s.
-        pair: working memory for the values of one pair, [PAIR_WIDTH]; overwritten.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
+    least the smallest closing speed of any first contact with the front vehicle. ``last`` is the latest time (s) of a
+    first contact with the front vehicle.
     """
     pair[PAIR_GAP], pair[LEADER_ONSET], pair[LEADER_FREE] = at[LINE.GAP_L] + at[LINE.GAP_R], 0.0, 0.0
     pair[LEADER_V], pair[LEADER_A] = at[LINE.V_L], at[LINE.A_L]
@@ -67,20 +63,12 @@ def all_at_once(at: Floats, first: float, last: float, pair: Floats, plan: Float
 
 @compiled(apart=True)
 def late_meetings(at: Floats, first: float, stand: float, plan: Floats, other: Floats) -> int:
-    """Return a code that says whether the first contact of the rear vehicle and the controlled vehicle can come after
-    ``stand``.
+    """Return a code that says whether the first contact of the rear pair can come after ``stand``, the time (s) at
+    which the rear vehicle comes to rest under full braking.
 
-    Code 0: the first contact of these two vehicles cannot come after ``stand``. Code 1: this contact can come after
-    ``stand``; if it does, its harm is at least as large as the harm of some first contact with the front vehicle. Code
-    2: this contact can come after ``stand``, and nothing is proven about its harm.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        first: earliest time of a first contact with the front vehicle, s; infinite if there is no such contact.
-        stand: time at which the rear vehicle comes to rest under full braking, s.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
+    Code 0: this contact cannot come after ``stand``. Code 1: it can; if it does, its harm is at least as large as the
+    harm of some first contact with the front vehicle. Code 2: it can, and nothing is proven about its harm. ``first``
+    is infinite if there is no first contact with the front vehicle.
     """
     if first == math.inf or not stays_ahead(at, first, first, plan, other):
         return 0
@@ -104,25 +92,8 @@ def combined_bound_of_team(
     """Return a lower bound (m2/s2) on the harm of the first three vehicles in a world with unavoidable contact.
 
     The bound covers first contacts with the front vehicle and first contacts with the rear vehicle. The result is 0 if
-    some of the harm that the bound counts may come after ``until``.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        until: horizon, s; later harm does not count.
-        front: lower bound on the harm of the front pair (front and controlled vehicle) alone, m2/s2.
-        rear: lower bound on the harm of the rear pair (controlled and rear vehicle) alone, m2/s2.
-        since: time from which on the rear vehicle may brake less than fully, s.
-        power: largest possible value of the rear vehicle's acceleration minus its acceleration under full braking,
-            m/s2.
-        pair: working memory for the values of one pair, [PAIR_WIDTH]; overwritten.
-        moved: working memory for a changed copy of the world's state, [LINE.WIDTH]; overwritten.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-        heap: working memory for the search of contacts with the front vehicle, [CELLS, NEAR]: one row for each cell
-            (range of first contacts).
-        heap_behind: working memory for the search of contacts with the rear vehicle, [SEARCHED + 4, HEAP_WIDTH]: one
-            row for each cell (range of first contacts).
-
+    some of the harm that the bound counts may come after the horizon ``until`` (s). ``front`` and ``rear`` are lower
+    bounds on the harm of each pair alone (m2/s2). ``heap_behind`` is the heap of ``free_rear``.
     """
     rest, stand = last_rest(at)
     if not rest < until:
@@ -153,18 +124,11 @@ def combined_bound_of_team(
 
 @compiled
 def bound_threes(states: Floats, until: Floats, pairs: Floats, since: Floats, power: Floats, out: Floats) -> None:
-    """Compute a lower bound on the harm of the first three vehicles together in each of ``n`` worlds with unavoidable
-    contact.
+    """Compute a lower bound (m2/s2) on the harm of the first three vehicles together in each of ``n`` worlds with
+    unavoidable contact, and write it to ``out`` [n].
 
-    Args:
-        states: [n, LINE.WIDTH] worlds; ``line.LINE`` names the columns.
-        until: [n] horizon, s; later harm does not count.
-        pairs: [n, 2] lower bounds on the harm of the first two pairs, each pair alone, m2/s2.
-        since: [n] time from which on the rear vehicle may brake less than fully, s.
-        power: [n] largest possible value of the rear vehicle's acceleration minus its acceleration under full braking,
-            m/s2.
-        out: [n] array into which the function writes the bounds, m2/s2.
-
+    ``states`` is [n, LINE.WIDTH]. ``until`` [n] is the horizon (s), after which harm does not count. ``pairs`` [n, 2]
+    has lower bounds on the harm of each of the first two pairs alone (m2/s2). ``since`` and ``power`` are [n].
     """
     plan, other, pair, moved = empty_plan(), empty_plan(), np.empty(PAIR_WIDTH), np.empty(LINE.WIDTH)
     heap, heap_behind = np.empty((CELLS, NEAR)), np.empty((SEARCHED + 4, HEAP_WIDTH))

@@ -1,5 +1,7 @@
 """Columns of the arrays that describe worlds in the proofs, and the motion of a front or rear vehicle that nothing
 pushes.
+
+``at`` is the state of one world: a row of such an array, [LINE.WIDTH].
 """
 
 from __future__ import annotations
@@ -13,8 +15,7 @@ from ethbrake_marl.physics.state import Floats
 
 
 class _Line(NamedTuple):
-    """Index of each column in the arrays that describe worlds. The values describe a world at the moment at which the
-    controlled vehicle may act.
+    """Index of each column in the arrays that describe worlds at the moment at which the controlled vehicle may act.
 
     L marks the front vehicle (leader), F the controlled vehicle (follower), R the rear vehicle. V is a speed (m/s), A a
     braking capacity and U a driving capacity (m/s2).
@@ -63,20 +64,14 @@ AHEAD_M = 1e-9  # an overlap below this does not count as contact with the other
 
 @compiled
 def leader(at: Floats, time: float) -> tuple[float, float]:
-    """Return speed (m/s) and travelled distance (m) of the front vehicle at ``time`` (s) if no other vehicle pushes it.
-
-    ``at`` is the state of one world, [LINE.WIDTH] numbers in the order of ``line.LINE``.
-    """
+    """Return speed (m/s) and travelled distance (m) of the front vehicle at ``time`` if no other vehicle pushes it."""
     speed, way, _ = solo_motion(at[LINE.V_L], -at[LINE.A_L], 0.0, math.inf, time)
     return speed, way
 
 
 @compiled
 def follower(at: Floats, time: float) -> tuple[float, float]:
-    """Return speed (m/s) and travelled distance (m) of the rear vehicle at ``time`` (s) if no other vehicle pushes it.
-
-    ``at`` is the state of one world, [LINE.WIDTH] numbers in the order of ``line.LINE``.
-    """
+    """Return speed (m/s) and travelled distance (m) of the rear vehicle at ``time`` if no other vehicle pushes it."""
     speed, way, _ = solo_motion(at[LINE.V_R], -at[LINE.A_R], at[LINE.ONSET_R], math.inf, time)
     return speed, way
 

@@ -1,7 +1,7 @@
 """``lower_bound``: a proven lower bound on the harm of every world, whatever the controlled vehicle does.
 
-In the compiled functions ``at`` is the state of one world (columns of ``line.LINE``); ``plan``, ``other`` and ``heap``
-are working memory.
+``proofs/__init__.py`` explains the arguments that functions share. ``front`` and ``rear`` are lower bounds on the harm
+of the front pair alone and of the rear pair alone, m2/s2.
 """
 
 from __future__ import annotations
@@ -61,17 +61,11 @@ _PARTS = 8  # number of parts into which the times of soft contacts are divided
 
 @compiled
 def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
-    """Return the smallest squared closing speed (m2/s2) at the first contact of the rear pair (controlled and rear
-    vehicle), and the latest time (s) of this contact.
+    """Return the smallest squared closing speed (m2/s2) at the first contact of the rear pair, and the latest time (s)
+    of this contact.
 
     If the controlled vehicle drives fully, the first contact of the rear pair happens exactly at the returned time with
     the returned squared closing speed. The returned time is infinite if full drive avoids this contact.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
     """
     fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], math.inf, at[LINE.A_F])
     fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
@@ -85,14 +79,6 @@ def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
 def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
     """Return whether the gentlest first contact (smallest closing speed) with the neighbour ``kind`` at ``time`` comes
     before any contact with the other neighbour.
-
-    Args:
-        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST``.
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        time: time of the contact, in s from the moment at which the controlled vehicle may act.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
     """
     if kind == FRONT_FIRST:
         return stays_ahead(at, gentlest_front(at, time)[1], time, plan, other)
@@ -101,23 +87,13 @@ def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) ->
 
 @compiled(apart=True)
 def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, other: Floats) -> float:
-    """Return the latest time (s) at which a contact with the neighbour ``kind`` can come before any contact with the
-    other neighbour.
+    """Return the latest time (s), at most ``last``, at which a contact with the neighbour ``kind`` can come before any
+    contact with the other neighbour.
 
-    The function finds this time by bisection: the later the first contact, the nearer is the other neighbour. The later
-    the contact with the front vehicle, the shorter the controlled vehicle drives, so the rear vehicle comes nearer. The
-    later the contact with the rear vehicle, the shorter the controlled vehicle brakes, so the controlled vehicle comes
-    nearer to the front vehicle.
-
-    Args:
-        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST``.
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        first: a time at which a first contact with the neighbour ``kind`` is possible before the other neighbour
-            arrives, s.
-        last: latest time of a contact with the neighbour ``kind``, s; the result is at most ``last``.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
+    The function finds this time by bisection, beginning with ``first`` (s), a time at which such a contact is possible.
+    The later the first contact, the nearer is the other neighbour. The later the contact with the front vehicle, the
+    shorter the controlled vehicle drives, so the rear vehicle comes nearer. The later the contact with the rear
+    vehicle, the shorter the controlled vehicle brakes, so the controlled vehicle comes nearer to the front vehicle.
     """
     if is_first(kind, at, last, plan, other):
         return last
@@ -136,14 +112,7 @@ def last_meeting(at: Floats, first: float, plan: Floats, other: Floats) -> tuple
     the front vehicle can come before the rear vehicle arrives.
 
     The third result is True if the first contact with the front vehicle may come arbitrarily late and at any closing
-    speed.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        first: earliest time of a contact with the front vehicle, s.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
+    speed. ``first`` is the earliest time (s) of a contact with the front vehicle.
     """
     touches = spare_gap(at[LINE.GAP_L], at[LINE.V_L], at[LINE.A_L], at[LINE.V_F], at[LINE.A_F]) >= 0.0
     last = meet_front(at, 0.0, plan, other)
@@ -159,25 +128,13 @@ def last_meeting(at: Floats, first: float, plan: Floats, other: Floats) -> tuple
 def front_first(
     at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
-    """Return a lower bound (m2/s2) on the harm if the first contact is with the front vehicle or with both neighbours
-    at once.
+    """Return a lower bound (m2/s2), at most ``best``, on the harm if the first contact is with the front vehicle or
+    with both neighbours at once.
 
-    The result is at most ``best``, the smallest harm that the search has reached. In a contact of all three vehicles at
-    once, the closing speeds of the two pairs add up to W, the closing speed of the rear vehicle relative to the front
-    vehicle. The closing speed of the front pair is at least the smallest closing speed that is possible at the time of
-    this contact. The result covers a contact of all three vehicles at a time t only if a first contact with the front
-    vehicle is possible at the time t.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        floor: known lower bound on the harm of the other pair (the pair that does not have the first contact), m2/s2.
-        best: smallest harm that the search has reached so far, m2/s2.
-        enough: lower bound on the harm that is already proven in another way, m2/s2; the function returns 0 if the harm
-            that it proves for some first contact is not above ``enough``.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-        heap: working memory for the search, [CELLS, NEAR]: one row for each cell (range of first contacts).
-
+    In a contact of all three vehicles at once, the closing speeds of the two pairs add up to W, the closing speed of
+    the rear vehicle relative to the front vehicle. The closing speed of the front pair is at least the smallest closing
+    speed that is possible at the time of this contact. The result covers a contact of all three vehicles at a time t
+    only if a first contact with the front vehicle is possible at the time t.
     """
     first = meet_front(at, math.inf, plan, other)
     if (
@@ -211,21 +168,8 @@ def front_first(
 def soft_harm(
     kind: int, at: Floats, early: float, late: float, floor: float, best: float, plan: Floats, other: Floats
 ) -> float:
-    """Return a lower bound (m2/s2) on the harm of first contacts from ``early`` to ``late`` with any closing speed.
-
-    The result is at most ``best``, the smallest harm that the search has reached.
-
-    Args:
-        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST``.
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
-            act.
-        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
-        floor: known lower bound on the harm of the other pair (the pair that does not have the first contact), m2/s2.
-        best: smallest harm that the search has reached so far, m2/s2.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
+    """Return a lower bound (m2/s2), at most ``best``, on the harm of first contacts from ``early`` to ``late`` with any
+    closing speed.
     """
     soft = 0.0
     while soft * soft < best:
@@ -242,20 +186,7 @@ def soft_harm(
 def rear_first(
     at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
-    """Return a lower bound (m2/s2) on the harm if the first contact is with the rear vehicle. The result is at most
-    ``best``, the smallest harm that the search has reached.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        floor: known lower bound on the harm of the other pair (the pair that does not have the first contact), m2/s2.
-        best: smallest harm that the search has reached so far, m2/s2.
-        enough: lower bound on the harm that is already proven in another way, m2/s2; the function returns 0 if the harm
-            that it proves for some first contact is not above ``enough``.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-        heap: working memory for the search, [CELLS, NEAR]: one row for each cell (range of first contacts).
-
-    """
+    """Return a lower bound (m2/s2), at most ``best``, on the harm if the first contact is with the rear vehicle."""
     high = max(at[LINE.V_F] / at[LINE.A_F], at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R])
     first = meet_rear(at, high, plan, other)
     if first == math.inf or not stays_behind(at, first, first, plan, other):
@@ -290,14 +221,8 @@ def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
     Until its first contact, the rear vehicle passes neither the front vehicle nor the controlled vehicle. Suppose that
     the rear vehicle brakes harder than the controlled vehicle, by b (m/s2). If the rear vehicle already braked at the
     time t seconds before the contact, the rear vehicle was faster at that time than the controlled vehicle by at least
-    ``b t`` (m/s).
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        rest: time at which controlled and rear vehicle have both come to rest under full braking, s.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
+    ``b t`` (m/s). ``rest`` is the time (s) at which controlled and rear vehicle have both come to rest under full
+    braking.
     """
     fill_braking(plan, 0.0, at[LINE.A_L])
     fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
@@ -317,10 +242,6 @@ def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
 def last_rest(at: Floats) -> tuple[float, float]:
     """Return the time (s) by which all harm that the combined bound counts has happened, and the time (s) at which the
     rear vehicle comes to rest if it brakes fully and no other vehicle pushes it.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-
     """
     stand = at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R]
     way = solo_motion(at[LINE.V_R], -at[LINE.A_R], at[LINE.ONSET_R], math.inf, stand)[1]
@@ -336,17 +257,7 @@ def combined_bound(
     """Return a lower bound (m2/s2) on the harm of a world with unavoidable contact.
 
     The first contact may be with the front or the rear vehicle. The result is 0 if some of the harm that the bound
-    counts may come after ``until``.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        until: horizon, s; later harm does not count.
-        front: lower bound on the harm of the front pair (front and controlled vehicle) alone, m2/s2.
-        rear: lower bound on the harm of the rear pair (controlled and rear vehicle) alone, m2/s2.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-        heap: working memory for the search, [CELLS, NEAR]: one row for each cell (range of first contacts).
-
+    counts may come after the horizon ``until`` (s).
     """
     if not last_rest(at)[0] < until:
         return 0.0
@@ -371,10 +282,9 @@ def bound_worlds(
         states: [n, LINE.WIDTH] worlds; ``line.LINE`` names the columns.
         until: [n] horizon, s; later harm does not count.
         has_front: [n] True if the controlled vehicle has a front vehicle and the next impact of this pair counts.
-        has_rear: [n] True if the controlled vehicle has a rear vehicle and the next impact of this pair counts.
+        has_rear: [n] the same for the rear vehicle.
         unavoidable: [n] True if contact is unavoidable; the combined bound is 0 in all other worlds.
-        out: [n, BOUNDS] array into which the function writes the columns FRONT_BOUND, REAR_BOUND and COMBINED_BOUND,
-            m2/s2.
+        out: [n, BOUNDS] output: the columns FRONT_BOUND, REAR_BOUND and COMBINED_BOUND, m2/s2.
 
     """
     plan, other, heap = empty_plan(), empty_plan(), np.empty((CELLS, NEAR))
@@ -423,16 +333,14 @@ def lower_bound(
     Args:
         worlds: the ``n`` worlds in their present state.
         vehicle: index of the controlled vehicle, from 0.
-        harm_count: which impacts count: ``first`` or ``total``. With ``first``, only the first impact of each pair
-            counts: if a pair has had an impact before now, no later impact of this pair counts.
+        harm_count: ``first`` or ``total``. With ``first``, only the first impact of each pair counts: if a pair has had
+            an impact before now, no later impact of this pair counts.
         horizon_s: time until which harm counts, s after the alert.
-        scripts: maps the index of each vehicle that is not controlled to the name of its script. The only script
-            allowed is full_brake. If ``scripts`` is None, all vehicles that are not controlled brake fully.
-        time_step_s: time between two decisions, s. If ``time_step_s`` is a number, the bound is larger than for None,
-            but it holds only for commands that change at decisions. The first decision comes when the vehicle may act,
-            and the next ones every ``time_step_s`` after it, as for every agent. If ``time_step_s`` is a number, the
-            computation takes ten times as long as for None. If ``time_step_s`` is None, commands may change at any
-            time.
+        scripts: script of each vehicle that is not controlled, by index; only full_brake is allowed. None: all of them
+            brake fully.
+        time_step_s: time between two decisions, s. With a number, the bound is larger than with None, but it holds only
+            for commands that change at decisions: when the vehicle may act, and every ``time_step_s`` after that, as
+            for every agent. The computation then takes ten times as long. None: commands may change at any time.
 
     Raises ``InvalidInput`` for lines that ``avoidability`` does not cover, for an unknown ``harm_count``, for a time
     step below ``LEAST_TIME_STEP_S``, and for a horizon that is not finite or lies before the vehicle may act.

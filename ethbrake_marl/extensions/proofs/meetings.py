@@ -1,9 +1,12 @@
 """Compute the gentlest first contact (smallest closing speed) of the controlled vehicle with a neighbour at a given
 time.
 
-Times are measured from the moment at which the controlled vehicle (f) may act. The front vehicle (leader, l) already
-brakes at time 0. The rear vehicle (r) coasts until its latency has elapsed, and then brakes. All speeds and gaps are at
-least 0. docs/internals/proofs/lower-bound.md has the proofs.
+Times are measured from the moment at which the controlled vehicle may act. The front vehicle already brakes at time 0.
+The rear vehicle coasts until its latency has elapsed, and then brakes. All speeds and gaps are at least 0.
+docs/internals/proofs/lower-bound.md has the proofs.
+
+``proofs/__init__.py`` explains the arguments that functions share. ``drive`` is how long (s) a vehicle drives before it
+brakes, and ``brake`` how long (s) a vehicle brakes before it drives.
 """
 
 from __future__ import annotations
@@ -32,11 +35,6 @@ def gentlest_front(at: Floats, time: float) -> tuple[float, float]:
 
     The controlled vehicle reaches the place of the contact at ``time`` with the smallest possible speed if it drives
     first and then brakes.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        time: time of the contact, in s from the moment at which the controlled vehicle may act.
-
     """
     v_l, way = leader(at, time)
     place, v, u, a = at[LINE.GAP_L] + way, at[LINE.V_F], at[LINE.U_F], at[LINE.A_F]
@@ -61,12 +59,6 @@ def braked_then_driven(at: Floats, brake: float, time: float) -> tuple[float, fl
     drives.
 
     A vehicle that brakes to rest waits there until it drives.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        brake: how long the vehicle brakes before it drives, s.
-        time: time at which the function computes distance and speed, s.
-
     """
     v, u, a = at[LINE.V_F], at[LINE.U_F], at[LINE.A_F]
     braking = min(brake, v / a)
@@ -84,11 +76,7 @@ def braking_to_rear(at: Floats, time: float, further: float) -> float:
     """Return how long (s) the controlled vehicle must brake before it drives, so that it has contact with the rear
     vehicle at ``time``.
 
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        time: time of the contact, in s from the moment at which the controlled vehicle may act.
-        further: distance by which the rear vehicle is farther ahead than if it braked fully, m.
-
+    The rear vehicle is farther ahead than if it braked fully, by the distance ``further`` (m).
     """
     place = follower(at, time)[1] - at[LINE.GAP_R] + further
     low, high = 0.0, time
@@ -109,11 +97,6 @@ def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
     The controlled vehicle reaches the place of the contact at ``time`` with the largest possible speed if it brakes
     first and then drives. The duration of the braking is returned as infinite if the vehicle reaches its speed limit by
     ``time``.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        time: time of the contact, in s from the moment at which the controlled vehicle may act.
-
     """
     brake = braking_to_rear(at, time, 0.0)
     speed = braked_then_driven(at, brake, time)[1]
@@ -126,13 +109,6 @@ def gentlest(kind: int, at: Floats, time: float) -> tuple[float, float]:
     drives or brakes first.
 
     With brake build-up, the second result (the duration) is always 0.
-
-    Args:
-        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
-            build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        time: time of the contact, in s from the moment at which the controlled vehicle may act.
-
     """
     if kind >= RAMPED_FRONT:
         return gentlest_ramped(kind, at, time), 0.0
@@ -144,14 +120,7 @@ def meet_front(at: Floats, drive: float, plan: Floats, other: Floats) -> float:
     """Return the time (s) at which a controlled vehicle that drives first and then brakes has contact with the front
     vehicle.
 
-    The result is infinite if there is no contact.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        drive: how long the vehicle drives before it brakes, s; infinite if it never brakes.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
+    The result is infinite if there is no contact. If ``drive`` is infinite, the vehicle never brakes.
     """
     fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], drive, at[LINE.A_F])
     fill_braking(other, 0.0, at[LINE.A_L])
@@ -164,13 +133,6 @@ def meet_rear(at: Floats, brake: float, plan: Floats, other: Floats) -> float:
     vehicle.
 
     The result is infinite if there is no contact.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        brake: how long the vehicle brakes before it drives, s.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
     """
     fill_brake_then_drive(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], brake, at[LINE.A_F])
     fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
@@ -182,15 +144,7 @@ def meet_rear(at: Floats, brake: float, plan: Floats, other: Floats) -> float:
 @compiled(apart=True)
 def stays_ahead(at: Floats, drive: float, until: float, plan: Floats, other: Floats) -> bool:
     """Return whether a controlled vehicle that drives first and then brakes avoids contact with the rear vehicle until
-    ``until``.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        drive: how long the vehicle drives before it brakes, s.
-        until: time until which there must be no contact, s.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
+    ``until`` (s).
     """
     fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], drive, at[LINE.A_F])
     fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
@@ -200,15 +154,7 @@ def stays_ahead(at: Floats, drive: float, until: float, plan: Floats, other: Flo
 @compiled(apart=True)
 def stays_behind(at: Floats, brake: float, until: float, plan: Floats, other: Floats) -> bool:
     """Return whether a controlled vehicle that brakes first and then drives avoids contact with the front vehicle until
-    ``until``.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        brake: how long the vehicle brakes before it drives, s.
-        until: time until which there must be no contact, s.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
+    ``until`` (s).
     """
     fill_brake_then_drive(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], brake, at[LINE.A_F])
     fill_braking(other, 0.0, at[LINE.A_L])

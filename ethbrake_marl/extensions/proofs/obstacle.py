@@ -1,9 +1,9 @@
 """Compute lower bounds on the harm that must follow a first contact if an obstacle is ahead of the front vehicle.
 
-``beyond`` is the squared speed (m2/s2) at which the leader (front vehicle) hits the obstacle. The leader's speed at the
-obstacle limits how far ahead the leader can be at any time. Position 0 is the place of the controlled vehicle at the
-moment at which it may act. Masses are in units of the controlled vehicle's mass.
-docs/internals/proofs/lower-bound-obstacle.md has the proofs.
+``beyond`` is the squared speed (m2/s2) at which the leader hits the obstacle. The leader's speed at the obstacle limits
+how far ahead the leader can be at any time. Position 0 is the place of the controlled vehicle at the moment at which it
+may act. Masses are in units of the controlled vehicle's mass. ``proofs/__init__.py`` explains the other arguments that
+functions share. docs/internals/proofs/lower-bound-obstacle.md has the proofs.
 """
 
 from __future__ import annotations
@@ -41,13 +41,8 @@ def all_three(at: Floats) -> tuple[float, float, float, float]:
     """Return the masses of front and rear vehicle, and two decelerations of the centre of mass of all three vehicles
     (m/s2).
 
-    Masses are in units of the controlled vehicle's mass. The third result is the largest deceleration of the centre of
-    mass before the rear vehicle brakes. The fourth result is the additional deceleration of this centre of mass that
-    the rear vehicle's brakes cause.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-
+    The third result is the largest deceleration of the centre of mass before the rear vehicle brakes. The fourth result
+    is the additional deceleration that the rear vehicle's brakes cause.
     """
     front, rear = at[LINE.FRONT_SHARE] / (1.0 - at[LINE.FRONT_SHARE]), at[LINE.REAR_SHARE] / (1.0 - at[LINE.REAR_SHARE])
     whole = front + 1.0 + rear
@@ -56,16 +51,10 @@ def all_three(at: Floats) -> tuple[float, float, float, float]:
 
 @compiled
 def leader_pushed(at: Floats, early: float, beyond: float) -> tuple[float, float]:
-    """Return the speed (m/s) of the front vehicle after a push, and the time (s) at which the front vehicle hits the
-    obstacle after this push.
+    """Return the speed (m/s) of the front vehicle after a push at ``early``, and the time (s) at which the front
+    vehicle hits the obstacle after this push.
 
-    The push is just strong enough that the front vehicle hits the obstacle with the speed ``sqrt(beyond)`` (m/s).
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: time of the push, s.
-        beyond: squared speed at which the front vehicle hits the obstacle, m2/s2.
-
+    The push is just strong enough that the front vehicle hits the obstacle with the speed ``sqrt(beyond)``.
     """
     v = math.sqrt(max(beyond + 2.0 * at[LINE.A_L] * (at[LINE.WALL] - leader(at, early)[1]), 0.0))
     return v, early + (v - math.sqrt(beyond)) / at[LINE.A_L]
@@ -78,18 +67,8 @@ def least_beyond(
     """Return the smallest squared speed (m2/s2) at which the front vehicle, pushed at ``early``, hits the obstacle.
 
     The bound uses the centre of mass of all three vehicles, which cannot reach the obstacle before the front vehicle
-    does.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: time of the push, s.
-        late: time for which ``place`` and ``speed`` are given, s.
-        place: smallest possible position, at ``late``, of the centre of mass of all three vehicles, m.
-        speed: speed of the centre of mass of all three vehicles at ``late``, m/s.
-        least: lower bound on the result that is known already, m2/s2; the result is at least ``least``.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
+    does. At ``late``, ``place`` is the smallest possible position (m) and ``speed`` the speed (m/s) of this centre of
+    mass. The result is at least ``least``, a lower bound that is known already.
     """
     if not speed > 0.0:
         return least
@@ -111,15 +90,8 @@ def slowest(at: Floats, early: float, late: float, faster: float) -> tuple[float
     brakes after its first contact.
 
     The third result is the deceleration of the vehicle (m/s2): the largest braking capacity of all three vehicles, so
-    that no command and no push brings the vehicle further behind.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
-            act.
-        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
-        faster: speed of the vehicle minus speed of the front vehicle after the first contact, m/s.
-
+    that no command and no push brings the vehicle further behind. ``faster`` is the speed of the vehicle minus the
+    speed of the front vehicle after the first contact, m/s.
     """
     v_l, way = leader(at, late)
     brakes = max(at[LINE.A_F], at[LINE.A_L], at[LINE.A_R])
@@ -133,15 +105,8 @@ def last_drive(room: float, speed: float, brakes: float, drive: float, time: flo
     """Return how long (s) a vehicle must drive, after braking first, to travel ``room`` metres in ``time`` seconds in
     all.
 
-    The result is infinite if the vehicle cannot travel so far.
-
-    Args:
-        room: distance that the vehicle must travel, m.
-        speed: present speed of the vehicle, m/s.
-        brakes: deceleration while the vehicle brakes, m/s2.
-        drive: acceleration while the vehicle drives, m/s2.
-        time: total time of braking and driving, s.
-
+    The result is infinite if the vehicle cannot travel so far. ``speed`` is the present speed (m/s), ``brakes`` the
+    deceleration and ``drive`` the acceleration (m/s2).
     """
     stand = speed / brakes
     if time > stand:
@@ -163,19 +128,9 @@ def stopped_there(
     (m/s) is the vehicle's largest backward speed. The time (s) is the longest time that the vehicle can spend near the
     obstacle before the rear vehicle arrives.
 
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
-            act.
-        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
-        hard: largest closing speed that the first contact may have, m/s.
-        beyond: squared speed at which the front vehicle hits the obstacle, m2/s2.
-        struck: time at which the front vehicle hits the obstacle, s.
-        until: time by which the rear vehicle arrives, s.
-        place: smallest possible position of the vehicle at ``late``, m.
-        speed: smallest possible speed of the vehicle at ``late``, m/s.
-        brakes: deceleration of the vehicle, m/s2.
-
+    The front vehicle hits the obstacle at the time ``struck``, and the rear vehicle arrives by the time ``until`` (s).
+    ``place`` and ``speed`` are the smallest possible position (m) and speed (m/s) of the vehicle at ``late``,
+    ``brakes`` is its deceleration (m/s2).
     """
     bounce, drive, wall = at[LINE.RESTITUTION], at[LINE.U_F], at[LINE.GAP_L] + at[LINE.WALL]
     v_l, way = leader(at, early)
@@ -204,26 +159,11 @@ def behind_leader(
     at: Floats, early: float, late: float, soft: float, hard: float, beyond: float, place: float, speed: float,
     plan: Floats, other: Floats,
 ) -> float:  # fmt: skip
-    """Return the smallest squared closing speed (m2/s2) of the rear pair (controlled and rear vehicle) after the
-    controlled vehicle's first contact, which is with the front vehicle.
+    """Return the smallest squared closing speed (m2/s2) of the rear pair after a first contact with the front vehicle.
 
     The function assumes that the front vehicle hits the obstacle with at most ``sqrt(beyond)`` m/s, and that no vehicle
     passes the front vehicle or the obstacle. The result is LARGE (a huge number) if these assumptions contradict each
-    other.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
-            act.
-        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
-        soft: smallest closing speed that the first contact may have, m/s.
-        hard: largest closing speed that the first contact may have, m/s.
-        beyond: largest squared speed at which the front vehicle hits the obstacle, m2/s2.
-        place: smallest possible position, at ``late``, of the centre of mass of all three vehicles, m.
-        speed: speed of the centre of mass of all three vehicles at ``late``, m/s.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
+    other. ``place`` and ``speed`` are as in ``least_beyond``.
     """
     wall, drive, onset = at[LINE.GAP_L] + at[LINE.WALL], at[LINE.U_F], at[LINE.ONSET_R]
     rest = 1.0 - at[LINE.FRONT_SHARE] * (1.0 + at[LINE.RESTITUTION])
@@ -292,20 +232,10 @@ def behind_leader(
 def after_at_obstacle(
     at: Floats, early: float, late: float, soft: float, hard: float, follows: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the smallest sum (m2/s2) of the harm of the rear pair (controlled and rear vehicle) and the harm at the
-    obstacle, after a first contact with the front vehicle.
+    """Return the smallest sum (m2/s2) of the harm of the rear pair and the harm at the obstacle, after a first contact
+    with the front vehicle.
 
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
-            act.
-        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
-        soft: smallest closing speed that the first contact may have, m/s.
-        hard: largest closing speed that the first contact may have, m/s.
-        follows: known lower bound on the harm of the rear pair (controlled and rear vehicle), m2/s2.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
+    ``follows`` is a known lower bound on the harm of the rear pair, m2/s2.
     """
     share = at[LINE.FRONT_SHARE]
     least = obstacle_harm(at, late, soft)
@@ -339,16 +269,7 @@ def beyond_rear(
     """Return the smallest squared speed (m2/s2) of the front vehicle at the obstacle if the first contact is with the
     rear vehicle.
 
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
-            act.
-        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
-        closing: largest closing speed that the first contact may have, m/s.
-        least: lower bound on the result that is known already, m2/s2; the result is at least ``least``.
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
+    The result is at least ``least``, a lower bound that is known already.
     """
     v_l, way_l = leader(at, late)
     v_r, way_r = follower(at, late)
@@ -364,22 +285,8 @@ def beyond_rear(
 def after_rear(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the smallest sum (m2/s2) of the harm of the front pair (front and controlled vehicle) and the harm at the
-    obstacle, after a first contact with the rear vehicle.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
-            act.
-        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
-        closing: largest closing speed that the first contact may have, m/s.
-        end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
-        lack: smallest amount, m/s2, by which the controlled vehicle's command until ``end`` differs from the extreme
-            command (full drive after a first contact with the front vehicle, full braking after one with the rear
-            vehicle).
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
+    """Return the smallest sum (m2/s2) of the harm of the front pair and the harm at the obstacle, after a first contact
+    with the rear vehicle.
     """
     share, rest = at[LINE.REAR_SHARE], 1.0 - at[LINE.REAR_SHARE]
     v_l, way_l = leader(at, early)
@@ -411,23 +318,6 @@ def after(
 ) -> float:  # fmt: skip
     """Return the smallest harm (m2/s2) that must follow a first contact: the harm of the contact with the second
     neighbour and, if there is an obstacle, the harm at the obstacle.
-
-    Args:
-        kind: code of the neighbour with which the first contact happens: ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake
-            build-up: ``RAMPED_FRONT`` or ``RAMPED_REAR``).
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
-            act.
-        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
-        closing: largest closing speed that the first contact may have, m/s.
-        end: end of the decision step in which the first contact happens, s; the command cannot change before ``end``.
-        lack: smallest amount, m/s2, by which the controlled vehicle's command until ``end`` differs from the extreme
-            command (full drive after a first contact with the front vehicle, full braking after one with the rear
-            vehicle).
-        plan: working memory for the motion of one vehicle, an array from ``empty_plan`` (with brake build-up from
-            ``empty_legs``); overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
     """
     if kind >= RAMPED_FRONT:
         return after_ramped(kind, at, early, late, closing, plan, other)

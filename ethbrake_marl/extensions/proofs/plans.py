@@ -3,7 +3,7 @@
 A *plan* is the motion of one vehicle, an array [2, PIECES]. A *piece* is a time interval of constant acceleration. Row
 ENDS has the end of each piece (in s from now; the last piece never ends). Row ACCELERATIONS has the acceleration in
 each piece (m/s2). A vehicle that brakes to rest stays at rest. The simulation needs no time steps, because the motion
-in each piece has a closed form.
+in each piece has a closed form. A function whose name begins with ``fill`` overwrites ``plan``.
 """
 
 from __future__ import annotations
@@ -23,9 +23,7 @@ PIECES = 4
 
 @compiled
 def empty_plan() -> Floats:
-    """Return an uninitialised plan, [2, PIECES]. A plan consists of intervals of constant acceleration: the caller
-    fills row 0 with their ends (s) and row 1 with their accelerations (m/s2).
-    """
+    """Return an uninitialised plan, [2, PIECES]."""
     return np.empty((2, PIECES))
 
 
@@ -36,7 +34,7 @@ def fill_plan(
     """Write a plan with four constant accelerations (m/s2), one after the other.
 
     The acceleration is ``u_0`` until ``end_0``, ``u_1`` until ``end_1``, ``u_2`` until ``end_2``, and ``u_3`` after
-    ``end_2``. ``plan`` [2, PIECES] is overwritten.
+    ``end_2``.
     """
     plan[ENDS, 0], plan[ENDS, 1], plan[ENDS, 2], plan[ENDS, 3] = end_0, end_1, end_2, math.inf
     plan[ACCELERATIONS, 0], plan[ACCELERATIONS, 1] = u_0, u_1
@@ -45,10 +43,7 @@ def fill_plan(
 
 @compiled
 def fill_braking(plan: Floats, onset: float, braking: float) -> None:
-    """Write a plan: coast until ``onset`` (s), then brake to rest with ``braking`` (m/s2, positive).
-
-    ``plan`` [2, PIECES] is overwritten.
-    """
+    """Write a plan: coast until ``onset`` (s), then brake to rest with ``braking`` (m/s2, positive)."""
     fill_plan(plan, onset, 0.0, onset, 0.0, onset, 0.0, -braking)
 
 
@@ -57,7 +52,7 @@ def fill_window(plan: Floats, u: float, late: float, end: float, change: float, 
     """Write a plan: the acceleration is ``u``, increased by ``step`` from the time ``turn`` on, and increased by
     ``change`` from the time ``late`` to the time ``end``.
 
-    ``u``, ``step`` and ``change`` are in m/s2, the times in s. ``plan`` [2, PIECES] is overwritten.
+    ``u``, ``step`` and ``change`` are in m/s2, the times in s.
     """
     first, second, third = min(turn, late), min(max(turn, late), end), max(turn, end)
     u_1 = u + step if turn < late else u + change
@@ -76,16 +71,10 @@ def time_to_limit(v: float, u: float, limit: float) -> float:
 
 @compiled
 def fill_drive_then_brake(plan: Floats, v: float, u: float, limit: float, drive: float, braking: float) -> None:
-    """Write a plan: drive for ``drive`` seconds (without exceeding the speed limit), then brake to rest.
+    """Write a plan: drive with ``u`` (m/s2) for ``drive`` seconds, then brake to rest with ``braking`` (m/s2,
+    positive).
 
-    Args:
-        plan: [2, PIECES] array into which the function writes the motion.
-        v: present speed of the vehicle, m/s.
-        u: driving acceleration, m/s2.
-        limit: speed limit of the vehicle, m/s.
-        drive: how long the vehicle drives before it brakes, s.
-        braking: deceleration while the vehicle brakes, m/s2, positive.
-
+    ``v`` is the present speed (m/s). At the speed ``limit`` (m/s) the vehicle keeps its speed.
     """
     cap = min(time_to_limit(v, u, limit), drive)
     fill_plan(plan, cap, u, drive, 0.0, drive, 0.0, -braking)
@@ -95,14 +84,7 @@ def fill_drive_then_brake(plan: Floats, v: float, u: float, limit: float, drive:
 def fill_brake_then_drive(plan: Floats, v: float, u: float, limit: float, brake: float, braking: float) -> None:
     """Write a plan: brake for ``brake`` seconds, at most to rest, then drive up to the speed limit and keep that speed.
 
-    Args:
-        plan: [2, PIECES] array into which the function writes the motion.
-        v: present speed of the vehicle, m/s.
-        u: driving acceleration, m/s2.
-        limit: speed limit of the vehicle, m/s.
-        brake: how long the vehicle brakes before it drives, s.
-        braking: deceleration while the vehicle brakes, m/s2, positive.
-
+    The arguments are as in ``fill_drive_then_brake``.
     """
     cap = brake + time_to_limit(max(v - braking * brake, 0.0), u, limit)
     fill_plan(plan, brake, -braking, cap, u, cap, 0.0, 0.0)
@@ -113,12 +95,7 @@ def piece_at(plan: Floats, now: float, v: float) -> tuple[float, float, bool]:
     """Return the acceleration at ``now`` (m/s2), the time until which this acceleration lasts (s), and whether the
     vehicle stops at that time.
 
-    Args:
-        plan: [2, PIECES] motion of the vehicle: ends (s) and accelerations (m/s2) of its intervals of constant
-            acceleration.
-        now: present time, s.
-        v: speed at ``now``, m/s.
-
+    ``v`` is the speed at ``now``, m/s.
     """
     k = 0
     while now >= plan[ENDS, k]:
@@ -140,20 +117,11 @@ def walk(
     """Return the smallest gap of two vehicles (m), the time (s) of their first contact, and the squared closing speed
     (m2/s2) of this contact.
 
-    If there is no contact, the time is infinite and the closing speed 0. The motion is computed as if the vehicles
-    could pass through each other, so a negative smallest gap is the depth of their overlap. A gap that reaches 0 and
-    opens again does not count as contact. A gap that reaches 0 and would become negative counts as contact, even at
-    closing speed 0. The speeds of both vehicles must be at least 0.
-
-    Args:
-        gap: present gap between the two vehicles, m.
-        v_front: speed of the front vehicle, m/s.
-        front: motion of the front vehicle, [2, PIECES]: ends (s) and accelerations (m/s2) of its intervals of constant
-            acceleration.
-        v_rear: speed of the rear vehicle, m/s.
-        rear: motion of the rear vehicle, an array like ``front``.
-        until: time at which the motion ends, s.
-
+    The vehicles start with the gap ``gap`` (m) and the speeds ``v_front`` and ``v_rear`` (m/s, at least 0), and follow
+    the plans ``front`` and ``rear`` until ``until`` (s). If there is no contact, the time is infinite and the closing
+    speed 0. The motion is computed as if the vehicles could pass through each other, so a negative smallest gap is the
+    depth of their overlap. A gap that reaches 0 and opens again does not count as contact. A gap that reaches 0 and
+    would become negative counts as contact, even at closing speed 0.
     """
     lowest, now, met_at, squared = gap, 0.0, math.inf, 0.0
     while now < until:

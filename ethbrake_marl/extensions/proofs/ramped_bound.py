@@ -1,4 +1,7 @@
-"""Compute the lower bound on harm if brakes build up at finite rates."""
+"""Compute the lower bound on harm if brakes build up at finite rates.
+
+``proofs/__init__.py`` explains the arguments that functions share.
+"""
 
 from __future__ import annotations
 
@@ -38,18 +41,9 @@ def combined_ramped(
 ) -> float:
     """Return a lower bound (m2/s2) on the harm of both pairs together, with brake build-up.
 
-    The first contact may be with the front or the rear vehicle. The result is 0 if nothing is proven.
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        until: horizon, s; later harm does not count.
-        front: lower bound on the harm of the front pair (front and controlled vehicle) alone, m2/s2.
-        rear: lower bound on the harm of the rear pair (controlled and rear vehicle) alone, m2/s2.
-        contact_s: time by which some contact is certain, s; infinite if no contact is known to be certain.
-        plan: working memory for the motion of one vehicle, an array from ``empty_legs``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-        heap: working memory for the search, [CELLS, NEAR]: one row for each cell (range of first contacts).
-
+    The first contact may be with the front or the rear vehicle. The result is 0 if nothing is proven. ``until`` is the
+    horizon (s), after which harm does not count. ``front`` and ``rear`` are lower bounds on the harm of each pair alone
+    (m2/s2). ``contact_s`` is the time by which some contact is certain, infinite if no contact is known to be certain.
     """
     if min(at[LINE.GAP_L], at[LINE.GAP_R]) <= TOUCHING_M:
         return 0.0
@@ -85,14 +79,8 @@ def bound_ramped(states: Floats, has_front: Bools, has_rear: Bools, both: Bools,
     """Compute lower bounds on the harm of ``n`` worlds with brake build-up: for each pair alone, and for both pairs
     together.
 
-    Args:
-        states: [n, LINE.WIDTH] worlds; ``line.LINE`` names the columns.
-        has_front: [n] True if the controlled vehicle has a front vehicle and the next impact of this pair counts.
-        has_rear: [n] True if the controlled vehicle has a rear vehicle and the next impact of this pair counts.
-        both: [n] True for worlds whose combined bound is computed; the combined bound is 0 in all other worlds.
-        out: [n, BOUNDS] array into which the function writes the columns FRONT_BOUND, REAR_BOUND and COMBINED_BOUND,
-            m2/s2.
-
+    The arguments are as in ``lower_bound.bound_worlds``. ``both`` [n] is True for worlds whose combined bound is
+    computed; the combined bound is 0 in all other worlds.
     """
     plan, other, heap = empty_legs(), empty_legs(), np.empty((CELLS, NEAR))
     for k in range(states.shape[0]):
@@ -114,13 +102,9 @@ def bound_ramped(states: Floats, has_front: Bools, has_rear: Bools, both: Bools,
 def ramped_states(worlds: Worlds, i: int, until: Floats) -> Floats:
     """Return worlds with brake build-up as an array with the columns of ``line.LINE``, [n, LINE.WIDTH].
 
-    A controlled vehicle that already brakes or drives is treated as if its brakes built up and released at once.
-
-    Args:
-        worlds: the worlds, [n], at the moment when vehicle ``i`` may act.
-        i: index of the controlled vehicle.
-        until: [n] horizon, in s from the moment when vehicle ``i`` may act; later harm does not count.
-
+    The worlds are in their state at the moment when the controlled vehicle ``i`` may act. ``until`` [n] is the horizon,
+    in s from this moment. A controlled vehicle that already brakes or drives is treated as if its brakes built up and
+    released at once.
     """
     v, at = worlds.vehicles, onset_states(worlds, i, None)
     moved = worlds.command_mps2[:, i] != 0.0

@@ -2,9 +2,14 @@
 
 ``sign`` is 1 for first contacts with the leader and -1 for first contacts with the rear vehicle. The functions treat
 contacts with the rear vehicle as the mirror image of contacts with the leader. Here *force* means force per mass, which
-is an acceleration (m/s2). ``sign`` times the controlled vehicle's force first rises and later falls. For a contact with
-the leader the controlled vehicle drives and then brakes; for a contact with the rear vehicle it brakes and then drives.
-``place`` is a position times ``sign`` (m). docs/internals/proofs/lower-bound-cases.md has the proofs.
+is an acceleration (m/s2). ``sign`` times the controlled vehicle's force first rises and later falls; the *switch* is
+the time (s) at which it begins to fall. For a contact with the leader the controlled vehicle drives and then brakes;
+for a contact with the rear vehicle it brakes and then drives. docs/internals/proofs/lower-bound-cases.md has the
+proofs.
+
+``place`` is a position times ``sign`` (m). ``final`` is the required value of ``sign`` times the force at the time of
+the contact (m/s2), or -inf if no value is required. ``proofs/__init__.py`` explains the other arguments that functions
+share.
 """
 
 from __future__ import annotations
@@ -35,37 +40,23 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 
 @compiled
 def fill_leader(at: Floats, plan: Floats) -> None:
-    """Write the motion of the front vehicle, if no other vehicle pushes it, to ``plan`` [3, LEGS].
-
-    A plan describes a vehicle's acceleration as a piecewise linear function of time. ``at`` is the state of one world,
-    [LINE.WIDTH] numbers in the order of ``line.LINE``.
-    """
+    """Write the motion of the front vehicle, if no other vehicle pushes it, to ``plan`` [3, LEGS]."""
     fill_build_up(plan, 0.0, at[LINE.FORCE_L], -at[LINE.A_L], at[LINE.FALL_L])
 
 
 @compiled
 def fill_follower(at: Floats, plan: Floats) -> None:
-    """Write the motion of the rear vehicle, if no other vehicle pushes it, to ``plan`` [3, LEGS].
-
-    A plan describes a vehicle's acceleration as a piecewise linear function of time. ``at`` is the state of one world,
-    [LINE.WIDTH] numbers in the order of ``line.LINE``.
-    """
+    """Write the motion of the rear vehicle, if no other vehicle pushes it, to ``plan`` [3, LEGS]."""
     fill_build_up(plan, at[LINE.ONSET_R], at[LINE.FORCE_R], -at[LINE.A_R], at[LINE.FALL_R])
 
 
 @compiled
 def range_of(sign: float, at: Floats) -> tuple[float, float, float, float]:
-    """Return the limits of ``sign`` times the controlled vehicle's force: largest value, fastest rise, smallest value
-    and fastest fall.
+    """Return the limits of ``sign`` times the controlled vehicle's force: largest value (m/s2), fastest rise (m/s3),
+    smallest value (m/s2) and fastest fall (m/s3).
 
-    Here *force* means force per mass, which is an acceleration (m/s2); rates are in m/s3. The smallest value is
-    negative and is returned without its minus sign. If ``sign`` is 1, the largest value belongs to full drive; if
-    ``sign`` is -1, the largest value belongs to full braking.
-
-    Args:
-        sign: 1 or -1, by which the force is multiplied.
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-
+    The smallest value is negative and is returned without its minus sign. If ``sign`` is 1, the largest value belongs
+    to full drive; if ``sign`` is -1, the largest value belongs to full braking.
     """
     if sign > 0.0:
         return at[LINE.U_F], at[LINE.RISE_F], at[LINE.A_F], at[LINE.FALL_F]
@@ -76,17 +67,6 @@ def range_of(sign: float, at: Floats) -> tuple[float, float, float, float]:
 def fill_controlled(at: Floats, sign: float, switch: float, time: float, final: float, plan: Floats) -> None:
     """Write a plan of the controlled vehicle: ``sign`` times its force rises as fast as possible until ``switch``, then
     falls as fast as possible.
-
-    Here *force* means force per mass, which is an acceleration (m/s2).
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        sign: 1 for a contact with the front vehicle, -1 for a contact with the rear vehicle.
-        switch: time at which ``sign`` times the force begins to fall, s.
-        time: time of the contact, s.
-        final: required value of ``sign`` times the force at ``time``, m/s2; -inf if no value is required.
-        plan: [3, LEGS] array into which the function writes the motion.
-
     """
     high, rise, low, fall = range_of(sign, at)
     fill_switch(plan, sign, sign * at[LINE.FORCE_F], high, rise, low, fall, switch, time, final)
@@ -99,20 +79,8 @@ def switch_for(
     """Return a time (s) just before the switch and a time (s) just after the switch with which the controlled vehicle
     reaches ``place`` at ``time``.
 
-    The *switch* is the time at which ``sign`` times the vehicle's force stops rising and begins to fall; a *force* is
-    an acceleration. The third result is the speed (m/s) that the vehicle has at ``time`` if the switch happens at the
-    first result (the time just before the switch).
-
-    Args:
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        sign: 1 for a contact with the front vehicle, -1 for a contact with the rear vehicle.
-        time: time of the contact, in s from the moment at which the controlled vehicle may act.
-        place: ``sign`` times the position that the vehicle must reach at ``time``, m.
-        final: required value of ``sign`` times the force at ``time``, m/s2; -inf if no value is required.
-        halvings: number of bisection steps in the search for the switch (the time at which ``sign`` times the force
-            begins to fall).
-        plan: working memory for the motion of one vehicle, an array from ``empty_legs``; overwritten.
-
+    The third result is the speed (m/s) that the vehicle has at ``time`` if the switch happens at the first result.
+    ``halvings`` is the number of bisection steps.
     """
     low, high = (-1.0 if range_of(sign, at)[1] == math.inf else 0.0), time
     for _ in range(halvings):
@@ -130,15 +98,6 @@ def switch_for(
 def met_at(kind: int, at: Floats, time: float, plan: Floats) -> tuple[float, float, float]:
     """Return the sign of the first contact, and the speed (m/s) and the place (m) of the neighbour at ``time`` if no
     other vehicle pushes this neighbour.
-
-    The *sign* is 1 for the front vehicle and -1 for the rear vehicle. The *place* is the position times the sign.
-
-    Args:
-        kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        time: time of the contact, in s from the moment at which the controlled vehicle may act.
-        plan: working memory for the motion of one vehicle, an array from ``empty_legs``; overwritten.
-
     """
     if kind == RAMPED_FRONT:
         fill_leader(at, plan)
@@ -151,14 +110,7 @@ def met_at(kind: int, at: Floats, time: float, plan: Floats) -> tuple[float, flo
 
 @compiled(apart=True)
 def gentlest_ramped(kind: int, at: Floats, time: float) -> float:
-    """Return the smallest closing speed (m/s) of a first contact at ``time``, with brake build-up.
-
-    Args:
-        kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        time: time of the contact, in s from the moment at which the controlled vehicle may act.
-
-    """
+    """Return the smallest closing speed (m/s) of a first contact at ``time``, with brake build-up."""
     plan = empty_legs()
     sign, v, place = met_at(kind, at, time, plan)
     return max(sign * (switch_for(at, sign, time, place, -math.inf, HALVINGS, plan)[2] - v), 0.0)
@@ -171,19 +123,8 @@ def slack_of(
     """Return, for the time ``early``, the largest possible distance (m) to the neighbour and the largest possible
     *excess* (m/s).
 
-    The excess is the closing speed (m/s) of controlled vehicle and neighbour at ``early`` minus ``hard``. The first
-    contact comes between ``early`` and ``late``.
-
-    Args:
-        kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
-            act.
-        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
-        v: speed of the neighbour at ``early``, m/s.
-        hard: largest closing speed that the first contact may have, m/s.
-        plan: working memory for the motion of one vehicle, an array from ``empty_legs``; overwritten.
-
+    The excess is the closing speed of controlled vehicle and neighbour at ``early`` minus ``hard``. ``v`` is the speed
+    of the neighbour at ``early``, m/s.
     """
     span = late - early
     if kind == RAMPED_FRONT:
@@ -194,16 +135,7 @@ def slack_of(
 
 @compiled(apart=True)
 def gentlest_ramped_between(kind: int, at: Floats, early: float, late: float) -> float:
-    """Return the smallest closing speed (m/s) of first contacts between ``early`` and ``late``, with brake build-up.
-
-    Args:
-        kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
-            act.
-        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
-
-    """
+    """Return the smallest closing speed (m/s) of first contacts between ``early`` and ``late``, with brake build-up."""
     plan = empty_legs()
     hard = gentlest_ramped(kind, at, early)
     sign, v, place = met_at(kind, at, early, plan)
@@ -222,15 +154,6 @@ def force_of_meeting(kind: int, at: Floats, early: float, late: float, hard: flo
     at most ``hard``.
 
     If the contact is with the rear vehicle, the result is an upper bound on the controlled vehicle's deceleration.
-
-    Args:
-        kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
-            act.
-        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
-        hard: largest closing speed that the first contact may have, m/s.
-
     """
     plan = empty_legs()
     sign, v, place = met_at(kind, at, early, plan)
@@ -257,17 +180,6 @@ def after_ramped(
     with the other neighbour, with brake build-up.
 
     The bound is computed from the motion of the controlled vehicle, not of a centre of mass.
-
-    Args:
-        kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        early: earliest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may
-            act.
-        late: latest time of the controlled vehicle's first contact, in s from the moment at which this vehicle may act.
-        hard: largest closing speed that the first contact may have, m/s.
-        plan: working memory for the motion of one vehicle, an array from ``empty_legs``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
     """
     sign = 1.0 if kind == RAMPED_FRONT else -1.0
     share = at[LINE.FRONT_SHARE] if kind == RAMPED_FRONT else at[LINE.REAR_SHARE]
@@ -311,14 +223,6 @@ def after_ramped(
 def is_first_ramped(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
     """Return whether a first contact with the neighbour ``kind`` at ``time`` or later is possible before the other
     neighbour arrives.
-
-    Args:
-        kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        time: time of the contact, in s from the moment at which the controlled vehicle may act.
-        plan: working memory for the motion of one vehicle, an array from ``empty_legs``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
     """
     sign, _, place = met_at(kind, at, time, plan)
     switch = switch_for(at, sign, time, place, -math.inf, HALVINGS, plan)[1]
@@ -338,19 +242,12 @@ def is_first_ramped(kind: int, at: Floats, time: float, plan: Floats, other: Flo
 
 @compiled(apart=True)
 def meet_ramped(kind: int, at: Floats, sign: float, plan: Floats, other: Floats) -> tuple[float, float, float]:
-    """Return time (s) and closing speed (m/s) of the contact with a neighbour under full drive or full braking.
+    """Return time (s) and closing speed (m/s) of the contact with the neighbour ``kind`` under full drive (``sign`` 1)
+    or full braking (``sign`` -1).
 
     Brakes build up at finite rates. If there is no contact, the time is infinite and the closing speed is 0. The third
     result is the smallest closing speed (m/s) of the contact over all motions of the pair in which the gap is never
     larger than in the motion under full drive or full braking.
-
-    Args:
-        kind: code of the neighbour with which the first contact happens: ``RAMPED_FRONT`` or ``RAMPED_REAR``.
-        at: state of one world, [LINE.WIDTH] numbers; ``line.LINE`` says what each number is.
-        sign: 1 if the controlled vehicle drives fully, -1 if it brakes fully.
-        plan: working memory for the motion of one vehicle, an array from ``empty_legs``; overwritten.
-        other: working memory for the motion of a second vehicle, an array like ``plan``; overwritten.
-
     """
     fill_controlled(at, sign, math.inf, math.inf, -math.inf, plan)
     if kind == RAMPED_FRONT:
@@ -400,21 +297,13 @@ class LowerBound:
 def at_onset_of(
     where: str, worlds: Worlds, vehicles: Ints, harm_count: HarmCount, horizon_s: float
 ) -> tuple[Worlds, Floats, Floats, Bools]:
-    """Simulate worlds until the first of ``vehicles`` may act.
+    """Simulate worlds until the *start*, the moment when the first of the controlled ``vehicles`` may act.
 
-    The *start* is the moment when the first of ``vehicles`` may act. Returns the worlds at the start, the time of the
-    start ([n], s after the alert), the harm before the start ([n], m2/s2), and a boolean mask [n, P]. The mask is True
-    for each pair whose next impact counts and whose vehicles move forward.
-
-    Args:
-        where: name of the calling function, with which error messages begin.
-        worlds: the ``n`` worlds in their present state.
-        vehicles: indices of the controlled vehicles.
-        harm_count: which impacts count: ``first`` or ``total``.
-        horizon_s: horizon, s.
+    Returns the worlds at the start, the time of the start ([n], s after the alert), the harm before the start ([n],
+    m2/s2), and a boolean mask [n, P]. The mask is True for each pair whose next impact counts and whose vehicles move
+    forward. Error messages begin with ``where``, the name of the calling function.
 
     Raises ``InvalidInput`` if the horizon is not finite, or lies before a vehicle may act.
-
     """
     start = np.maximum(worlds.vehicles.latency_s[:, vehicles].min(axis=1), worlds.time_s)
     if not (np.all(start <= horizon_s) and horizon_s < np.inf):
@@ -430,14 +319,10 @@ def at_onset_of(
 
 
 def check_asked(where: str, harm_count: str, horizon_s: object, time_step_s: object) -> None:
-    """Raise ``InvalidInput`` for an unknown harm count, a horizon that is not a number, or an invalid time step.
+    """Raise ``InvalidInput`` for an unknown harm count, a horizon that is not a number, or a time step that is neither
+    None nor a number of at least ``LEAST_TIME_STEP_S``.
 
-    Args:
-        where: name of the calling function, with which the error message begins.
-        harm_count: must be ``first`` or ``total``.
-        horizon_s: time until which harm counts, s; must be a number.
-        time_step_s: must be None or a number of at least ``LEAST_TIME_STEP_S``.
-
+    The error message begins with ``where``, the name of the calling function.
     """
     check_harm_count(harm_count)
     if not _is_number(horizon_s):
@@ -465,20 +350,16 @@ def rounding(worlds: Worlds, vehicle: int | Ints, way_m: Floats | float = 0.0) -
 
     In a segment of motion, the computation rounds each speed twice and each gap five times. In a round of impacts,
     rounding changes each speed by up to 8 eps of the largest speed. Rounding in one segment, or in one round of
-    impacts, changes the squared closing speed D by at most 8 eps S (eps = 2^-52). These errors add up and do not
-    multiply, because the proofs compare a motion only with the formulas for this same motion. ``BOUND_EPS`` allows for
-    500 segments and rounds of impacts. This number is enough: an episode of 8 s has 80 steps, and the computation of
-    the bound itself rounds a few hundred times.
+    impacts, changes D by at most 8 eps S (eps = 2^-52). These errors add up and do not multiply, because the proofs
+    compare a motion only with the formulas for this same motion. ``BOUND_EPS`` allows for 500 segments and rounds of
+    impacts. This number is enough: an episode of 8 s has 80 steps, and the computation of the bound itself rounds a few
+    hundred times.
 
     If controlled vehicles may drive, the largest speed V is at least the largest of their speed limits, and the largest
     closing acceleration A includes the largest of their driving capacities.
 
-    Args:
-        worlds: the worlds, [n].
-        vehicle: index of the controlled vehicle, or indices of several controlled vehicles.
-        way_m: additional distance, such as the gap to an obstacle, that is added to the sum of the gaps, m; one number,
-            or [n] with a number for each world.
-
+    ``vehicle`` is the index of the controlled vehicle, or indices of several. ``way_m`` is an additional distance, such
+    as the gap to an obstacle, m; one number, or [n].
     """
     v, chosen = worlds.vehicles, np.atleast_1d(vehicle)
     driving = v.driving_capacity_mps2[:, chosen]
@@ -494,14 +375,9 @@ def rounding(worlds: Worlds, vehicle: int | Ints, way_m: Floats | float = 0.0) -
 def onset_states(worlds: Worlds, i: int, time_step_s: float | Floats | None) -> Floats:
     """Return the worlds as an array with the columns of ``line.LINE``, [n, LINE.WIDTH].
 
-    If the controlled vehicle has no front or no rear vehicle, the columns of this neighbour are 0.
-
-    Args:
-        worlds: the worlds, [n], at the moment when vehicle ``i`` may act.
-        i: index of the controlled vehicle.
-        time_step_s: time between two decisions, s; one number, or [n] with a number for each world. None, or 0 in an
-            array, means that commands may change at any time.
-
+    The worlds are in their state at the moment when the controlled vehicle ``i`` may act. If this vehicle has no front
+    or no rear vehicle, the columns of this neighbour are 0. ``time_step_s`` is the time between two decisions, s; one
+    number, or [n]. None, or 0 in an array, means that commands may change at any time.
     """
     v = worlds.vehicles
     at = np.zeros((worlds.n, LINE.WIDTH))

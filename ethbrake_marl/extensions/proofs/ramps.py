@@ -29,26 +29,20 @@ _MEETING_HALVINGS = 30
 
 @compiled
 def empty_legs() -> Floats:
-    """Return an uninitialised plan, [3, LEGS]. The three rows of a plan contain the end (s), the initial acceleration
-    (m/s2) and the jerk (m/s3) of each interval of constant jerk.
-    """
+    """Return an uninitialised plan, [3, LEGS]."""
     return np.empty((3, LEGS))
 
 
 @compiled
 def put_leg(plan: Floats, k: int, end: float, force: float, jerk: float) -> None:
-    """Write leg ``k`` of a plan [3, LEGS] in place: its end (s), its initial force (m/s2) and its jerk (m/s3).
-
-    A *leg* is a time interval of constant jerk; a *force* is an acceleration.
-    """
+    """Write leg ``k`` of a plan in place: its end (s), its initial force (m/s2) and its jerk (m/s3)."""
     plan[ENDS, k], plan[FORCES, k], plan[JERKS, k] = end, force, jerk
 
 
 @compiled
 def fill_build_up(plan: Floats, since: float, force: float, wanted: float, rate: float) -> None:
-    """Write a plan: the force is ``force`` until ``since`` (s), and then changes to ``wanted`` at ``rate`` (m/s3).
-
-    Forces are accelerations in m/s2. The rate may be infinite. ``plan`` [3, LEGS] is overwritten.
+    """Write a plan: the force is ``force`` until ``since`` (s), and then changes to ``wanted`` at ``rate`` (m/s3),
+    which may be infinite.
     """
     rise = abs(wanted - force) / rate
     put_leg(plan, 0, since, force, 0.0)
@@ -63,22 +57,11 @@ def fill_switch(
 ) -> None:  # fmt: skip
     """Write a plan: the force rises from ``force`` to at most ``high`` until ``switch``, then falls to ``-low``.
 
-    Before ``time`` the force rises again, and reaches ``final`` at ``time``. A *force* is an acceleration in m/s2; all
-    forces in the arguments are already multiplied by ``sign``.
-
-    Args:
-        plan: [3, LEGS] array into which the function writes the motion.
-        sign: 1 or -1, by which the forces in the arguments are already multiplied.
-        force: force now.
-        high: largest force.
-        rise: rate at which the force rises, m/s3; may be infinite.
-        low: the smallest force, which is negative, without its minus sign.
-        fall: rate at which the force falls, m/s3.
-        switch: time at which the force begins to fall, s. If ``rise`` is infinite, ``switch`` may be from -1 to 0: the
-            force in this case jumps to ``force + (1 + switch) (high - force)`` and falls at once.
-        time: time at which the force is ``final``, s.
-        final: required force at ``time``; -inf if no force is required.
-
+    Before ``time`` the force rises again, and reaches ``final`` at ``time``. All forces in the arguments are already
+    multiplied by ``sign`` (1 or -1). ``low`` is the smallest force, which is negative, without its minus sign. The
+    rates ``rise`` and ``fall`` are in m/s3; ``rise`` may be infinite. In this case ``switch`` may be from -1 to 0: the
+    force jumps to ``force + (1 + switch) (high - force)`` and falls at once. ``final`` is -inf if no force is required
+    at ``time``.
     """
     full = (high - force) / rise
     top = high if switch >= full else force + rise * switch
@@ -103,15 +86,8 @@ def leg_at(plan: Floats, now: float, v: float, limit: float) -> tuple[float, flo
     """Return acceleration (m/s2) and jerk (m/s3) at ``now``, the time at which this jerk ends (s), and the speed at the
     end of this jerk (m/s).
 
-    The speed is NaN unless the vehicle is at rest or at the speed limit when the jerk ends.
-
-    Args:
-        plan: [3, LEGS] motion of the vehicle: end (s), initial acceleration (m/s2) and jerk (m/s3) of each interval of
-            constant jerk.
-        now: present time, s.
-        v: speed of the vehicle at ``now``, m/s.
-        limit: speed limit of the vehicle, m/s.
-
+    The speed is NaN unless the vehicle is at rest or at the speed limit when the jerk ends. ``v`` is the speed at
+    ``now``, and ``limit`` the speed limit (m/s).
     """
     k = 0
     while now >= plan[ENDS, k]:
@@ -140,11 +116,10 @@ def leg_at(plan: Floats, now: float, v: float, limit: float) -> tuple[float, flo
 
 @compiled
 def speed_after(v: float, u: float, jerk: float, step: float, reached: float) -> float:
-    """Return the speed (m/s) after ``step`` seconds of constant ``jerk`` (m/s3), from the initial acceleration ``u``
-    (m/s2).
+    """Return the speed (m/s) after ``step`` seconds of constant ``jerk`` (m/s3), from the speed ``v`` (m/s) and the
+    initial acceleration ``u`` (m/s2).
 
-    ``v`` is the speed at the start (m/s). ``reached`` is the speed (m/s) after ``step`` seconds if this speed is
-    already known, and NaN if it is not known.
+    ``reached`` is the speed (m/s) after ``step`` seconds if this speed is already known, and NaN if it is not known.
     """
     return max(v + (u + 0.5 * jerk * step) * step, 0.0) if math.isnan(reached) else reached
 
@@ -153,13 +128,7 @@ def speed_after(v: float, u: float, jerk: float, step: float, reached: float) ->
 def travel(plan: Floats, v: float, limit: float, until: float) -> tuple[float, float]:
     """Return speed (m/s) and travelled distance (m), at ``until`` (s), of a vehicle that follows ``plan``.
 
-    Args:
-        plan: [3, LEGS] motion of the vehicle: end (s), initial acceleration (m/s2) and jerk (m/s3) of each interval of
-            constant jerk.
-        v: speed of the vehicle at the start of ``plan``, m/s.
-        limit: speed limit of the vehicle, m/s.
-        until: time at which speed and distance are computed, s.
-
+    ``v`` is the speed at the start of ``plan``, and ``limit`` the speed limit (m/s).
     """
     now, way = 0.0, 0.0
     while now < until:
@@ -174,9 +143,7 @@ def travel(plan: Floats, v: float, limit: float, until: float) -> tuple[float, f
 
 @compiled
 def force_of(plan: Floats, now: float) -> float:
-    """Return the force (m/s2) of a plan [3, LEGS] at ``now`` (s), even if the vehicle stands still. Here *force* means
-    force per mass, which is an acceleration.
-    """
+    """Return the force (m/s2) of a plan at ``now`` (s), even if the vehicle stands still."""
     return leg_at(plan, now, 1.0, math.inf)[0]
 
 
@@ -215,26 +182,16 @@ def meeting(
     """Return the time (s) of two vehicles' first contact, its closing speed (m/s), and the *forced closing speed*
     (m/s).
 
-    The results are inf, 0, 0 if there is no contact. The forced closing speed is the smallest value of
-    ``w + (gap - slack) / t`` until the contact. Here w is the closing speed (m/s) and gap is the gap (m) in the given
-    motion, t seconds after ``since``. The forced closing speed is also a lower bound on the closing speed of another
-    motion of the pair if two conditions hold. First, at ``since`` the gap in the other motion is smaller than the gap
-    in the given motion by at most ``slack``. Second, the closing speed in the other motion minus the closing speed in
-    the given motion never decreases.
+    The results are inf, 0, 0 if there is no contact. The forced closing speed is the smallest value of ``w + (gap -
+    slack) / t`` until the contact. Here w is the closing speed (m/s) and gap is the gap (m) in the given motion, t
+    seconds after ``since``. The forced closing speed is also a lower bound on the closing speed of another motion of
+    the pair if two conditions hold. First, at ``since`` the gap in the other motion is smaller than the gap in the
+    given motion by at most ``slack`` (m). Second, the closing speed in the other motion minus the closing speed in the
+    given motion never decreases.
 
-    Args:
-        gap: gap at ``since``, m.
-        slack: largest distance by which, at ``since``, the gap in another motion of the pair may be smaller than
-            ``gap``, m.
-        v_front: speed of the front vehicle at ``since``, m/s.
-        front: motion of the front vehicle, [3, LEGS].
-        front_limit: speed limit of the front vehicle, m/s.
-        v_rear: speed of the rear vehicle at ``since``, m/s.
-        rear: motion of the rear vehicle, [3, LEGS].
-        rear_limit: speed limit of the rear vehicle, m/s.
-        since: time at which the motion starts, s.
-        until: time at which the motion ends, s.
-
+    The motion lasts from ``since`` to ``until`` (s). ``gap`` (m), ``v_front`` and ``v_rear`` (m/s) are the gap and the
+    speeds at ``since``. ``front`` and ``rear`` are the plans, ``front_limit`` and ``rear_limit`` the speed limits
+    (m/s).
     """
     now, least = since, math.inf
     while now < until:

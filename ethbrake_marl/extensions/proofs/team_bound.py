@@ -49,12 +49,12 @@ def _combined_bound_of_line(
     the line is treated as if it may act now.
 
     Args:
-        now: the ``n`` worlds in their present state.
+        now: the worlds in their present state.
         onset: [n, N] time from now at which each vehicle may act, s.
         counts: [n, P] True for pairs whose next impact counts and whose vehicles move forward.
         chosen: indices of the controlled vehicles; they include the second vehicle.
         until: [n] horizon, s from now.
-        pairs: [n, 2] lower bounds on the harm of the first two pairs, each pair alone, m2/s2.
+        pairs: [n, 2] lower bounds on the harm of each of the first two pairs alone, m2/s2.
         time_step_s: time between two decisions, s; None if commands may change at any time.
 
     """
@@ -143,15 +143,14 @@ def team_bound(
     Args:
         worlds: the ``n`` worlds in their present state.
         vehicles: indices of the controlled vehicles, from 0.
-        harm_count: which impacts count: ``first`` or ``total``. With ``first``, only the first impact of each pair
-            counts: if a pair has had an impact before now, no later impact of this pair counts.
+        harm_count: ``first`` or ``total``. With ``first``, only the first impact of each pair counts: if a pair has had
+            an impact before now, no later impact of this pair counts.
         horizon_s: time until which harm counts, s after the alert.
-        scripts: maps the index of each vehicle that is not controlled to the name of its script. The only script
-            allowed is full_brake. If ``scripts`` is None, all vehicles that are not controlled brake fully.
-        time_step_s: time between two decisions, s. If ``time_step_s`` is a number, the bound holds only for commands
-            that change at decisions. The first decision comes when the first controlled vehicle may act, and the next
-            ones every ``time_step_s`` after it. If Vehicle 2 is the first controlled vehicle that may act, the bound is
-            larger if ``time_step_s`` is a number than if it is None. If ``time_step_s`` is None, commands may change at
+        scripts: script of each vehicle that is not controlled, by index; only full_brake is allowed. None: all of them
+            brake fully.
+        time_step_s: time between two decisions, s. With a number, the bound holds only for commands that change at
+            decisions: when the first controlled vehicle may act, and every ``time_step_s`` after that. If Vehicle 2 is
+            the first controlled vehicle that may act, the bound is larger than with None. None: commands may change at
             any time.
 
     Raises ``InvalidInput`` if ``vehicles`` is empty, or has an unknown or repeated index. The function also raises
@@ -231,12 +230,9 @@ def _pair_bound(columns: Mapping[int, Floats | float], until: Floats, counts: Bo
     """Return a lower bound on the harm of one pair alone, [n] m2/s2; 0 in worlds where the pair's next impact does not
     count.
 
-    Args:
-        columns: maps columns of the array of pairs (``PAIR_GAP`` to ``FOLLOWER_A``) to their values; columns that are
-            left out are 0.
-        until: [n] horizon, s; later harm does not count.
-        counts: [n] True for worlds in which the next impact of the pair counts.
-
+    ``columns`` maps columns of the array of pairs (``PAIR_GAP`` to ``FOLLOWER_A``) to their values; columns that are
+    left out are 0. ``until`` [n] is the horizon, s. ``counts`` [n] is True for worlds in which the next impact of the
+    pair counts.
     """
     at, bounds, out = np.zeros((len(until), PAIR_WIDTH)), np.zeros(len(until)), np.empty(int(counts.sum()))
     for column, values in columns.items():
