@@ -9,9 +9,8 @@ vehicle and M the sum of both masses. Let u be the largest speed of any vehicle,
 backwards yet. An impact slows the rear vehicle, but the new speed is at least -e times the previous speed. An impact
 gives a front vehicle at rest at most (1 + e) times the rear vehicle's speed. So, in a line of three vehicles, the speed
 of the middle vehicle stays between -e u and (1 + e) u until both its pairs have had contact. If three vehicles are in
-contact at once, each vehicle has the speed (1 + e) P - e v after the impact, where v is the speed of this vehicle
-before the impact, and P is a weighted mean of the three speeds before the impact. The speed of each vehicle after an
-impact of three vehicles, too, lies between -e u and (1 + e) u.
+contact at once, each vehicle has the speed (1 + e) P - e v after the impact, where v is its speed before the impact,
+and P is a weighted mean of the three speeds before the impact. This speed, too, lies between -e u and (1 + e) u.
 """
 
 from __future__ import annotations
