@@ -45,6 +45,7 @@ class RobustShield(StepShield):
 
     Raises ``InvalidInput`` in three cases: if ``StepShield`` raises this error, if an uncertainty is combined with
     several vehicles or with a cap, or if ``robust="interior"`` cannot certify the settings.
+
     """
 
     def __init__(
