@@ -314,8 +314,8 @@ def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
 
 @compiled(apart=True)
 def hold(speed: Floats, i: int, length: float, motion: Motion) -> None:
-    """Widen ``onward`` and ``reach`` of vehicle ``i``, because brakes that release gradually may still hold the vehicle
-    at rest.
+    """Widen ``onward`` and ``reach`` of vehicle ``i`` in ``motion``, because brakes that release gradually may still
+    hold the vehicle at rest.
 
     A vehicle that is held by gradually releasing brakes may stand until its acceleration is above 0. While the vehicle
     stands, the formulas give a negative speed -u. The true speed is larger than the computed speed by at most u. The
@@ -364,8 +364,8 @@ def command(cell: Cell, i: int, piece: int, motion: Motion) -> None:
 
 @compiled(apart=True)
 def begin_later(cell: Cell, i: int, piece: int, motion: Motion) -> None:
-    """Set ``onward``, ``reach``, ``pull`` and ``vague`` of vehicle ``i`` if its command may take effect after the start
-    of the piece.
+    """Set ``onward``, ``reach``, ``pull`` and ``vague`` of vehicle ``i`` in ``motion`` if its command may take effect
+    after the start of the piece.
     """
     pull = motion.pull[i]
     if pull[0] == 0.0 and radius(pull) == 0.0:
@@ -394,8 +394,8 @@ def since(cell: Cell, i: int, time: float) -> Floats:
 
 @compiled(apart=True)
 def stop(moving: bool, speed: Floats, i: int, length: float, motion: Motion) -> None:
-    """Set ``rest``, ``speed`` and ``way`` of a braking vehicle ``i`` that stops, or may stop, within a piece and then
-    stays at rest.
+    """Set ``rest``, ``speed`` and ``way`` in ``motion`` for a braking vehicle ``i`` that stops, or may stop, within a
+    piece and then stays at rest.
 
     ``moving`` is ``Cell.moving``; ``speed`` is the speed at the start of the piece, m/s.
     """

@@ -62,7 +62,7 @@ def stand_still(cell: Cell, pull: Floats, vague: float, left: float, speed: Floa
     would become negative.
 
     Args:
-        cell: the commands; only ``moving`` is read.
+        cell: only ``moving`` is read.
         pull: mean acceleration after the impact, m/s2.
         vague: largest deviation of the acceleration from ``pull``, m/s2.
         left: longest time from the impact to the end of the piece, s (a number).

@@ -199,8 +199,8 @@ class Ranges:
         return cls(vehicle, others, middle, low, high, float(world.obstacle_gap_m[0]))
 
     def at(self, share: Mapping[tuple[str, int], float] | None, key: str) -> Floats:
-        """Return the quantity ``key`` (a key of ``middle``) of every vehicle, [N], at the positions ``share`` in its
-        range.
+        """Return the quantity ``key`` (a key of ``middle``) of every vehicle, [N], at the positions in its range
+        that ``share`` gives.
         """
         value = self.middle[key].copy()
         for (name, j), part in () if share is None else share.items():
@@ -303,7 +303,7 @@ def _in_order(place: Floats, known: Bools, vehicle: int) -> Floats:
     N] m.
 
     ``place`` [n, N] is the position of each vehicle relative to ``vehicle``, m; the function changes this array in
-    place. It does not change the positions of ``known`` [n, N] vehicles.
+    place. ``known`` [n, N] is True for vehicles whose position is certain; these positions do not change.
     """
     N = place.shape[1]
     for way in (-1, 1):  # first the vehicles ahead, then the vehicles behind

@@ -279,8 +279,8 @@ class EstimatedShield:
         return keeps
 
     def _note_impacts(self, worlds: Worlds) -> None:
-        """Store the present time for each vehicle that had an impact since the last decision in at least one possible
-        world.
+        """Store the present time as the time of the last impact of each vehicle that had an impact since the last
+        decision in at least one possible world.
         """
         running = self.shield.memory.running
         assert running is not None

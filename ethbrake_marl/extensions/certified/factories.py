@@ -1,8 +1,8 @@
 """Agents and shields that this extension registers: the shield ``+robust``, and ``:estimated`` variants of other agents
 and shields.
 
-Arguments that several functions share: ``policy`` is the agent to shield, and ``argument`` the part of the agent's spec
-(the text that names the agent) after the name of the shield or agent. Error messages quote ``settings.spec``.
+Arguments that several functions share: ``policy`` is the agent to shield, and ``argument`` a setting from the agent's
+spec (the text that names the agent). Error messages quote ``settings.spec``.
 """
 
 from __future__ import annotations

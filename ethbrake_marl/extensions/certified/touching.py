@@ -260,10 +260,10 @@ def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length:
     An impact never increases the relative speed. The relative speed therefore grows at most at the rate of the closing
     acceleration that the commands cause. While the closing acceleration lies between b- (``least``) and b+ (``most``),
     and b- > 0, the relative speed does not grow. Consider a flight with gap g and relative speed w at some moment. The
-    gap in this flight is at most ``h = g + w^2 / (2 b-)``, and the flight ends with a closing speed of at most ``sqrt(2
-    b+ h)``. The next flight starts with a relative speed of e times this closing speed, where e is the restitution. So
-    the relative speed decreases from flight to flight if ``e sqrt(b+ / b-) < 1``. If one vehicle stands or moves
-    backwards, its own brakes hold it, so that flights are shorter and the relative speeds in them are smaller.
+    gap in this flight is at most ``h = g + w^2 / (2 b-)``, and the flight ends with a closing speed of at most
+    ``sqrt(2 b+ h)``. The next flight starts with a relative speed of e times this closing speed, where e is the
+    restitution. So the relative speed decreases from flight to flight if ``e sqrt(b+ / b-) < 1``. If one vehicle stands
+    or moves backwards, its own brakes hold it, so that flights are shorter and the relative speeds in them are smaller.
 
     ``least`` and ``most`` are in m/s2. ``vague`` is the largest deviation of a vehicle's acceleration from its mean in
     the piece, m/s2.
@@ -325,8 +325,8 @@ def settle(touch: Floats, e: float) -> None:
     """Reset the state of a pair in contact if the pair certainly moves as one body by the end of the present piece.
 
     Let the closing acceleration of the pair lie between ``b-`` and ``b+``, and let e be the restitution. A flight that
-    begins with separating speed s lasts at most ``2 s / b-``. This flight ends with a closing speed of at most ``s
-    sqrt(b+ / b-)``, and the next flight begins with e times this closing speed. So all flights of the pair together
+    begins with separating speed s lasts at most ``2 s / b-``. This flight ends with a closing speed of at most
+    ``s sqrt(b+ / b-)``, and the next flight begins with e times this closing speed. So all flights of the pair together
     last at most ``2 s / (b- (1 - e sqrt(b+ / b-)))``. After the last flight, the two vehicles move as one body, unless
     one stands or moves backwards.
     """
