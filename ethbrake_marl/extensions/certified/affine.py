@@ -1,17 +1,18 @@
 """Affine arithmetic over a box of worlds, and the motion of single vehicles in the box.
 
-A *box* contains all worlds whose K uncertain numbers lie in given intervals. An *affine form* represents a number that
-differs from world to world. An affine form is an array of W = K + 2 numbers for ``c + g_1 e_1 + ... + g_K e_K + r e``:
-a centre c, one slope g_k for each uncertain number, and a remainder r. ``e_k`` in [-1, 1] is the position of a world in
-the interval of uncertain number k; all affine forms use the same ``e_k``. ``e`` in [-1, 1] is unknown, and each affine
-form has its own ``e``. In the difference of two affine forms, parts that depend on the same ``e_k`` cancel. The
-difference of two plain intervals would be wider than the difference of the two affine forms.
+An *affine form* represents a number that differs from world to world. An affine form is an array of W = K + 2 numbers
+for ``c + g_1 e_1 + ... + g_K e_K + r e``: a centre c, one slope g_k for each of the K uncertain numbers of the box, and
+a remainder r. ``e_k`` in [-1, 1] is the position of a world in the interval of uncertain number k; all affine forms use
+the same ``e_k``. ``e`` in [-1, 1] is unknown, and each affine form has its own ``e``. In the difference of two affine
+forms, parts that depend on the same ``e_k`` cancel. The difference of two plain intervals would be wider.
 
 The result of every operation on affine forms encloses the exact result: for each world of the box, some value of ``e``
 makes the form equal to the exact result. The operations ignore floating-point rounding; instead, the speeds and
-distances are widened by ``ROUNDING`` once in each piece (time interval of constant command).
+distances are widened by ``ROUNDING`` once in each piece.
 
-Letters for shapes: ``N`` vehicles, ``P = N - 1`` pairs, ``J`` pieces.
+Letters for shapes: ``N`` vehicles, ``P = N - 1`` pairs, ``J`` pieces. An array without a stated shape is an affine form
+[W]. Arguments that several functions share: ``i`` is the index of a vehicle, ``piece`` the index of a piece, from 0 to
+J - 1, and ``length`` the duration of the piece, s.
 """
 
 from __future__ import annotations
@@ -27,9 +28,8 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints
 
 @compiled(apart=True)
 def radius(x: Floats) -> float:
-    """Return the radius of the affine form ``x`` [W]: the largest distance of its values from its centre.
-
-    The radius is the sum of the absolute slopes and the remainder.
+    """Return the largest distance of the values of ``x`` from its centre: the sum of the absolute slopes and the
+    remainder.
     """
     whole: float = x[-1]
     for k in range(1, x.shape[0] - 1):
@@ -39,22 +39,19 @@ def radius(x: Floats) -> float:
 
 @compiled(apart=True)
 def low(x: Floats) -> float:
-    """Return the smallest value of the affine form ``x`` [W] (centre, slopes, remainder) in the box."""
+    """Return the smallest value of ``x`` in the box."""
     return float(x[0] - radius(x))
 
 
 @compiled(apart=True)
 def high(x: Floats) -> float:
-    """Return the largest value of the affine form ``x`` [W] (centre, slopes, remainder) in the box."""
+    """Return the largest value of ``x`` in the box."""
     return float(x[0] + radius(x))
 
 
 @compiled(apart=True)
 def add(out: Floats, share: float, x: Floats) -> None:
-    """Add ``share * x`` to ``out`` in place.
-
-    ``x`` and ``out`` are affine forms [W] (centre, slopes, remainder); ``share`` is any number.
-    """
+    """Add ``share * x`` to ``out`` in place."""
     for k in range(x.shape[0] - 1):
         out[k] += share * x[k]
     out[-1] += abs(share) * x[-1]
@@ -62,7 +59,7 @@ def add(out: Floats, share: float, x: Floats) -> None:
 
 @compiled(apart=True)
 def difference(x: Floats, y: Floats) -> Floats:
-    """Return the difference ``x - y`` of two affine forms [W] (centre, slopes, remainder)."""
+    """Return ``x - y``."""
     out = x.copy()
     add(out, -1.0, y)
     return out
@@ -70,16 +67,13 @@ def difference(x: Floats, y: Floats) -> Floats:
 
 @compiled(apart=True)
 def negative(x: Floats) -> Floats:
-    """Return the affine form ``-x`` [W] (centre, slopes, remainder) for the affine form ``x``."""
+    """Return ``-x``."""
     return linear(x, -1.0, 0.0, 0.0)
 
 
 @compiled(apart=True)
 def between(least: float, most: float, width: int) -> Floats:
-    """Return an affine form that encloses every number between ``least`` and ``most``.
-
-    ``width`` is the number W of entries of the affine form (centre, slopes, remainder).
-    """
+    """Return an affine form of ``width`` entries that encloses every number between ``least`` and ``most``."""
     out = np.zeros(width)
     out[0], out[-1] = 0.5 * (least + most), 0.5 * (most - least)
     return out
@@ -87,10 +81,7 @@ def between(least: float, most: float, width: int) -> Floats:
 
 @compiled(apart=True)
 def product(x: Floats, y: Floats) -> Floats:
-    """Return an affine form [W] (centre, slopes, remainder) that encloses the product of two affine forms.
-
-    The remainder covers the second-order terms of the product.
-    """
+    """Return an affine form that encloses ``x * y``. The remainder covers the second-order terms."""
     out = np.empty_like(x)
     for k in range(x.shape[0] - 1):
         out[k] = x[0] * y[k] + y[0] * x[k]
@@ -101,9 +92,9 @@ def product(x: Floats, y: Floats) -> Floats:
 
 @compiled(apart=True)
 def square(x: Floats) -> Floats:
-    """Return an affine form [W] (centre, slopes, remainder) that encloses ``x * x``.
+    """Return an affine form that encloses ``x * x``.
 
-    The remainder of this form is smaller than the remainder of ``product(x, x)``, because a square is never negative.
+    The remainder is smaller than the remainder of ``product(x, x)``, because a square is never negative.
     """
     out = np.empty_like(x)
     for k in range(x.shape[0] - 1):
@@ -116,9 +107,7 @@ def square(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def linear(x: Floats, slope: float, start: float, error: float) -> Floats:
-    """Return the affine form [W] (centre, slopes, remainder) of ``start + slope * x``, widened by ``error`` on both
-    sides.
-    """
+    """Return ``start + slope * x``, widened by ``error`` on both sides."""
     out = np.empty_like(x)
     for k in range(x.shape[0] - 1):
         out[k] = slope * x[k]
@@ -129,11 +118,10 @@ def linear(x: Floats, slope: float, start: float, error: float) -> Floats:
 
 @compiled(apart=True)
 def square_root(x: Floats) -> Floats:
-    """Return an affine form [W] (centre, slopes, remainder) that encloses the square root of ``x`` where ``x >= 0``.
+    """Return an affine form that encloses the square root of ``x`` where ``x >= 0``. ``high(x)`` must be at least 0.
 
-    The largest value of ``x`` in the box, ``high(x)``, must be at least 0. In worlds with negative ``x`` the result has
-    no meaning. On an interval [a, b] the square root lies between two parallel lines: its chord, with slope 1 /
-    (sqrt(a) + sqrt(b)), and the tangent with this slope.
+    In worlds with negative ``x`` the result has no meaning. On an interval [a, b] the square root lies between two
+    parallel lines: its chord, with slope 1 / (sqrt(a) + sqrt(b)), and the tangent with this slope.
     """
     least, most = math.sqrt(max(low(x), 0.0)), math.sqrt(high(x))
     if most <= 0.0:
@@ -146,8 +134,7 @@ def square_root(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def reciprocal(x: Floats) -> Floats:
-    """Return an affine form [W] (centre, slopes, remainder) that encloses ``1 / x``. The smallest value of ``x`` in the
-    box, ``low(x)``, must be above 0.
+    """Return an affine form that encloses ``1 / x``. ``low(x)`` must be above 0.
 
     On an interval [a, b] the reciprocal lies between two parallel lines: its chord, with slope -1 / (a b), and the
     tangent with this slope.
@@ -161,7 +148,7 @@ def reciprocal(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def positive_part(x: Floats) -> Floats:
-    """Return an affine form [W] (centre, slopes, remainder) that encloses ``max(x, 0)``.
+    """Return an affine form that encloses ``max(x, 0)``.
 
     If ``x`` may have both signs, ``max(x, 0)`` lies between two parallel lines: the chord of this function and the line
     through the origin.
@@ -178,12 +165,10 @@ def positive_part(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def cut(x: Floats, least: float, most: float) -> Floats:
-    """Return an affine form [W] (centre, slopes, remainder) that encloses ``x``, whose values are known to lie between
-    ``least`` and ``most``.
+    """Return an affine form that encloses ``x``, whose values are known to lie between ``least`` and ``most``.
 
     If less than half of the interval of ``x`` lies between ``least`` and ``most``, the result encloses every number of
-    this interval that lies between the two limits. If at least half of the interval of ``x`` lies between ``least`` and
-    ``most``, the result is ``x`` itself.
+    this interval that lies between the two limits. Otherwise the result is ``x`` itself.
     """
     inside_low, inside_high = max(low(x), least), min(high(x), most)
     if inside_high - inside_low < radius(x):
@@ -209,11 +194,11 @@ TOUCH_WIDTH = 9
 
 
 class Forces(NamedTuple):
-    """Accelerations while brakes or engines build up gradually: affine forms for every vehicle and time interval.
+    """Accelerations of every vehicle while brakes or engines build up gradually.
 
-    On the second axis of an array, index 0 belongs to the time from the alert to the start of the first piece (time
-    interval of constant command), and index j + 1 belongs to piece j. Impacts do not change the accelerations, so the
-    arrays are the same for every sequence of impacts.
+    On the second axis of an array, index 0 belongs to the time from the alert to the start of the first piece, and
+    index j + 1 belongs to piece j. Impacts do not change the accelerations, so the arrays are the same for every
+    sequence of impacts.
     """
 
     mean: Floats  # [N, J + 1, W] mean acceleration of the piece, m/s2
@@ -225,12 +210,7 @@ class Forces(NamedTuple):
 
 
 class Cell(NamedTuple):
-    """A box (all worlds whose uncertain numbers lie in given intervals) as affine forms [W], and the commands in each
-    piece (time interval of constant command).
-
-    An *affine form* represents a number that differs from world to world: a centre, a slope for each uncertain number
-    of the box, and a remainder.
-    """
+    """A box as affine forms [W], and the vehicles' commands in each piece."""
 
     speed: Floats  # [N, W] speeds at the start of the first piece, m/s
     gap: Floats  # [P, W] gaps at the start of the first piece, m
@@ -250,10 +230,8 @@ class Cell(NamedTuple):
 
 
 class Path(NamedTuple):
-    """Those worlds of a box (``Cell``) that had the same impacts and contacts so far, with their present state.
-
-    An affine form [W] represents a number that differs from world to world: a centre, a slope for each uncertain number
-    of the box, and a remainder.
+    """Those worlds of a box that had the same impacts and contacts so far, with their state at the start of the present
+    piece.
     """
 
     forms: Floats  # [N + P + 1, W] affine forms of the speeds (m/s), the gaps (m) and the harm so far (m2/s2)
@@ -267,12 +245,7 @@ class Path(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Motion of each vehicle through one piece (time interval of constant command), as if the vehicle were alone on the
-    road.
-
-    Each row of an array [N, W] is the affine form for one vehicle: a centre, a slope for each uncertain number of the
-    box, and a remainder.
-    """
+    """Motion of each vehicle through one piece, as if the vehicle were alone on the road."""
 
     pull: Floats  # [N, W] acceleration by the command, m/s2
     onward: Floats  # [N, W] speed at the end under the command alone, m/s, as if the vehicle never stopped
@@ -285,7 +258,7 @@ class Motion(NamedTuple):
 
 @compiled(apart=True)
 def new_motion(N: int, width: int) -> Motion:
-    """Return a ``Motion`` with all values 0, for ``N`` vehicles and affine forms of length ``width``."""
+    """Return a ``Motion`` with all values 0, for affine forms of length ``width``."""
     return Motion(
         np.zeros((N, width)), np.zeros((N, width)), np.zeros((N, width)), np.zeros((N, width)), np.zeros((N, width)),
         np.zeros(N, np.int64), np.zeros(N),
@@ -294,17 +267,7 @@ def new_motion(N: int, width: int) -> Motion:
 
 @compiled(apart=True)
 def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
-    """Compute how every vehicle moves through one piece under its own command, as if the vehicle were alone on the
-    road.
-
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
-            interval of constant command).
-        piece: index of the piece (time interval of constant command), from 0 to J - 1 if there are J pieces.
-        motion: object into which the function writes its results.
-
-    """
+    """Write into ``motion`` how every vehicle moves through a piece under its own command, as if alone on the road."""
     for i in range(cell.speed.shape[0]):
         command(cell, i, piece, motion)
     for i in range(cell.speed.shape[0]):
@@ -351,20 +314,13 @@ def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
 
 @compiled(apart=True)
 def hold(speed: Floats, i: int, length: float, motion: Motion) -> None:
-    """Widen the affine forms of the motion of vehicle ``i`` in place, because brakes that release gradually may still
+    """Widen ``onward`` and ``reach`` of vehicle ``i`` in ``motion``, because brakes that release gradually may still
     hold the vehicle at rest.
 
     A vehicle that is held by gradually releasing brakes may stand until its acceleration is above 0. While the vehicle
-    stands, the formulas give a negative speed; let u be the absolute value of this speed. The true speed of the vehicle
-    is larger than the computed speed by at most u. The true distance is larger than the computed distance by at most u
-    times the duration of the piece.
-
-    Args:
-        speed: speed at the start of the piece as an affine form [W], m/s.
-        i: index of the vehicle.
-        length: duration of the piece (time interval of constant command), s.
-        motion: motion of all vehicles in the piece; the function changes ``onward`` and ``reach`` of vehicle ``i``.
-
+    stands, the formulas give a negative speed -u. The true speed is larger than the computed speed by at most u. The
+    true distance is larger than the computed distance by at most u times the duration of the piece. ``speed`` is the
+    speed at the start of the piece, m/s.
     """
     least, most = low(motion.pull[i]) - motion.vague[i], high(motion.pull[i]) + motion.vague[i]
     slowest = low(speed) + least * length
@@ -375,10 +331,7 @@ def hold(speed: Floats, i: int, length: float, motion: Motion) -> None:
 
 @compiled(apart=True)
 def between_shifted(x: Floats, shift: float) -> Floats:
-    """Return an affine form [W] (centre, slopes, remainder) that encloses every number between ``x`` and ``x + shift``.
-
-    ``x`` is an affine form.
-    """
+    """Return an affine form that encloses every number between ``x`` and ``x + shift``."""
     out = x.copy()
     add(out, 1.0, between(min(shift, 0.0), max(shift, 0.0), x.shape[0]))
     return out
@@ -386,17 +339,10 @@ def between_shifted(x: Floats, shift: float) -> Floats:
 
 @compiled(apart=True)
 def command(cell: Cell, i: int, piece: int, motion: Motion) -> None:
-    """Set ``motion.pull`` of vehicle ``i`` in a piece: the acceleration that the vehicle commands, or 0 before the
-    vehicle's latency has elapsed.
+    """Set ``motion.pull`` of vehicle ``i`` to the acceleration that it commands, or to 0 before its latency has
+    elapsed.
 
     The function also sets ``motion.rest`` and ``motion.vague`` of vehicle ``i``.
-
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        i: index of the vehicle.
-        piece: index of the piece (time interval of constant command), from 0 to J - 1 if there are J pieces.
-        motion: object into which the function writes its results.
-
     """
     pull = motion.pull[i]
     pull[:] = 0.0
@@ -418,15 +364,8 @@ def command(cell: Cell, i: int, piece: int, motion: Motion) -> None:
 
 @compiled(apart=True)
 def begin_later(cell: Cell, i: int, piece: int, motion: Motion) -> None:
-    """Set the motion of vehicle ``i`` in a piece if the vehicle's command may take effect after the start of the piece.
-
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        i: index of the vehicle.
-        piece: index of the piece (time interval of constant command), from 0 to J - 1 if there are J pieces.
-        motion: motion of each vehicle in the piece; the function changes ``onward``, ``reach``, ``pull`` and ``vague``
-            of vehicle ``i``.
-
+    """Set ``onward``, ``reach``, ``pull`` and ``vague`` of vehicle ``i`` in ``motion`` if its command may take effect
+    after the start of the piece.
     """
     pull = motion.pull[i]
     if pull[0] == 0.0 and radius(pull) == 0.0:
@@ -445,10 +384,8 @@ def begin_later(cell: Cell, i: int, piece: int, motion: Motion) -> None:
 
 @compiled(apart=True)
 def since(cell: Cell, i: int, time: float) -> Floats:
-    """Return the time (at least 0 s) for which the command of vehicle ``i`` has been in effect at ``time``, as an
-    affine form [W].
-
-    ``time`` is in s, measured from the first decision. ``cell`` contains the box of worlds.
+    """Return the time (s, at least 0) for which the command of vehicle ``i`` has been in effect at ``time`` (s after
+    the first decision).
     """
     since = negative(cell.onset[i])
     since[0] += time
@@ -457,16 +394,10 @@ def since(cell: Cell, i: int, time: float) -> Floats:
 
 @compiled(apart=True)
 def stop(moving: bool, speed: Floats, i: int, length: float, motion: Motion) -> None:
-    """Set the speed and the distance of a braking vehicle that stops, or may stop, within a piece and then stays at
-    rest.
+    """Set ``rest``, ``speed`` and ``way`` in ``motion`` for a braking vehicle ``i`` that stops, or may stop, within a
+    piece and then stays at rest.
 
-    Args:
-        moving: True if the acceleration of any vehicle builds up gradually instead of at once.
-        speed: speed at the start of the piece as an affine form [W], m/s.
-        i: index of the vehicle.
-        length: duration of the piece (time interval of constant command), s.
-        motion: motion of all vehicles in the piece; the function sets ``rest``, ``speed`` and ``way`` of vehicle ``i``.
-
+    ``moving`` is ``Cell.moving``; ``speed`` is the speed at the start of the piece, m/s.
     """
     pull, vague, width = motion.pull[i], motion.vague[i], speed.shape[0]
     beyond = negative(motion.onward[i])
@@ -484,13 +415,9 @@ def stop(moving: bool, speed: Floats, i: int, length: float, motion: Motion) -> 
 
 @compiled(apart=True)
 def deceleration(pull: Floats, vague: float) -> Floats:
-    """Return the mean deceleration of a vehicle over any part of a piece, as an affine form [W] (centre, slopes,
-    remainder), m/s2.
+    """Return the mean deceleration (m/s2) of a vehicle over any part of a piece.
 
-    Args:
-        pull: mean acceleration in the piece (time interval of constant command) as an affine form [W], m/s2.
-        vague: largest deviation of the acceleration from ``pull``, m/s2.
-
+    ``pull`` is the mean acceleration in the piece and ``vague`` the largest deviation from ``pull``, m/s2.
     """
     out = negative(pull)
     out[-1] += vague

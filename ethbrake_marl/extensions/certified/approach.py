@@ -1,8 +1,11 @@
 """First contacts in a box of worlds: when, and at which closing speed, a pair of vehicles may come into contact.
 
-Each function considers one piece (time interval of constant command). A *path* is a set of worlds with the same impacts
-so far (``affine.Path``). The affine forms of a path may also enclose states of worlds with other impacts. The results
-of the functions are correct for the worlds that really have the impacts of the path.
+Each function considers one piece. A *path* is a set of worlds with the same impacts so far (``affine.Path``). The
+affine forms of a path may also enclose states of worlds with other impacts. The results of the functions are correct
+for the worlds that really have the impacts of the path.
+
+Arguments that several functions share: ``p`` is the index of the pair (vehicle ``p`` in front, vehicle ``p + 1``
+behind), ``motion`` the result of ``move_alone``, and ``length`` the duration of the piece, s.
 """
 
 from __future__ import annotations
@@ -43,10 +46,8 @@ SLOWEST = 0.05  # below this mean closing speed (m/s) an impact is assumed possi
 
 
 class Approach(NamedTuple):
-    """Time and closing speed at which a pair may come into contact within one piece (time interval of constant
-    command).
-
-    Every array [W] is an affine form: centre, slopes, remainder.
+    """Time and closing speed at which a pair may come into contact within one piece, as affine forms [W] (module
+    ``affine``).
     """
 
     closing: Floats  # [W] closing speed at the start of the piece, m/s
@@ -57,17 +58,8 @@ class Approach(NamedTuple):
 
 @compiled(apart=True)
 def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
-    """Return the largest change of the gap or of the relative speed of pair ``p`` that bounces of the neighbouring
-    pairs can cause.
-
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
-            interval of constant command).
-        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        of_gap: if True, return the change of the gap of pair ``p``, m; if False, return the change of the relative
-            speed of pair ``p``, m/s.
-
+    """Return the largest change that bounces of the neighbouring pairs can cause in pair ``p``: the change of its gap
+    (m) if ``of_gap`` is True, otherwise the change of its relative speed (m/s).
     """
     P, most = cell.gap.shape[0], 0.0
     if p > 0 and path.marks[P + p - 1] != FREE:
@@ -79,9 +71,9 @@ def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
 
 @compiled(apart=True)
 def pressing(motion: Motion, p: int) -> tuple[float, float]:
-    """Return the smallest and the largest closing acceleration of pair ``p`` in a piece, m/s2. Both returned
-    accelerations are also correct if a vehicle stops within the piece. ``motion`` contains the motion of all vehicles
-    in the piece (time interval of constant command).
+    """Return the smallest and the largest closing acceleration of pair ``p`` in a piece, m/s2.
+
+    Both accelerations are also correct if a vehicle stops within the piece.
     """
     front_low, front_high = low(motion.pull[p]) - motion.vague[p], high(motion.pull[p]) + motion.vague[p]
     rear_low, rear_high = low(motion.pull[p + 1]) - motion.vague[p + 1], high(motion.pull[p + 1]) + motion.vague[p + 1]
@@ -94,18 +86,7 @@ def pressing(motion: Motion, p: int) -> tuple[float, float]:
 
 @compiled(apart=True)
 def may_meet(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> bool:
-    """Return whether pair ``p`` may come into contact within this piece at a time when its gap is closing.
-
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
-            interval of constant command).
-        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
-            ``move_alone``).
-        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        length: duration of the piece (time interval of constant command), s.
-
-    """
+    """Return whether pair ``p`` may come into contact within this piece at a time when its gap is closing."""
     N = cell.speed.shape[0]
     gap = path.forms[N + p]
     softest, hardest = pressing(motion, p)
@@ -134,17 +115,8 @@ def approach(
     the contact is then ``w^2 + 2 b g``, and the contact comes after the time ``2 g / (w + w')``. If the front vehicle
     stops before the contact, g includes the stopping distance of the front vehicle.
 
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
-            interval of constant command).
-        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
-            ``move_alone``).
-        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        length: duration of the piece (time interval of constant command), s.
-        front_stands: if True, consider the worlds in which the front vehicle is at rest at the contact; if False, the
-            worlds in which the front vehicle moves at the contact.
-
+    If ``front_stands`` is True, the result is for the worlds in which the front vehicle is at rest at the contact;
+    otherwise for the worlds in which it moves.
     """
     N, width = cell.speed.shape[0], cell.speed.shape[1]
     slack, vague = noise(cell, path, p, False), motion.vague[p] + motion.vague[p + 1]
@@ -196,13 +168,8 @@ def approach(
 def _stopping_way(moving: bool, speed: Floats, pull: Floats, vague: float, length: float) -> Floats:
     """Return the stopping distance (m) of a vehicle that stops within a piece, as an affine form [W].
 
-    Args:
-        moving: True if the acceleration of any vehicle builds up gradually instead of at once.
-        speed: speed at the start of the piece as an affine form [W], m/s.
-        pull: mean acceleration of the vehicle in the piece as an affine form [W], m/s2.
-        vague: largest deviation of the acceleration from ``pull``, m/s2.
-        length: duration of the piece (time interval of constant command), s.
-
+    ``moving`` is ``Cell.moving``. ``speed`` [W] is the speed at the start of the piece (m/s), ``pull`` [W] the mean
+    acceleration in the piece, and ``vague`` the largest deviation from ``pull`` (m/s2).
     """
     if not high(pull) + vague < 0.0 or (vague > 0.0 and not moving):
         fastest = max(high(speed), 0.0) + max(high(pull) + vague, 0.0) * length

@@ -1,6 +1,10 @@
 """Motion of two vehicles from their impact to the end of the piece, in all worlds of a box.
 
-A *piece* is a time interval of constant command.
+Arrays without a stated shape are affine forms [W] (module ``affine``). Arguments that several functions share: ``p`` is
+the index of the pair (vehicle ``p`` in front, vehicle ``p + 1`` behind), and ``left`` the time from the impact to the
+end of the piece, s. ``motion`` is the result of ``move_alone``, and ``how`` the result of ``approach`` for pair ``p``.
+The functions write the speeds at the end of the piece into ``after``, the path after the impact, and the distances (m)
+that the two vehicles travel in the piece into ``way`` [N, W].
 """
 
 from __future__ import annotations
@@ -31,19 +35,7 @@ def spring_apart(
 ) -> None:
     """Compute the motion of both vehicles of a pair that separates after an impact, up to the end of the piece.
 
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
-            ``move_alone``).
-        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        how: closing speed and time of the contact of pair ``p``, as ``approach`` returns them.
-        jump: change of the pair's relative speed by the impact, as an affine form [W] (centre, slopes, remainder), m/s.
-        left: time from the impact to the end of the piece (time interval of constant command) as an affine form [W], s.
-        after: the path (worlds with the same impacts so far) after the impact; the function writes into this path the
-            vehicles' speeds at the end of the piece.
-        way: [N, W] distances travelled in the piece, m; the function writes the distances of the two vehicles of the
-            pair into it.
-
+    ``jump`` is the change of the pair's relative speed by the impact, m/s.
     """
     front, rear = product(cell.share[p, 0], jump), product(cell.share[p, 1], jump)
     after.forms[p + 1] = difference(motion.onward[p + 1], rear)
@@ -66,16 +58,16 @@ def spring_apart(
 
 @compiled(apart=True)
 def stand_still(cell: Cell, pull: Floats, vague: float, left: float, speed: Floats, way: Floats) -> None:
-    """Correct the speed and the distance of a braking vehicle: the vehicle stands from the time at which its speed
+    """Correct ``speed`` and ``way`` of a braking vehicle in place: the vehicle stands from the time at which its speed
     would become negative.
 
     Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        pull: mean acceleration after the impact as an affine form [W] (centre, slopes, remainder), m/s2.
+        cell: only ``moving`` is read.
+        pull: mean acceleration after the impact, m/s2.
         vague: largest deviation of the acceleration from ``pull``, m/s2.
-        left: longest time from the impact to the end of the piece (time interval of constant command), s.
-        speed: speed at the end of the piece as an affine form [W], m/s; the function corrects it in place.
-        way: distance travelled in the piece as an affine form [W], m; the function corrects it in place.
+        left: longest time from the impact to the end of the piece, s (a number).
+        speed: speed at the end of the piece, m/s.
+        way: distance travelled in the piece, m.
 
     """
     least = low(speed)
@@ -96,23 +88,8 @@ def stay(
 ) -> None:
     """Compute the motion of both vehicles of a pair that stays in contact after an impact, up to the end of the piece.
 
-    Both vehicles get the speed of the pair's centre of mass.
-
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
-            interval of constant command).
-        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
-            ``move_alone``).
-        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        how: closing speed and time of the contact of pair ``p``, as ``approach`` returns them.
-        speed: closing speed at the impact as an affine form [W] (centre, slopes, remainder), m/s.
-        left: time from the impact to the end of the piece (time interval of constant command) as an affine form [W], s.
-        after: the path (worlds with the same impacts so far) after the impact; the function writes into it the speeds
-            at the end of the piece and the state of the pair in contact.
-        way: [N, W] distances travelled in the piece, m; the function writes the distances of the two vehicles of the
-            pair into it.
-
+    Both vehicles get the speed of the pair's centre of mass. ``speed`` is the closing speed at the impact, m/s. The
+    function also updates the state of the pair in contact, ``after.touch[p]``.
     """
     N, touch = cell.speed.shape[0], after.touch[p]
     pull, vague = common(cell, p, motion.pull[p], motion.pull[p + 1]), max(motion.vague[p], motion.vague[p + 1])

@@ -1,8 +1,15 @@
 """Upper bound on the harm of a plan in all worlds of a box, by branch and bound.
 
-A *box* contains all worlds whose uncertain numbers lie in given intervals. A *plan* has one action for each decision up
-to the horizon. The search divides the box into parts: it repeatedly halves the part with the largest upper bound on the
-harm. Letters for shapes: a world consists of ``Q`` numbers, of which ``K`` are uncertain; a plan has ``L`` actions.
+The search divides the box into parts: it repeatedly halves the part with the largest upper bound on the harm.
+
+Letters for shapes: a world consists of ``Q`` numbers, of which ``K`` are uncertain; a plan has ``L`` actions; an affine
+form (module ``affine``) has ``W = K + 2`` entries. Arguments that several functions share:
+
+- ``low_``, ``high_``: [Q] smallest and largest value in the box for each number of a world.
+- ``free``: [K] indices of the uncertain numbers.
+- ``plan``: [L] action of the shielded vehicle at each decision.
+- ``late``: time from the alert to the start of the first piece as an affine form [W], s.
+- ``rates``: [2, W] rates at which the brakes build up (index 0) and release (index 1), m/s3.
 """
 
 from __future__ import annotations
@@ -65,16 +72,7 @@ class Known(NamedTuple):
 
 @compiled(apart=True)
 def form_of(low_: Floats, high_: Floats, which: int, free: Ints) -> Floats:
-    """Return one of a world's numbers as an affine form [K + 2] (centre, slopes, remainder) that covers all worlds of a
-    box.
-
-    Args:
-        low_: [Q] smallest value in the box for each of the Q numbers of a world.
-        high_: [Q] largest value in the box for each of the Q numbers of a world.
-        which: index, among the Q numbers of a world, of the number to return as an affine form.
-        free: [K] indices of the uncertain numbers; each of them has its own slope in the affine form.
-
-    """
+    """Return the number with index ``which`` of a world as an affine form [W] that covers all worlds of a box."""
     out = np.zeros(free.shape[0] + 2)
     out[0] = 0.5 * (low_[which] + high_[which])
     half = 0.5 * (high_[which] - low_[which])
@@ -90,18 +88,9 @@ def form_of(low_: Floats, high_: Floats, which: int, free: Ints) -> Floats:
 def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats) -> tuple[Cell, Floats]:
     """Return the cell of a box, and the time (s) from the alert to the start of the first piece as an affine form [W].
 
-    A *cell* is the box as affine forms, with the commands divided into pieces (time intervals of constant command). All
-    times in a cell are measured from the first decision. If the shielded vehicle's latency is uncertain, the time from
-    the alert to the first decision differs between worlds. The first piece starts d seconds before the first decision,
-    where d is the shortest time from the alert to the first decision in any world of the box.
-
-    Args:
-        low_: [Q] smallest value in the box for each of the Q numbers of a world.
-        high_: [Q] largest value in the box for each of the Q numbers of a world.
-        free: [K] indices of the uncertain numbers among the Q numbers of a world.
-        known: quantities that are the same in all worlds of the box.
-        plan: [L] action of the shielded vehicle at each decision.
-
+    All times in a cell are measured from the first decision. If the shielded vehicle's latency is uncertain, the time
+    from the alert to the first decision differs between worlds. The first piece starts d seconds before the first
+    decision, where d is the shortest time from the alert to the first decision in any world of the box.
     """
     N, W = known.limit.shape[0], free.shape[0] + 2
     P, v = N - 1, known.vehicle
@@ -153,14 +142,7 @@ def build_up(cell: Cell, i: int, late: Floats, rates: Floats) -> None:
     """Write the accelerations of vehicle ``i`` into ``cell.forces``, for every piece and for the time before the first
     piece.
 
-    At the alert the acceleration of the vehicle is 0. A *piece* is a time interval of constant command.
-
-    Args:
-        cell: the box of worlds and the vehicles' commands over time; the function changes only ``cell.forces``.
-        i: index of the vehicle.
-        late: time from the alert to the start of the first piece as an affine form [W] (centre, slopes, remainder), s.
-        rates: [2, W] rates at which the brakes build up (index 0) and release (index 1), m/s3.
-
+    At the alert the acceleration of the vehicle is 0.
     """
     forces, own, force, wanted = cell.forces, i == cell.vehicle, np.zeros_like(late), np.zeros_like(late)
     last, there = 0.0, True  # last action, and whether the acceleration has reached its target
@@ -212,16 +194,16 @@ def ramp(
     acceleration ``wanted``, plus ``m (d + e) / 2`` for the speed and ``m t (d + e) / 2 - m^2 (d + 2 e) / 6`` for the
     distance. Returns True if the acceleration equals ``wanted`` at the end of ``duration`` in every world of the box.
 
+    All arguments except ``longest``, ``rates`` and ``swing`` are affine forms [W].
+
     Args:
-        force: acceleration at the start of ``duration`` as an affine form [W] (centre, slopes, remainder), m/s2; the
-            function replaces it by the acceleration at the end of ``duration``.
-        wanted: acceleration that the vehicle commands, as an affine form [W], m/s2.
-        duration: time during which the command acts, as an affine form [W], s.
+        force: acceleration at the start of ``duration``, m/s2; the function replaces it by the acceleration at the end.
+        wanted: acceleration that the vehicle commands, m/s2.
+        duration: time during which the command acts, s.
         longest: upper limit of ``duration``, s.
-        rates: [2, W] rates at which the brakes build up (index 0) and release (index 1), m/s3.
-        rise: change of speed as an affine form [W], m/s; the function adds its result to this form in place.
-        gain: distance minus (initial speed times duration) as an affine form [W], m; the function adds its result to
-            this form in place.
+        rates: rates at which the brakes build up and release.
+        rise: change of speed, m/s; changed in place.
+        gain: distance minus (initial speed times duration), m; changed in place.
         swing: [2] array in which the function stores the largest deviation of the acceleration from its mean, m/s2: at
             index 0 if the acceleration falls, at index 1 if the acceleration rises.
 
@@ -255,11 +237,10 @@ def ramp(
 
 @compiled(apart=True)
 def wait(cell: Cell, late: Floats) -> bool:
-    """Advance the speeds and gaps of a cell (box of worlds) in place, from the alert to the start of the first piece
-    (time interval of constant command).
+    """Advance the speeds and gaps of a cell in place, from the alert to the start of the first piece.
 
     Returns False if a contact, a stop, the speed limit or a command that takes effect may disturb the motion before the
-    first piece. ``late`` [W] is the time from the alert to the start of the first piece, s.
+    first piece.
     """
     if high(late) <= 1e-12:
         return True
@@ -291,12 +272,11 @@ def wait(cell: Cell, late: Floats) -> bool:
 
 @compiled(apart=True)
 def early_pull(cell: Cell, i: int, late: Floats) -> tuple[Floats, bool]:
-    """Return the acceleration of vehicle ``i`` from the alert until the time ``late``, and whether this acceleration is
-    certain.
+    """Return the acceleration (m/s2) of vehicle ``i`` from the alert until the time ``late`` as an affine form [W], and
+    whether this acceleration is certain.
 
-    The acceleration is an affine form [W] (centre, slopes, remainder) in m/s2; it is 0 for the shielded vehicle. The
-    acceleration is uncertain if the vehicle's command may take effect before ``late``. ``cell`` is the box of worlds;
-    ``late`` [W] is the time from the alert to the start of the first piece (time interval of constant command), s.
+    The acceleration is 0 for the shielded vehicle. The acceleration is uncertain if the vehicle's command may take
+    effect before ``late``.
     """
     pull = np.zeros_like(late)
     if i == cell.vehicle:
@@ -314,17 +294,11 @@ def early_pull(cell: Cell, i: int, late: Floats) -> tuple[Floats, bool]:
 
 @compiled(apart=True)
 def pieces(known: Known, onset: Floats, earliest: float, plan: Floats) -> tuple[Floats, Floats]:
-    """Return the times that separate the J pieces (time intervals of constant command), [J + 1], and the action in each
-    piece, [J].
+    """Return the times that separate the J pieces (s after the first decision), [J + 1], and the action in each piece,
+    [J].
 
-    The times are in s, measured from the first decision.
-
-    Args:
-        known: quantities that are the same in all worlds of the box.
-        onset: [N, W] time after the first decision at which each vehicle's command takes effect, s.
-        earliest: shortest time from the alert to the first decision in any world of the box, s.
-        plan: [L] action of the shielded vehicle at each decision.
-
+    ``onset`` [N, W] is the time after the first decision at which each vehicle's command takes effect, s. ``earliest``
+    is the shortest time from the alert to the first decision in any world of the box, s.
     """
     N = onset.shape[0]
     before = earliest - known.begin_s
@@ -360,20 +334,9 @@ def bound_of(
 ) -> float:  # fmt: skip
     """Return an upper bound (m2/s2) on the harm of a plan in all worlds of one box.
 
-    A result above ``most`` is no bound: the search stopped, and the harm may be larger than the result.
-
-    Args:
-        low_: [Q] smallest value in the box for each of the Q numbers of a world.
-        high_: [Q] largest value in the box for each of the Q numbers of a world.
-        free: [K] indices of the uncertain numbers among the Q numbers of a world.
-        known: quantities that are the same in all worlds of the box.
-        plan: [L] action of the shielded vehicle at each decision.
-        stack: memory that the search overwrites; it stores the paths (sets of worlds with the same impacts so far).
-        motion: memory that the function overwrites; it stores the motion of each vehicle in the present piece.
-        out: [K + 2]; the function writes the affine form of the largest harm into it. The bound is the largest value of
-            the affine form in ``out``.
-        most: the search stops as soon as the harm of some world may exceed this number, m2/s2.
-
+    A result above ``most`` is no bound: the search stops as soon as the harm of some world may exceed ``most``. The
+    function writes the affine form of the largest harm into ``out`` [W]; the bound is its largest value. ``stack`` and
+    ``motion`` are memory that the function overwrites.
     """
     cell, late = cell_of(low_, high_, free, known, plan)
     # rough bound for all worlds; their first piece begins ``late`` after the alert
@@ -398,20 +361,11 @@ def bound_box(
     low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, enough: float, cells: int, only_enough: bool
 ) -> tuple[float, int]:
     """Return an upper bound (m2/s2) on the harm of a plan in all worlds of a box, and the number of parts of the box
-    that were examined. The function repeatedly halves the part with the largest bound, until the bound of the whole box
-    is at most ``enough``, or ``cells`` parts were examined.
+    that were examined.
 
-    Args:
-        low_: [Q] smallest value in the box for each of the Q numbers of a world.
-        high_: [Q] largest value in the box for each of the Q numbers of a world.
-        free: [K] indices of the uncertain numbers among the Q numbers of a world.
-        known: quantities that are the same in all worlds of the box.
-        plan: [L] action of the shielded vehicle at each decision.
-        enough: the search stops as soon as the bound of the whole box is at most this number, m2/s2.
-        cells: largest number of parts of the box to examine.
-        only_enough: if True, stop examining a part of the box as soon as its harm may exceed ``enough``; a result above
-            ``enough`` is then no bound.
-
+    The search stops when the bound of the whole box is at most ``enough`` (m2/s2), or after ``cells`` parts. If
+    ``only_enough`` is True, it stops examining a part as soon as the part's harm may exceed ``enough``; a result above
+    ``enough`` is then no bound.
     """
     N, K, Q = known.limit.shape[0], free.shape[0], low_.shape[0]
     stack, motion = new_stack(N, K + 2), new_motion(N, K + 2)
@@ -456,6 +410,9 @@ SCRIPTS = ("full_brake", "coast", "constant")
 class Boxes(NamedTuple):
     """Boxes around ``n`` reported worlds: each of the ``Q = 8 N - 1`` numbers of a world in the box lies between
     ``low`` and ``high``.
+
+    Arguments that several methods share: ``others`` are the scripts of the other vehicles, by vehicle index, and
+    ``plans`` [m, L] the actions of the shielded vehicle at each decision, for each of m boxes.
     """
 
     # [n, Q] smallest values: braking and driving capacity, latency, mass, brake rate, release rate and speed of each
@@ -475,16 +432,8 @@ class Boxes(NamedTuple):
         """Raise ``InvalidInput`` for a setting that ``robust="interior"`` cannot certify in any world.
 
         Interior mode cannot certify these settings: total harm; more than three vehicles; an obstacle ahead; another
-        vehicle with a script other than full braking, coasting or one constant deceleration.
-
-        Args:
-            robust: worlds of the box in which actions are certified: ``corners`` (for which the function never raises
-                an error) or ``interior``.
-            scenario: the scenario of the worlds.
-            harm_count: impacts whose harm is counted: ``first`` (first impact of each pair) or ``total`` (every
-                impact).
-            others: scripts of the other vehicles; the keys are vehicle indices.
-
+        vehicle with a script other than full braking, coasting or one constant deceleration. For ``robust="corners"``
+        the function never raises an error.
         """
         if robust != INTERIOR:
             return
@@ -507,20 +456,14 @@ class Boxes(NamedTuple):
     def of(
         cls, possible: Worlds, problem: ProfileProblem, n: int, scenario: Scenario, others: Mapping[int, Script]
     ) -> Boxes:
-        """Return the boxes (sets of possible worlds) around ``n`` reported worlds at the alert.
+        """Return the boxes around ``n`` reported worlds at the alert.
 
         Raises ``InvalidInput`` for worlds that interior mode cannot certify: an obstacle ahead, a vehicle whose command
         changes over time (profile), brakes that began to build up before the alert, or another vehicle whose command is
         not the same in all worlds of the box. ``check_possible`` checks the settings that do not depend on the worlds.
 
-        Args:
-            possible: [n * M] worlds, M consecutive worlds for each box: the reported world, then the corners of its
-                box.
-            problem: table with one row for each world in ``possible``, including the commands of the other vehicles.
-            n: number of boxes.
-            scenario: the scenario of the worlds.
-            others: scripts of the other vehicles; the keys are vehicle indices.
-
+        ``possible`` are [n * M] worlds, M consecutive worlds for each box: the reported world, then the corners of its
+        box. ``problem`` has one row for each world in ``possible``, including the commands of the other vehicles.
         """
         v, N, vehicle, members = possible.vehicles, possible.N, int(problem.vehicles[0]), possible.n // n
         if possible.obstacle_ahead.any():
@@ -559,12 +502,10 @@ class Boxes(NamedTuple):
         return self._replace(**arrays)
 
     def placed(self, old: Boxes | None, rows: Ints) -> Boxes:
-        """Return the boxes of all running episodes, with the new boxes (``self``) at the indices ``rows``.
+        """Return the boxes of all running episodes, with the new boxes (``self``) at the indices ``rows`` [m].
 
-        Args:
-            old: boxes of all episodes as they were before the new episodes began; None if no episode had begun before.
-            rows: [m] indices of the new episodes. If all episodes are new, ``old`` is not used.
-
+        ``old`` are the boxes of all episodes as they were before the new episodes began; None if no episode had begun
+        before. If all episodes are new, ``old`` is not used.
         """
         if old is None or len(rows) >= len(old.low):
             return self.take(np.argsort(rows))
@@ -574,14 +515,11 @@ class Boxes(NamedTuple):
         return self._replace(**arrays)
 
     def at_alert(self, plans: Floats, harm: Floats) -> Floats:
-        """Return, for each world at the alert, an upper bound on the harm of the world's plan in all worlds of its box,
-        [n] m2/s2.
+        """Return, for each world at the alert, an upper bound on the harm of its plan in all worlds of its box, [n]
+        m2/s2.
 
-        Args:
-            plans: [n, L] action of the shielded vehicle at each decision, for each world.
-            harm: [n] harm of each world's plan, m2/s2: the largest harm over the corners of the world's box. The search
-                stops when its upper bound is close to this harm.
-
+        ``harm`` [n] is the largest harm (m2/s2) of each world's plan over the corners of its box. The search stops when
+        its upper bound is close to this harm.
         """
         return self.bound(np.arange(len(plans)), plans, NEAR * harm + NEARLY_NOTHING, CELLS_AT_ALERT)
 
@@ -590,14 +528,8 @@ class Boxes(NamedTuple):
     ) -> Floats:
         """Return, for each plan, an upper bound on the harm since the alert in all worlds of the plan's box, [m] m2/s2.
 
-        Args:
-            rows: [m] indices of the boxes for which the search computes a bound.
-            plans: [m, L] action of the shielded vehicle at each decision, for each box.
-            enough: [m] the search in a box stops as soon as the bound of the whole box is at most this number, m2/s2.
-            cells: largest number of parts of each box that the search examines.
-            only_enough: if True, the search also stops as soon as the harm may exceed ``enough``; a result above
-                ``enough`` is then no bound.
-
+        ``rows`` [m] are the indices of the boxes. ``enough`` [m], ``cells`` and ``only_enough`` say when the search in
+        a box stops, as in ``bound_box``.
         """
         bounds = np.empty(len(rows))
         for j, k in enumerate(rows.tolist()):
@@ -621,7 +553,7 @@ def _refusal(what: str) -> InvalidInput:
 def checked_robust(robust: object, where: str) -> str:
     """Return ``robust`` if it is ``corners`` or ``interior``; raise ``UnknownName`` otherwise.
 
-    ``where`` is the start of the error message; it names the setting that is checked.
+    ``where`` is the start of the error message.
     """
     if robust not in CERTAINTIES:
         raise unknown_name(f"{where}: robust", robust, CERTAINTIES)

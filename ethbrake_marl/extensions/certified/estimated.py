@@ -3,21 +3,18 @@
 A vehicle is *known* if its message has arrived or it is in sight. The estimate combines these sources:
 
 * A known vehicle is the source of its capacities, its mass, its own latency, and the newest state that was received
-  from it. The estimate extrapolates the newest received state to the present. If a command was in force at the time of
-  the newest received state, the vehicle is assumed to follow its script from that time on. If no command was in force
-  at the time of the newest received state, the vehicle is assumed to coast until the time at which it is expected to
-  react.
+  from it. The estimate extrapolates this state to the present. If a command was in force at the time of this state, the
+  vehicle is assumed to follow its script from that time on. Otherwise, the vehicle is assumed to coast until the time
+  at which it is expected to react.
 * The scenario is the source for a vehicle that is not known. Each quantity of an unknown vehicle is the median of its
   distribution, or a chosen value of its range. An unknown vehicle is assumed to follow its script from the alert on.
 * The scenario is also the source for each quantity that the messages of a known vehicle lack (``v2x: tells``). The
   received position of a vehicle is used only if its speed was received, too. The received command of a vehicle is used
   only if its position and speed were received, too. A received intent (announced command) is not used, because the
   script already predicts what the vehicle does.
-* The estimating vehicle itself is a source, too: it measures its own state, its distance since the alert, and its
-  impacts with known neighbours.
+* The estimating vehicle measures its own state, its distance since the alert, and its impacts with known neighbours.
 
-Apart from these sources, the estimate reads nothing of the true world, so information that was not received cannot
-change the estimate.
+The estimate reads nothing else of the true world, so information that was not received cannot change the estimate.
 """
 
 from __future__ import annotations
@@ -54,8 +51,7 @@ OF_OTHERS = (
 class Told(NamedTuple):
     """Information that one vehicle has received about the other vehicles up to the present time.
 
-    A vehicle is *known* if its message has arrived or it is in sight. Values in the columns of unknown vehicles have no
-    meaning.
+    Values in the columns of unknown vehicles have no meaning.
     """
 
     known: Bools  # [n, N] True for vehicles with known place and speed, and for the vehicle itself
@@ -70,7 +66,7 @@ class Told(NamedTuple):
 
     @property
     def reacts(self) -> Bools:
-        """Boolean mask [n, N]: True for a vehicle that is known to have a command in force."""
+        """Mask [n, N]: True for a vehicle that is known to have a command in force."""
         reacts: Bools = self.known & self.pieces[..., ACCELERATION] & (self.command_mps2 != 0.0)
         return reacts
 
@@ -78,15 +74,15 @@ class Told(NamedTuple):
     def heard(self) -> Floats:
         """Amount of information about each vehicle, [n, N].
 
-        The amount is 0 if nothing is known about the vehicle. The amount is 1 if something is known about the vehicle,
-        but not both its position and its speed. The amount is 2 if position and speed of the vehicle are known.
+        The amount is 0 if nothing is known about the vehicle, 2 if its position and its speed are known, and otherwise
+        1.
         """
         return self.pieces.any(axis=2).astype(np.float64) + self.known
 
     @classmethod
     def to(cls, worlds: Worlds, vehicle: int) -> Told:
-        """Return the information that the vehicle with index ``vehicle`` has received in ``worlds`` up to the present
-        time of these worlds.
+        """Return the information that the vehicle with index ``vehicle`` has received up to the present time of
+        ``worlds``.
         """
         n, N = worlds.speeds_mps.shape
         known = worlds.vehicles.known_from_s[:, vehicle] <= worlds.time_s[:, np.newaxis]
@@ -131,8 +127,7 @@ class Told(NamedTuple):
 
 
 def _places_of(worlds: Worlds, vehicle: int) -> Floats:
-    """Compute from the gaps of ``worlds`` the position of each vehicle relative to the vehicle with index ``vehicle``,
-    [n, N] m.
+    """Compute from the gaps of ``worlds`` the position of each vehicle relative to ``vehicle``, [n, N] m.
 
     Positions ahead are positive, positions behind negative. The position of a direct neighbour is exactly plus or minus
     the gap to this neighbour.
@@ -152,7 +147,11 @@ class Ranges:
     Keys of the mappings ``middle``, ``low`` and ``high``: ``place`` (position relative to the estimating vehicle at the
     alert, m), ``speeds_mps``, ``braking_capacity_mps2``, ``mass_t``, ``latency_s`` (latency without the delay of the
     alert message, s) and ``news_s`` (time at which a vehicle has received the alert and may react, s; 0 without a
-    channel). Each of the three mappings contains, for each key, an array [N] with one value for each vehicle.
+    channel).
+
+    The argument ``share`` of the methods gives, for some pairs (quantity, vehicle index), the position of the value in
+    its range: 0 is the smallest value, 1 the largest. Every other unknown quantity gets its median. If ``share`` is
+    None, every unknown quantity gets its median.
     """
 
     vehicle: int  # index of the estimating vehicle
@@ -164,12 +163,11 @@ class Ranges:
 
     @classmethod
     def of(cls, scenario: Scenario, vehicle: int, others: Mapping[int, Script] | None = None) -> Ranges:
-        """Return the ranges that ``scenario`` declares for the quantities of all vehicles. The vehicle with index
-        ``vehicle`` uses these ranges for its estimates.
+        """Return the ranges that ``scenario`` declares, for the estimates of the vehicle with index ``vehicle``.
 
-        ``others`` contains the scripts of the other vehicles; the keys are vehicle indices. If ``others`` is None, the
-        scripts of the scenario are used. Raises ``InvalidInput`` for a mixture of scenarios, because an unknown vehicle
-        could belong to any scenario of the mixture.
+        ``others`` contains the scripts of the other vehicles by vehicle index; None: the scripts of the scenario.
+        Raises ``InvalidInput`` for a mixture of scenarios, because an unknown vehicle could belong to any scenario of
+        the mixture.
         """
         if scenario.members:
             names = ", ".join(member.name for member in scenario.members)
@@ -201,15 +199,8 @@ class Ranges:
         return cls(vehicle, others, middle, low, high, float(world.obstacle_gap_m[0]))
 
     def at(self, share: Mapping[tuple[str, int], float] | None, key: str) -> Floats:
-        """Return one quantity of every vehicle, [N]: for each vehicle the median of the quantity, or the value at a
-        chosen position in the range of the quantity.
-
-        Args:
-            share: for some pairs (quantity, vehicle index), the position of the value in its range: 0 is the smallest
-                value, 1 the largest. A vehicle whose index is in no pair with the quantity ``key`` gets the median. If
-                ``share`` is None, all vehicles get the median.
-            key: name of the quantity; must be a key of ``middle``.
-
+        """Return the quantity ``key`` (a key of ``middle``) of every vehicle, [N], at the positions in its range
+        that ``share`` gives.
         """
         value = self.middle[key].copy()
         for (name, j), part in () if share is None else share.items():
@@ -219,9 +210,8 @@ class Ranges:
 
     @property
     def uncertain(self) -> tuple[tuple[str, int], ...]:
-        """The uncertain quantities of the other vehicles, as pairs (quantity, vehicle index).
-
-        A quantity of a vehicle is uncertain if the scenario declares a range for it instead of one value.
+        """The quantities of the other vehicles for which the scenario declares a range instead of one value, as pairs
+        (quantity, vehicle index).
         """
         others = [j for j in range(len(self.middle["place"])) if j != self.vehicle]
         return tuple((key, j) for j in others for key in OF_OTHERS if self.low[key][j] < self.high[key][j])
@@ -238,12 +228,9 @@ class Ranges:
         Args:
             worlds: the true worlds; only the information that the vehicle received is read.
             way_m: [n] distance that the estimating vehicle has travelled since the alert, m.
-            share: for some pairs (quantity, vehicle index), the position of the value in its range: 0 is the smallest
-                value, 1 the largest. Every other unknown quantity gets its median. If ``share`` is None, every unknown
-                quantity gets its median.
+            share: positions of unknown quantities in their ranges, see the class.
             foretold: the predicted present worlds, including impacts, and a mask [n, N]: True for a vehicle whose
-                predicted state replaces the state in its last message. If ``foretold`` is None, the estimate uses no
-                prediction.
+                predicted state replaces the state in its last message. None: the estimate uses no prediction.
 
         """
         worlds.refuse_build_up(":estimated")
@@ -302,14 +289,10 @@ class Ranges:
 
 
 def _places(ahead_m: Floats, behind_m: Floats, vehicle: int) -> Floats:
-    """Return the position of each vehicle relative to ``vehicle``, [N] m. Positions ahead are positive, positions
-    behind negative.
+    """Return the position of each vehicle relative to ``vehicle``, [N] m: positive ahead, negative behind.
 
-    Args:
-        ahead_m: [P] gap of each pair, m; the function uses only the gaps in front of ``vehicle``.
-        behind_m: [P] gap of each pair, m; the function uses only the gaps behind ``vehicle``.
-        vehicle: index of the vehicle whose position is 0.
-
+    ``ahead_m`` and ``behind_m`` [P] are gaps of the pairs, m; only the gaps in front of ``vehicle`` are read from
+    ``ahead_m``, and only the gaps behind ``vehicle`` from ``behind_m``.
     """
     front = np.cumsum(ahead_m[:vehicle][::-1])[::-1]
     return np.concatenate([front, [0.0], -np.cumsum(behind_m[vehicle:])])
@@ -319,12 +302,8 @@ def _in_order(place: Floats, known: Bools, vehicle: int) -> Floats:
     """Correct estimated positions so that no vehicle is ahead of the vehicle in front of it; return the positions, [n,
     N] m.
 
-    Args:
-        place: [n, N] position of each vehicle relative to ``vehicle``, m; the function changes this array in place.
-        known: [n, N] True for vehicles whose position is certain; the function does not change the position of these
-            vehicles.
-        vehicle: index of the vehicle whose position is 0.
-
+    ``place`` [n, N] is the position of each vehicle relative to ``vehicle``, m; the function changes this array in
+    place. ``known`` [n, N] is True for vehicles whose position is certain; these positions do not change.
     """
     N = place.shape[1]
     for way in (-1, 1):  # first the vehicles ahead, then the vehicles behind

@@ -1,12 +1,16 @@
 """Shields that decide in the estimated world: they use only the information that their vehicle received.
 
-The module ``estimated`` explains the *estimated world*. Mode ``step`` certifies every action in one estimated world:
-the world in which every unknown quantity has its median. Mode ``step`` promises nothing about the true world. Mode
+The module ``estimated`` explains the *estimated world*. Mode ``step`` certifies every action in the median world, the
+estimated world in which every unknown quantity has its median, and promises nothing about the true world. Mode
 ``robust`` also certifies every action in the corners: the estimated worlds in which every unknown quantity has its
 smallest or largest value. If the true world is one of the corners, the harm in the true world up to the horizon is at
 most the bound at the first decision. This bound holds for two reasons: a later message only removes corners that
 contradict the message, and a new plan replaces the present plan only if the new plan is better in the remaining
 corners.
+
+Arguments that several methods share: ``worlds`` are the true worlds, ``rows`` [m] the indices of episodes in the batch,
+``due`` [n] is True for worlds that have a decision now, and ``way_m`` is the distance that the shielded vehicle has
+travelled since the alert, m.
 """
 
 from __future__ import annotations
@@ -43,11 +47,10 @@ SURPRISE = 1e-6  # largest difference (m, m/s) between a measurement and its pre
 
 
 def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
-    """After a restart of the shield in the episodes ``rows``, restore the harm so far, and replace each new plan by the
+    """After a restart of ``shield`` in the episodes ``rows``, restore the harm so far, and replace each new plan by the
     rest of the old plan if the predicted harm of this rest is at most the predicted harm of the new plan.
 
-    ``shield`` has just been restarted; the function changes ``shield`` in place. ``before`` is a copy of the shield
-    from before the restart.
+    ``before`` is a copy of the shield from before the restart; the function changes ``shield`` in place.
     """
     (running, backup), (old, held) = shield.memory[:2], before.memory[:2]
     assert running is not None and old is not None
@@ -70,21 +73,19 @@ class EstimatedShield:
 
     The shield starts at the first decision. The shield restarts when its vehicle learns of a further vehicle, learns
     that another vehicle reacts, or sees a vehicle move otherwise than predicted. After a restart, the shield keeps the
-    rest of the previous plan if the predicted harm of this rest is at most the predicted harm of the new plan. At the
-    first decision, ``predicted_harm`` [n] is set to the present bound on harm; later decisions do not change it.
-    ``predicted_harm`` is infinite if the vehicle had an impact before the first decision, because the harm of that
-    impact is unknown.
+    rest of the previous plan if the predicted harm of this rest is at most the predicted harm of the new plan.
+    ``predicted_harm`` [n] is the bound on harm at the first decision. It is infinite if the vehicle had an impact
+    before the first decision, because the harm of that impact is unknown.
 
     Args:
         scenario: the scenario of the worlds; a mixture of scenarios raises ``InvalidInput``.
         vehicle: index of the shielded vehicle.
-        harm_count: impacts whose harm is counted: ``first`` (first impact of each pair) or ``total`` (every impact).
-        robust: worlds in which actions are certified. None: only the median world, in which every unknown quantity has
-            its median. ``corners``: the median world and all corners of the ranges of the unknown quantities; more than
-            ``MOST_CORNERS`` corners raise ``InvalidInput``. ``interior``: all worlds between the corners that are
-            possible at the first decision; with ``interior``, later information does not restart the shield.
-        others: scripts of the other vehicles; the keys are vehicle indices. If ``others`` is None, the shield uses the
-            scripts of the scenario.
+        harm_count: ``first`` or ``total``.
+        robust: worlds in which actions are certified. None: only the median world. ``corners``: the median world and
+            all corners of the ranges of the unknown quantities; more than ``MOST_CORNERS`` corners raise
+            ``InvalidInput``. ``interior``: all worlds between the corners that are possible at the first decision; with
+            ``interior``, later information does not restart the shield.
+        others: scripts of the other vehicles by vehicle index; None: the scripts of the scenario.
 
     """
 
@@ -134,7 +135,7 @@ class EstimatedShield:
         return 1 + len(self._corners())
 
     def __copy__(self) -> EstimatedShield:
-        """Return an independent copy of the shield. Decisions of the copy do not change the original shield."""
+        """Return an independent copy: its decisions do not change the original shield."""
         apart = object.__new__(EstimatedShield)
         apart.__dict__.update(self.__dict__)
         apart.shield = copy.copy(self.shield)
@@ -153,8 +154,7 @@ class EstimatedShield:
         return apart
 
     def begin(self, worlds: Worlds, rows: Ints) -> None:
-        """Start new episodes at the indices ``rows`` of the batch; ``worlds`` [m] are the worlds of these episodes at
-        the alert.
+        """Start new episodes at the indices ``rows`` of the batch; ``worlds`` [m] are their worlds at the alert.
 
         Certification starts later, at the first decision, with the information received by then.
         """
@@ -182,9 +182,8 @@ class EstimatedShield:
             worlds: the true worlds; only the information that the vehicle received is read.
             proposed: [n] actions that the policy proposes.
             proposer: the policy and its memory. If no other plan certifies a proposed action, the shield also tries the
-                policy's rollout (simulated episode) in the estimated worlds. If ``proposer`` is None, the shield does
-                not try the policy's rollout.
-            only: [n] True for worlds in which the vehicle decides now; None means all worlds.
+                policy's rollout (simulated episode) in the estimated worlds. None: the shield does not try it.
+            only: [n] True for worlds in which the vehicle decides now; None: all worlds.
 
         """
         shield, vehicle = self.shield, self.vehicle
@@ -210,13 +209,6 @@ class EstimatedShield:
     def _begin_anew(self, worlds: Worlds, estimated: Worlds, way_m: Floats, due: Bools) -> None:
         """Start the inner shield (``self.shield``) in worlds in which it has not started; restart it in worlds in which
         new information requires a restart.
-
-        Args:
-            worlds: the true worlds at the present time, [n].
-            estimated: the estimated worlds at the present time, [n].
-            way_m: [n] distance that the shielded vehicle has travelled since the alert, m.
-            due: [n] True for worlds that have a decision now.
-
         """
         shield, vehicle = self.shield, self.vehicle
         known = Told.to(worlds, vehicle)
@@ -247,18 +239,12 @@ class EstimatedShield:
     def _begin_shield(
         self, worlds: Worlds, estimated: Worlds, way_m: Floats, rows: Ints, keeps: Bools, before: StepShield | None
     ) -> None:
-        """Start the inner shield (``self.shield``) in the episodes with the indices ``rows``. The inner shield
-        certifies actions in the median world and, in mode ``robust``, in the corners of the ranges of unknown
-        quantities.
+        """Start the inner shield (``self.shield``) in the episodes ``rows``, whose worlds are ``worlds`` and
+        ``estimated``, [m].
 
-        Args:
-            worlds: [m] the true worlds of the episodes with the indices ``rows``.
-            estimated: [m] the estimated worlds of the episodes with the indices ``rows``.
-            way_m: [m] distance that the shielded vehicle has travelled since the alert, m.
-            rows: [m] indices of the episodes in the batch.
-            keeps: [m, N] True for vehicles whose predicted state replaces their received state.
-            before: the inner shield as it was before the restart; None if the inner shield starts for the first time.
-
+        The inner shield certifies actions in the median world and, in mode ``robust``, in the corners of the ranges of
+        unknown quantities. ``keeps`` [m, N] is True for vehicles whose predicted state replaces their received state.
+        ``before`` is the inner shield as it was before the restart; None if it starts for the first time.
         """
         parts = []
         for m, share in enumerate([None, *self._corners()]):
@@ -276,8 +262,7 @@ class EstimatedShield:
         """Return a mask [n, N]: True for each vehicle whose predicted state replaces its received state.
 
         The mask is True for a vehicle that is unknown, and for a vehicle whose last message is older than the vehicle's
-        last predicted impact or contact. ``received`` is the information that the vehicle has received; ``time_s`` [n]
-        is the present time.
+        last predicted impact or contact. ``time_s`` [n] is the present time.
         """
         running = self.shield.memory.running
         if running is None:
@@ -294,10 +279,8 @@ class EstimatedShield:
         return keeps
 
     def _note_impacts(self, worlds: Worlds) -> None:
-        """For each vehicle that had an impact since the last decision in at least one possible world, store the present
-        time as the time of the vehicle's last impact.
-
-        ``worlds`` are the true worlds at the present time.
+        """Store the present time as the time of the last impact of each vehicle that had an impact since the last
+        decision in at least one possible world.
         """
         running = self.shield.memory.running
         assert running is not None
@@ -314,10 +297,7 @@ class EstimatedShield:
         """Return a mask [n]: True for each world in which the estimated state of at least one vehicle is outside the
         range of the states that the shield predicted for this vehicle.
 
-        Args:
-            estimated: the estimated worlds at the present time, [n].
-            heard: [n, N] True for each vehicle whose received state is compared with its predicted states.
-
+        ``heard`` [n, N] is True for each vehicle whose received state is compared with its predicted states.
         """
         running = self.shield.memory.running
         assert running is not None

@@ -27,15 +27,16 @@ class Odometer(NamedTuple):
 
     @classmethod
     def begun(cls, alert: Worlds, vehicle: int) -> Odometer:
-        """Return the odometer (distance travelled since the alert) of the vehicle with index ``vehicle`` at the start
-        of episodes; ``alert`` [n] are the worlds at the alert.
+        """Return the odometer of the vehicle with index ``vehicle`` at the start of episodes; ``alert`` [n] are the
+        worlds at the alert.
         """
         return cls(np.zeros(alert.n), alert.time_s.copy(), alert.speeds_mps[:, vehicle].copy())
 
     def look(self, worlds: Worlds, vehicle: int) -> Odometer:
-        """Return a new odometer (distance travelled since the alert) for the present time; ``worlds`` [n] are the
-        present worlds. The method adds the distance since the last decision: mean speed times time, or the stopping
-        distance if a braking vehicle stopped. The added distance is exact if the command was constant.
+        """Return the odometer for the present ``worlds`` [n].
+
+        The method adds the distance since the last decision: mean speed times time, or the stopping distance if a
+        braking vehicle stopped. The added distance is exact if the command was constant.
         """
         speed, command, before = worlds.speeds_mps[:, vehicle], worlds.command_mps2[:, vehicle], self.speed_mps
         way = 0.5 * (before + speed) * (worlds.time_s - self.time_s)
@@ -53,11 +54,10 @@ class Estimating(AgentAround):
     policy expected at its first decision.
 
     Args:
-        policy: agent that controls the vehicle; any agent that reads the state of the line is possible.
+        policy: any agent that reads the state of the line.
         scenario: the scenario, which declares the ranges of all unknown quantities; a mixture of scenarios raises
             ``InvalidInput``.
-        shows: if True, the policy sees the estimated world at every decision; if False, the policy sees the estimated
-            world only when the policy starts.
+        shows: if True, the policy sees the estimated world at every decision; if False, only when the policy starts.
 
     """
 
@@ -73,15 +73,10 @@ class Estimating(AgentAround):
         return Knowledge((Source.ESTIMATES,))
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Return the agent's memory at the start of episodes, as a mapping.
+        """Return the agent's memory at the start of episodes; ``alert`` [n] are the worlds at the alert.
 
-        This method does not start the policy, because the vehicle has not received any information yet.
-
-        Args:
-            alert: the worlds at the alert, [n].
-            vehicle: index of the agent's vehicle.
-            scripts: scripts of the other vehicles; this agent does not use them.
-
+        This method does not start the policy, because the vehicle has not received any information yet. It does not use
+        ``scripts``.
         """
         return {
             "way": Odometer.begun(alert, vehicle),
@@ -93,11 +88,7 @@ class Estimating(AgentAround):
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
         """Return the policy's command, [n] m/s2, and the agent's new memory.
 
-        Args:
-            worlds: the true worlds; only the information that the vehicle received is read.
-            memory: memory from ``begin`` or the previous ``act``.
-            vehicle: index of the agent's vehicle.
-
+        Of the true ``worlds``, only the information that the vehicle received is read.
         """
         way, heard = Odometer(*memory["way"]).look(worlds, vehicle), self._heard(worlds, vehicle)
         policy, predicted = memory["policy"], memory["predicted_harm"]
@@ -120,9 +111,8 @@ class Estimating(AgentAround):
         """Return a summary of the information that ``vehicle`` has received about each vehicle, [n, 2 N].
 
         The first N columns contain the amount of information about each vehicle (``Told.heard``). The other N columns
-        contain a 1 for each vehicle whose reaction was reported in a message but not predicted, and a 0 for all other
-        vehicles. The policy restarts in worlds in which the returned summary changes. ``worlds`` are the true worlds at
-        the present time.
+        contain a 1 for each vehicle whose reaction was reported in a message but not predicted, otherwise 0. The policy
+        restarts in worlds in which this summary changes.
         """
         known = Told.to(worlds, vehicle)
         # a received latency predicts the reaction, unless a channel may delay the reaction
@@ -136,26 +126,25 @@ class Estimating(AgentAround):
 
 
 class EstimatingHybrid(Estimating):
-    """The paper's Algorithm 1 in the estimated world. At the first decision the agent chooses between the policy and
-    E-V2X-BM.
+    """The paper's Algorithm 1 in the estimated world.
 
-    E-V2X-BM is the best constant deceleration. The agent predicts the harm of the policy and of E-V2X-BM, and lets the
-    one with less predicted harm control the vehicle for the whole episode.
+    At the first decision the agent predicts the harm of the policy and of E-V2X-BM, and lets the one with less
+    predicted harm control the vehicle for the whole episode.
     """
 
     policy: HybridAgent
 
     @property
     def knows(self) -> Knowledge:
-        """Information that the agent uses: the information that the policy uses, and the estimated world, in which the
-        agent compares the policy with E-V2X-BM.
+        """Information that the policy uses, and the estimated world, in which the agent compares the policy with
+        E-V2X-BM.
         """
         return Knowledge.of(self.policy.policy, also=Source.ESTIMATES)
 
     def _shown_at_first(self, estimated: Worlds) -> Worlds:
         """Return the estimated worlds with the present time set to 0 and past impacts removed.
 
-        The rollouts (simulated episodes) that compare the policy with E-V2X-BM start in the returned worlds.
+        The rollouts (simulated episodes) that compare the policy with E-V2X-BM start in these worlds.
         """
         v, n = estimated.vehicles, estimated.n
         latency = np.maximum(v.latency_s - estimated.time_s[:, np.newaxis], 0.0)

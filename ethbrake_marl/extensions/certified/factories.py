@@ -1,5 +1,8 @@
 """Agents and shields that this extension registers: the shield ``+robust``, and ``:estimated`` variants of other agents
 and shields.
+
+Arguments that several functions share: ``policy`` is the agent to shield, and ``argument`` a setting from the agent's
+spec (the text that names the agent). Error messages quote ``settings.spec``.
 """
 
 from __future__ import annotations
@@ -20,16 +23,8 @@ from ethbrake_marl.shields.factories import shield_episodes
 def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
     """Return the shield ``+robust`` or ``+robust:interior`` around ``policy``.
 
-    The uncertainty is an interval around each uncertain quantity; together the intervals form a box of possible worlds.
-    The shield certifies actions for the corners of this box, or for its whole interior.
-
-    Args:
-        policy: the agent to shield.
-        argument: worlds of the box in which the shield certifies actions: ``corners`` or ``interior``; None means
-            ``corners``.
-        settings: settings of the agent: its scenario, uncertainty and harm count, and its spec (the text that names the
-            agent), which error messages quote.
-
+    The shield certifies actions for the corners of the box of possible worlds (``argument`` is ``corners`` or None), or
+    for its whole interior (``argument`` is ``interior``).
     """
     where = f"agent {settings.spec!r}"
     robust, uncertainty = checked_robust(argument or CORNERS, where), settings.uncertainty
@@ -43,15 +38,7 @@ def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: 
     """Return the shield ``+robust:estimated`` or ``+robust:interior:estimated``.
 
     The shield certifies actions in the estimated world, and also for other values of the quantities that its vehicle
-    did not receive, within the ranges of these quantities.
-
-    Args:
-        policy: the agent to shield.
-        argument: worlds of the box in which the shield certifies actions: ``corners`` or ``interior``; None means
-            ``corners``.
-        settings: settings of the agent: its scenario, its harm count, and its spec (the text that names the agent),
-            which error messages quote.
-
+    did not receive, within the ranges of these quantities. ``argument`` is as in ``shield_robustly``.
     """
     where = f"agent {settings.spec!r}"
     return ShieldedDriver(
@@ -63,14 +50,7 @@ def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: 
 def shield_steps_as_estimated(policy: Driver, argument: str | None, settings: AgentSettings) -> Driver:
     """Return the shield ``+step:estimated``, which certifies every action of ``policy`` in the estimated world.
 
-    Raises ``InvalidInput`` if ``policy`` is a team or if the scenario has several learners.
-
-    Args:
-        policy: the agent to shield.
-        argument: not used.
-        settings: settings of the agent: its scenario, its harm count, and its spec (the text that names the agent),
-            which error messages quote.
-
+    ``argument`` is not used. Raises ``InvalidInput`` if ``policy`` is a team or if the scenario has several learners.
     """
     scenario = settings.needed_scenario()
     if isinstance(policy, Team) or len(scenario.learners) > 1:
@@ -84,18 +64,10 @@ def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: 
     """Return the shield ``+episode:estimated`` or ``+episode:pairwise:estimated``: the paper's Algorithm 1 in the
     estimated world.
 
-    At the first decision the shield predicts, in the estimated world, the harm of ``policy`` and of E-V2X-BM (the best
-    constant deceleration). The policy or E-V2X-BM, whichever has less predicted harm, controls the vehicle for the
-    whole episode.
-
-    Raises ``InvalidInput`` if ``policy`` already decides on received information.
-
-    Args:
-        policy: the agent that the shield compares with E-V2X-BM.
-        argument: ``pairwise`` for the pairwise form of E-V2X-BM, None for the coupled form.
-        settings: settings of the agent: its scenario, its harm count, and its spec (the text that names the agent),
-            which error messages quote.
-
+    At the first decision the shield predicts, in the estimated world, the harm of ``policy`` and of E-V2X-BM. The one
+    with less predicted harm controls the vehicle for the whole episode. ``argument`` is ``pairwise`` for the pairwise
+    form of E-V2X-BM, None for the coupled form. Raises ``InvalidInput`` if ``policy`` already decides on received
+    information.
     """
     hybrid = shield_episodes(policy, argument, settings)
     if isinstance(policy, Estimating):
@@ -107,10 +79,9 @@ def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: 
 
 
 def make_estimating_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
-    """Return the agent ``e_v2x_bm:estimated`` or ``e_v2x_bm:pairwise:estimated``.
+    """Return the agent ``e_v2x_bm:estimated`` or ``e_v2x_bm:pairwise:estimated``: E-V2X-BM in the estimated world.
 
-    The agent is E-V2X-BM (the best constant deceleration) in the estimated world. ``argument`` is ``pairwise`` for the
-    pairwise form of E-V2X-BM, or None for the coupled form. ``settings`` contains the scenario of the worlds.
+    ``argument`` is ``pairwise`` for the pairwise form of E-V2X-BM, or None for the coupled form.
     """
     return Estimating(make_e_v2x_bm(argument, settings), settings.needed_scenario())
 

@@ -30,13 +30,10 @@ class RobustGuard(StepGuard):
     """
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos of a step, as a mapping from names to values. The info ``members`` is the number of possible
-        worlds that represent each true world; an action is certified in all of these possible worlds.
+        """Return the infos of a step. ``ruling`` is None at the reset of the environment.
 
-        Args:
-            memory: the shield and the policies as they are after the step.
-            ruling: the shield's decision in this step; None at the reset of the environment.
-
+        The info ``members`` is the number of possible worlds that represent each true world; an action is certified in
+        all of these possible worlds.
         """
         return super().tell(memory, ruling) | {"members": memory.shield.memory.running.members}
 
@@ -54,14 +51,10 @@ class EstimatedGuard(ShieldGuard):
         return shield
 
     def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
-        """Return the proposed actions, and the actions to apply; the actions to apply are certified in the estimated
-        worlds.
+        """Return the proposed actions, and the actions to apply, which are certified in the estimated worlds.
 
-        Args:
-            running: the engine, in its state before the step.
-            memory: the shield and the policies as they are before the step.
-            proposed: [n, 1] actions that the policy proposes.
-
+        ``running`` and ``memory`` are in their state before the step; ``proposed`` [n, 1] are the actions that the
+        policy proposes.
         """
         worlds = running.worlds
         proposed, memories = self._asked(worlds, memory.policies, proposed)
@@ -72,11 +65,10 @@ class EstimatedGuard(ShieldGuard):
         return Ruling(proposed, applied, stepped_in, ~running.ended, after.decision, Guarded(after, memories))
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos of one step as a mapping; the shield has certified the actions in estimated worlds.
+        """Return the infos of a step. ``ruling`` is None at the reset of the environment.
 
         The info ``trusted`` is true in mode ``robust`` and false in mode ``step``, because only mode ``robust`` has a
-        bound that may also hold in the true world. ``memory`` contains the shield as it is after the step. ``ruling``
-        is the shield's decision in this step, or None at the reset of the environment.
+        bound that may also hold in the true world.
         """
         estimated: EstimatedShield = memory.shield
         robust, shield = estimated.robust is not None, estimated.shield

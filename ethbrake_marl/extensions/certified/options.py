@@ -1,6 +1,4 @@
-"""Settings of ``robust`` and ``estimated`` shields. The class ``RobustOptions`` checks the settings, makes the shield,
-and makes the guard that connects the shield with an engine.
-"""
+"""Settings of ``robust`` and ``estimated`` shields."""
 
 from __future__ import annotations
 
@@ -28,13 +26,13 @@ class RobustOptions(ShieldOptions):
 
     Args:
         mode: a mode of ``eb.ShieldOptions``, or ``robust``, which extends mode ``step`` to uncertain worlds. None means
-            ``robust`` if ``uncertainty`` is given, and ``step`` if ``uncertainty`` is not given.
+            ``robust`` if ``uncertainty`` is given, otherwise ``step``.
         uncertainty: for mode ``robust``, an interval around each uncertain quantity, such as ``"gaps_m=0.5"``.
         robust: worlds in which mode ``robust`` certifies actions: ``corners`` (fast) means only the ends of the
             intervals, and ``interior`` means all values in the intervals.
         estimated: if True, certify actions in the estimated world, which uses only the information that the vehicle
-            received and the scenario's ranges. ``estimated=True`` is possible in modes ``step`` and ``robust`` with one
-            learner, and without ``uncertainty``, ``allowance``, ``cap``, ``logging`` and ``shares``.
+            received and the scenario's ranges. Possible in modes ``step`` and ``robust`` with one learner, and without
+            ``uncertainty``, ``allowance``, ``cap``, ``logging`` and ``shares``.
 
     Raises ``InvalidInput`` and ``UnknownName`` as ``eb.ShieldOptions`` does.
 
@@ -70,26 +68,24 @@ class RobustOptions(ShieldOptions):
 
     @property
     def written(self) -> str:
-        """Text after the ``+`` in the spec of an agent that has a shield with these settings.
-
-        For an agent with the spec ``ppo+robust:interior:estimated``, the text is ``robust:interior:estimated``.
+        """Text after the ``+`` in the spec of an agent that has a shield with these settings, such as
+        ``robust:interior:estimated`` for ``ppo+robust:interior:estimated``.
         """
         robust = "" if self.robust == CORNERS else f":{self.robust}"
         return f"{self.mode}{robust}{':estimated' if self.estimated else ''}"
 
     @property
     def adds(self) -> Source:
-        """Source of the information that the shield uses in addition to the information that the policy uses."""
+        """Source of the information that the shield uses in addition to the policy's information."""
         return Source.ESTIMATES if self.estimated else super().adds
 
     def shield(
         self, scenario: Scenario, vehicle: int | tuple[int, ...], others: Mapping[int, Script] | None = None
     ) -> Any:
-        """Return a new shield for ``vehicle``; no episode has begun in this shield.
+        """Return a new shield for ``vehicle``, in which no episode has begun.
 
         ``vehicle`` is the index of the shielded vehicle, or several indices for modes that shield several vehicles.
-        ``others`` contains the scripts of the other vehicles; the keys are vehicle indices. If ``others`` is None, the
-        scripts of the scenario are used.
+        ``others`` contains the scripts of the other vehicles by vehicle index; None: the scripts of the scenario.
         """
         if self.estimated:
             assert isinstance(vehicle, int)
@@ -114,14 +110,10 @@ class RobustOptions(ShieldOptions):
             super().check_in(scenario, several=several)
 
     def guard(self, engine: Engine, policies: Mapping[int, Agent], *, several: bool = False, **how: Any) -> ShieldGuard:
-        """Return the guard that connects a shield with these settings to an engine.
+        """Return the guard that connects a shield with these settings to ``engine``, whose learners are shielded.
 
-        Args:
-            engine: the engine whose learners are shielded.
-            policies: maps the index of each vehicle to the agent that proposes the actions of this vehicle.
-            several: True if one shield decides for all learners together.
-            how: further keyword arguments of ``StepGuard``.
-
+        ``policies`` maps the index of each vehicle to the agent that proposes its actions. ``several`` is True if one
+        shield decides for all learners together. ``how`` are further keyword arguments of ``StepGuard``.
         """
         scenario, scripts, where = as_scenario(engine.scenario), engine.scripts, self.where
         if self.estimated:
@@ -141,9 +133,9 @@ class RobustOptions(ShieldOptions):
 
 
 def checked_uncertainty(given: object) -> Uncertainty | None:
-    """Return ``given`` as an ``Uncertainty``, or None if ``given`` is None. If ``given`` is a text such as
-    ``"gaps_m=0.5"``, the function parses it. Raises ``InvalidInput`` if ``given`` is not an ``Uncertainty``, a text or
-    None.
+    """Return ``given`` as an ``Uncertainty``: parse a text such as ``"gaps_m=0.5"``, and return None for None.
+
+    Raises ``InvalidInput`` if ``given`` is not an ``Uncertainty``, a text or None.
     """
     if given is None or isinstance(given, Uncertainty):
         return given
@@ -155,11 +147,10 @@ def checked_uncertainty(given: object) -> Uncertainty | None:
 
 
 def mode_uncertainty(mode: str, given: object, where: str) -> Uncertainty | None:
-    """Check that the uncertainty ``given`` fits the shield mode ``mode``; return it as an ``Uncertainty``, or None if
-    ``given`` is None.
+    """Return ``checked_uncertainty(given)`` if it fits the shield mode ``mode``.
 
     Raises ``InvalidInput`` if mode ``robust`` has no uncertainty, or another mode has one; ``where`` is the beginning
-    of the error message. ``given`` is an ``Uncertainty``, a text such as ``"gaps_m=0.5"``, or None.
+    of the error message.
     """
     uncertainty = checked_uncertainty(given)
     if (mode == "robust") != (uncertainty is not None):

@@ -1,8 +1,17 @@
 """Simulate all worlds of a box along paths: if a pair has an impact in only some of the worlds, the worlds with the
 impact form a new path.
 
-A *path* is a set of worlds with the same sequence of impacts (``affine.Path``). A *cell* is a box (all worlds whose
-uncertain numbers lie in given intervals) together with the vehicles' commands over time.
+A *path* is a set of worlds with the same sequence of impacts (``affine.Path``). Arrays without a stated shape are
+affine forms [W] (module ``affine``). Arguments that several functions share:
+
+- ``stack``: the paths that still have to be simulated; the functions may add paths.
+- ``motion``: the motion of each vehicle in the present piece as if alone on the road, from ``move_alone``.
+- ``p``: index of a pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+- ``how``: closing speed and time of the contact of pair ``p``, from ``approach``.
+- ``speed``: closing speed at the impact of pair ``p``, m/s.
+- ``length``: duration of the piece, s.
+- ``worst``: largest harm recorded before the call, m2/s2. A function with this argument returns the largest harm
+  recorded so far. If it records a new largest harm, it writes the affine form of this harm into ``out``.
 """
 
 from __future__ import annotations
@@ -65,7 +74,7 @@ STACK = 256  # largest number of waiting paths
 
 
 class Stack(NamedTuple):
-    """Stack of paths that still have to be simulated. A *path* is a set of worlds with the same impacts so far."""
+    """Paths that still have to be simulated."""
 
     forms: Floats  # [STACK, N + P + 1, W] ``Path.forms`` of each path
     touch: Floats  # [STACK, P, TOUCH_WIDTH] ``Path.touch`` of each path
@@ -87,10 +96,7 @@ def new_stack(N: int, width: int) -> Stack:
 
 @compiled(apart=True)
 def keep_worst(harm: Floats, worst: float, out: Floats) -> float:
-    """Return the larger of ``worst`` and the largest value of the affine form ``harm`` [W], m2/s2.
-
-    If the largest value of ``harm`` is above ``worst``, the function copies ``harm`` to ``out`` [W].
-    """
+    """Record ``harm`` (m2/s2) if its largest value is above ``worst``."""
     if not high(harm) <= worst:
         out[:] = harm
         return high(harm)
@@ -99,19 +105,7 @@ def keep_worst(harm: Floats, worst: float, out: Floats) -> float:
 
 @compiled(apart=True)
 def keep_rough(cell: Cell, path: Path, worst: float, out: Floats) -> float:
-    """Record a rough bound on the harm of a path that is no longer simulated; return the largest harm recorded so far.
-
-    The rough bound (``rough_harm``) uses only the largest speeds that the vehicles can still reach.
-
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
-            interval of constant command).
-        worst: largest harm recorded before this call, m2/s2.
-        out: array [W]; if the function records a new largest harm, it writes this harm here as an affine form (centre,
-            slopes, remainder).
-
-    """
+    """Record a rough bound (``rough_harm``) on the harm of a path that is no longer simulated."""
     return keep_with(np.zeros(cell.speed.shape[1]), rough_harm(cell, path, -1), worst, out)
 
 
@@ -119,27 +113,11 @@ def keep_rough(cell: Cell, path: Path, worst: float, out: Floats) -> float:
 def branch(
     cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, how: Approach, worst: float, out: Floats
 ) -> float:
-    """For the worlds in which pair ``p`` has an impact in this piece, record the harm or put a new path on the stack;
-    return the largest harm recorded so far.
+    """For the worlds in which pair ``p`` has an impact in this piece, record the harm or put a new path on the stack.
 
-    If no other impact can follow, the harm in the worlds with the impact is final and is recorded. If another impact
-    can follow, the worlds with the impact become a new path on the stack. If this new path cannot be simulated, the
-    function records a rough bound on its harm (``rough_harm``) instead.
-
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
-            interval of constant command).
-        stack: paths (sets of worlds with the same impacts so far) that still have to be simulated; the function may add
-            paths.
-        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
-            ``move_alone``).
-        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        how: closing speed and time of the contact of pair ``p``, as ``approach`` returns them.
-        worst: largest harm recorded before this call, m2/s2.
-        out: array [W]; if the function records a new largest harm, it writes this harm here as an affine form (centre,
-            slopes, remainder).
-
+    If no other impact can follow, the harm in the worlds with the impact is final and is recorded. Otherwise, these
+    worlds become a new path on the stack. If this new path cannot be simulated, the function records a rough bound on
+    its harm (``rough_harm``) instead.
     """
     P = cell.gap.shape[0]
     harm = path.forms[-1].copy()
@@ -172,10 +150,7 @@ def branch(
 
 @compiled(apart=True)
 def keep_with(harm: Floats, rest: float, worst: float, out: Floats) -> float:
-    """Record the sum of the affine form ``harm`` [W] and ``rest``, and return the largest harm recorded so far, m2/s2.
-    ``rest`` is an upper bound on the harm of later impacts, m2/s2. ``worst`` is the largest harm recorded before this
-    call. If the function records a new largest harm, it writes the affine form of this harm into ``out`` [W].
-    """
+    """Record the sum of ``harm`` and ``rest``, an upper bound on the harm of later impacts (m2/s2)."""
     whole = harm.copy()
     whole[0] += rest
     return keep_worst(whole, worst, out)
@@ -186,20 +161,8 @@ def closing_after(cell: Cell, path: Path, motion: Motion, p: int, speed: Floats,
     """Return the closing speed (m/s) of an impact of the other pair that may follow the impact of pair ``p`` in the
     same piece.
 
-    The function is for a line of three vehicles, which has two pairs. The result is an affine form [W] (centre, slopes,
-    remainder); it is 0 if the other pair cannot have contact.
-
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
-            interval of constant command).
-        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
-            ``move_alone``).
-        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        speed: closing speed at the impact of pair ``p`` as an affine form [W], m/s.
-        time: time of the impact of pair ``p`` as an affine form [W], s after the start of the piece.
-        length: duration of the piece (time interval of constant command), s.
-
+    The function is for a line of three vehicles, which has two pairs. The result is 0 if the other pair cannot have
+    contact. ``time`` is the time of the impact of pair ``p``, s after the start of the piece.
     """
     N, other = cell.speed.shape[0], 1 - p
     push = product(cell.share[p, other], speed)  # change of the middle vehicle's speed, towards the other pair
@@ -226,21 +189,7 @@ def strike(
     """Put the worlds in which pair ``p`` has an impact in the present piece on the stack as a new path.
 
     Returns False, and puts nothing on the stack, if the stack is full or the rear vehicle may move backwards
-    (``thrown_back``).
-
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
-            interval of constant command).
-        stack: paths (sets of worlds with the same impacts so far) that still have to be simulated; the function may add
-            paths.
-        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
-            ``move_alone``).
-        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        how: closing speed and time of the contact of pair ``p``, as ``approach`` returns them.
-        speed: closing speed at the impact as an affine form [W] (centre, slopes, remainder), m/s.
-        harm: harm up to the present impact, including this impact, as an affine form [W], m2/s2.
-
+    (``thrown_back``). ``harm`` is the harm up to and including this impact, m2/s2.
     """
     N, P, width = cell.speed.shape[0], cell.gap.shape[0], cell.speed.shape[1]
     size = stack.size[0]
@@ -311,16 +260,6 @@ def may_only_touch(cell: Cell, path: Path, motion: Motion, p: int, how: Approach
     other.
 
     A contact at closing speed 0 is possible only if a command changes or an acceleration builds up gradually.
-
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
-            interval of constant command).
-        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
-            ``move_alone``).
-        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        how: closing speed and time of the contact of pair ``p``, as ``approach`` returns them.
-
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     softest, hardest = pressing(motion, p)
@@ -343,17 +282,6 @@ def may_only_touch(cell: Cell, path: Path, motion: Motion, p: int, how: Approach
 def may_turn(cell: Cell, motion: Motion, p: int, piece: int) -> bool:
     """Return whether accelerations that build up gradually may press the vehicles of pair ``p`` together harder within
     a piece.
-
-    The vehicles may press together harder if the front vehicle's acceleration may fall, or if the rear vehicle's
-    acceleration may rise.
-
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
-            ``move_alone``).
-        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        piece: index of the piece (time interval of constant command), from 0 to J - 1 if there are J pieces.
-
     """
     return may_move(cell, motion, p, piece, 0) or may_move(cell, motion, p + 1, piece, 1)
 
@@ -362,15 +290,6 @@ def may_turn(cell: Cell, motion: Motion, p: int, piece: int) -> bool:
 def may_move(cell: Cell, motion: Motion, i: int, piece: int, which: int) -> bool:
     """Return whether brake build-up may lower (``which=0``) or raise (``which=1``) the acceleration of vehicle ``i``
     within a piece.
-
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
-            ``move_alone``).
-        i: index of the vehicle.
-        piece: index of the piece (time interval of constant command), from 0 to J - 1 if there are J pieces.
-        which: 0: return whether the acceleration may fall; 1: return whether the acceleration may rise.
-
     """
     if not cell.forces.build[i] or motion.vague[i] > cell.forces.swing[i, piece + 1].max():
         return cell.moving and motion.vague[i] > 0.0
@@ -383,20 +302,8 @@ def touch_only(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, len
     contact.
 
     With brake build-up the pair may separate after the contact, and then have its first impact within the same piece.
-    Worlds in which the pair separates and has its first impact belong to the path that lies directly below the second
-    path on the stack. Returns False if the stack has no room for the second path.
-
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
-            interval of constant command).
-        stack: paths (sets of worlds with the same impacts so far) that still have to be simulated; the function may add
-            paths.
-        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
-            ``move_alone``).
-        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        length: duration of the piece (time interval of constant command), s.
-
+    These worlds belong to the path that lies directly below the second path on the stack. Returns False if the stack
+    has no room for the second path.
     """
     size = stack.size[0]
     if size >= STACK:
@@ -420,19 +327,8 @@ def touch_only(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, len
 def thrown_back(cell: Cell, path: Path, motion: Motion, p: int, how: Approach, speed: Floats) -> bool:
     """Return whether the rear vehicle of pair ``p`` may move backwards after the impact of the pair and be hit again.
 
-    The result is False for the last vehicle of the line if this vehicle never drives: no vehicle is behind the last
-    vehicle, so its backward motion cannot lead to an impact.
-
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
-            interval of constant command).
-        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
-            ``move_alone``).
-        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        how: closing speed and time of the contact of pair ``p``, as ``approach`` returns them.
-        speed: closing speed at the impact as an affine form [W] (centre, slopes, remainder), m/s.
-
+    The result is False for the last vehicle of the line if it never drives: no vehicle is behind it, so its backward
+    motion cannot lead to an impact.
     """
     P, share = cell.gap.shape[0], (1.0 + cell.restitution) * high(cell.share[p, 1]) - 1.0
     slowest = 0.0
@@ -448,17 +344,10 @@ MOST_PATHS = 4000  # largest number of paths to simulate in one cell
 
 @compiled(apart=True)
 def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float) -> float:
-    """Return an upper bound on the harm in all worlds of the cell's box, m2/s2. If the result is above ``most``, the
-    search stopped early, and the harm may be larger than the result.
+    """Return an upper bound on the harm in all worlds of the cell's box, m2/s2, and write its affine form into ``out``.
 
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        stack: memory that the search overwrites; it stores the paths (sets of worlds with the same impacts so far).
-        motion: memory that the function overwrites; it stores the motion of each vehicle in the present piece.
-        out: [W]; the function writes the affine form of the largest harm into it. The bound is the largest value of the
-            affine form in ``out``.
-        most: the search stops as soon as the harm of some world may exceed this number, m2/s2.
-
+    A result above ``most`` is no bound: the search stops as soon as the harm of some world may exceed ``most``. The
+    bound is the largest value of ``out``. The function overwrites ``stack`` and ``motion``.
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     worst, paths = -math.inf, 0
@@ -484,22 +373,10 @@ def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float
 
 @compiled(apart=True)
 def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
-    """Simulate a path (worlds with the same impacts so far) to its end; return the largest harm recorded so far, m2/s2.
+    """Simulate a path to its end, and record its harm.
 
-    The function records the harm of the path. It also records the harm in worlds that leave the path because of an
-    impact, if these worlds need no further simulation.
-
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
-            interval of constant command); the function updates this state in place.
-        stack: paths (sets of worlds with the same impacts so far) that still have to be simulated; the function may add
-            paths.
-        motion: memory that the function overwrites; it stores the motion of each vehicle in the present piece.
-        worst: largest harm recorded before this call, m2/s2.
-        out: array [W]; if the function records a new largest harm, it writes this harm here as an affine form (centre,
-            slopes, remainder).
-
+    The function also records the harm in worlds that leave the path because of an impact, if these worlds need no
+    further simulation. It updates ``path`` in place and overwrites ``motion``.
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     quiet = 0  # first piece from which on no vehicle drives
@@ -529,14 +406,6 @@ def may_meet_unseen(cell: Cell, path: Path, motion: Motion) -> bool:
     piece.
 
     The vehicles of a pair in contact must separate before they can have an impact.
-
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
-            interval of constant command).
-        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
-            ``move_alone``).
-
     """
     P = cell.gap.shape[0]
     for p in range(P):
@@ -552,22 +421,8 @@ def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out
     """Move the pairs in contact through the present piece, and pass the worlds in which a pair has an impact to
     ``branch``.
 
-    In the present piece, the vehicles of a pair in contact either move as one body or separate. ``branch`` records the
-    harm in the worlds with an impact, or adds these worlds as a new path to the stack of paths that still have to be
-    simulated. Returns the largest harm recorded so far, m2/s2.
-
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
-            interval of constant command); the function updates this state in place.
-        stack: paths (sets of worlds with the same impacts so far) that still have to be simulated; the function may add
-            paths.
-        motion: motion of each vehicle in the present piece (time interval of constant command); the function changes it
-            in place.
-        worst: largest harm recorded before this call, m2/s2.
-        out: array [W]; if the function records a new largest harm, it writes this harm here as an affine form (centre,
-            slopes, remainder).
-
+    The vehicles of a pair in contact either move as one body or separate. The function changes ``path`` and ``motion``
+    in place.
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     length = cell.times[path.marks[2 * P] + 1] - cell.times[path.marks[2 * P]]
@@ -613,16 +468,9 @@ def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out
 
 @compiled(apart=True)
 def go_on(cell: Cell, path: Path, motion: Motion) -> bool:
-    """Advance the path to the end of the present piece, for the worlds without an impact in this piece. Return False if
-    every world of the path has an impact in this piece.
+    """Advance ``path`` in place to the end of the present piece, for the worlds without an impact in this piece.
 
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
-            interval of constant command); the function updates this state in place.
-        motion: motion that each vehicle would have in the present piece if this vehicle were alone on the road (from
-            ``move_alone``).
-
+    Returns False if every world of the path has an impact in this piece.
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     for p in range(P):

@@ -38,11 +38,9 @@ class RobustShield(StepShield):
             possible.
         uncertainty: intervals around the reported quantities. If ``uncertainty`` is None, the caller must pass the
             possible worlds to ``begin`` (argument ``possible``).
-        robust: worlds in which actions are certified: ``corners`` (of the box of possible worlds) or ``interior`` (the
-            whole box).
-        harm_count: impacts whose harm is counted: ``first`` (first impact of each pair) or ``total`` (every impact).
-        others: scripts of the other vehicles; the keys are vehicle indices. If ``others`` is None, the shield uses the
-            scripts of the scenario.
+        robust: ``corners`` or ``interior`` (the whole box).
+        harm_count: ``first`` or ``total``.
+        others: scripts of the other vehicles by vehicle index; None: the scripts of the scenario.
         settings: further keyword arguments of ``StepShield``.
 
     Raises ``InvalidInput`` in three cases: if ``StepShield`` raises this error, if an uncertainty is combined with
@@ -73,9 +71,7 @@ class RobustShield(StepShield):
 
     @property
     def possible_are(self) -> str:  # type: ignore[override]  # a constant there
-        """Text in error messages that says which worlds are the members (possible worlds), such as "uncertainty:
-        gaps_m=0.5".
-        """
+        """Text in error messages that says which worlds are the members, such as "uncertainty: gaps_m=0.5"."""
         return f"uncertainty: {self.uncertainty}"
 
     def members_of(self, worlds: Worlds) -> Worlds:
@@ -84,9 +80,7 @@ class RobustShield(StepShield):
 
     @property
     def boxes(self) -> Boxes | None:
-        """The boxes (smallest and largest value of every number of each world) in interior mode. The property ``boxes``
-        is None in corners mode, and before the first episode.
-        """
+        """The boxes in interior mode; None in corners mode and before the first episode."""
         boxes: Boxes | None = self.memory.enclosure
         return boxes
 
@@ -94,17 +88,17 @@ class RobustShield(StepShield):
         self, possible: Worlds, problem: ProfileProblem, rows: Ints, plan: Floats, harm: Floats
     ) -> tuple[Floats, Boxes | None]:
         """Return, for each new episode, a bound on the harm of its plan at the alert, [m] m2/s2; also return the boxes
-        (sets of possible worlds) of all episodes.
+        of all episodes.
 
-        In interior mode the bound covers all worlds of each box. In corners mode the bound covers only the members (the
-        reported world and the corners of its box), and the function returns None instead of boxes.
+        In interior mode the bound covers all worlds of each box. In corners mode the bound covers only the members, and
+        the function returns None instead of boxes.
 
         Args:
-            possible: [m * M] members (possible worlds) of the new worlds: M consecutive members for each new world.
+            possible: [m * M] worlds: M consecutive members for each new world.
             problem: table with one row for each world in ``possible``.
             rows: [m] indices of the new episodes.
-            plan: [m, L] action of the shielded vehicle at each decision, for each new world.
-            harm: [m] harm of each world's plan, m2/s2: the largest harm over the members of this world.
+            plan: [m, L] action of the shielded vehicle at each decision.
+            harm: [m] largest harm of each world's plan over the members of this world, m2/s2.
 
         """
         if possible.n == len(rows) or self.robust != INTERIOR:
@@ -115,30 +109,22 @@ class RobustShield(StepShield):
     def _also_certified(
         self, now: Running, memory: StepMemory, budget: Floats, decision: Decision, asked: Bools
     ) -> Decision:
-        """Return ``decision``; in interior mode, replace each of its plans that is not certified for all worlds of its
-        box.
+        """Return ``decision``; in interior mode, the plan from before the decision replaces each of its plans that is
+        not certified for all worlds of its box.
 
-        The plan from before the decision takes the place of the plan that is not certified.
-
-        Args:
-            now: states of the members (the reported worlds and the corners of their boxes) before the decision.
-            memory: memory of the shield, which includes the boxes and the plans from before the decision.
-            budget: [n] largest harm that a new plan may have, m2/s2.
-            decision: the present decision; its plans are certified for the members (the reported worlds and the corners
-                of their boxes), but not yet for all worlds of the boxes.
-            asked: [n] True for episodes that have a decision now.
-
+        ``now`` and ``memory`` are from before the decision. ``budget`` and ``asked`` are as in ``certify_inside``.
         """
         boxes = memory.enclosure
         return decision if boxes is None else certify_inside(boxes, now, memory.backup, budget, decision, asked)
 
     def _leaves_range(self, running: Running) -> Bools:
         """Return a mask [n]: True for each reported world whose box may contain a world outside the range of the
-        members (possible worlds). The members are the reported world and the corners of its box; ``running`` contains
-        the states of the members. The mask is True where the method of the same name in ``StepShield`` returns True. In
-        interior mode the mask is also True where the latency of the shielded vehicle is uncertain, because the worlds
-        of a box then have their decisions at different times. If the friction is uncertain, so that one uncertain
-        number changes several quantities, the mask is True for all worlds.
+        members.
+
+        The mask is True where the method of the same name in ``StepShield`` returns True. In interior mode the mask is
+        also True where the latency of the shielded vehicle is uncertain, because the worlds of a box then have their
+        decisions at different times. If the friction is uncertain, so that one uncertain number changes several
+        quantities, the mask is True for all worlds.
         """
         leaves, boxes = super()._leaves_range(running), self.boxes
         if boxes is not None:
@@ -155,12 +141,12 @@ def certify_inside(
     """Return ``decision``, but keep the old plan wherever the new plan is not certified for all worlds of its box.
 
     Args:
-        boxes: box of each world: the smallest and the largest value of each of the world's numbers.
-        running: states of the members (the reported worlds and the corners of their boxes) before the decision.
-        held: for each world, the plan from before the decision and the bound on the harm of this plan.
+        boxes: box of each world.
+        running: states of the members before the decision.
+        held: for each world, the plan from before the decision and the bound on its harm.
         budget: [n] largest harm that a new plan may have, m2/s2.
-        decision: the present decision; its plans are certified for the corners of the boxes (each uncertain number at
-            an end of its interval), but not yet for all worlds of the boxes.
+        decision: the present decision; its plans are certified for the members, but not yet for all worlds of the
+            boxes.
         asked: [n] True for episodes that have a decision now. In interior mode an episode ends only at the horizon,
             because vehicles may still move in some world of a box when all vehicles are at rest in the corners of the
             box.

@@ -9,9 +9,8 @@ vehicle and M the sum of both masses. Let u be the largest speed of any vehicle,
 backwards yet. An impact slows the rear vehicle, but the new speed is at least -e times the previous speed. An impact
 gives a front vehicle at rest at most (1 + e) times the rear vehicle's speed. So, in a line of three vehicles, the speed
 of the middle vehicle stays between -e u and (1 + e) u until both its pairs have had contact. If three vehicles are in
-contact at once, each vehicle has the speed (1 + e) P - e v after the impact, where v is the speed of this vehicle
-before the impact, and P is a weighted mean of the three speeds before the impact. The speed of each vehicle after an
-impact of three vehicles, too, lies between -e u and (1 + e) u.
+contact at once, each vehicle has the speed (1 + e) P - e v after the impact, where v is its speed before the impact,
+and P is a weighted mean of the three speeds before the impact. This speed, too, lies between -e u and (1 + e) u.
 """
 
 from __future__ import annotations
@@ -26,11 +25,8 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(apart=True)
 def driven(cell: Cell, i: int, speed: float, since: float) -> float:
-    """Return the largest speed (m/s) that vehicle ``i`` can reach by driving if its speed at the time ``since`` is at
-    most ``speed``.
-
-    ``since`` is a time in s, measured from the first decision. ``cell`` contains the box of worlds and the vehicles'
-    commands over time.
+    """Return the largest speed (m/s) that vehicle ``i`` can reach by driving if its speed at the time ``since`` (s
+    after the first decision) is at most ``speed``.
     """
     drive, rest = 0.0, cell.times[-1] - since
     if i == cell.vehicle:
@@ -46,18 +42,10 @@ def driven(cell: Cell, i: int, speed: float, since: float) -> float:
 
 @compiled(apart=True)
 def rough_harm(cell: Cell, path: Path, hit: int) -> float:
-    """Return an upper bound (m2/s2) on the harm in all worlds of a path (worlds with the same impacts so far),
-    including the harm so far.
+    """Return an upper bound (m2/s2) on the harm in all worlds of a path, including the harm so far.
 
-    The bound uses only the largest speeds that the vehicles can still reach.
-
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
-            interval of constant command).
-        hit: index of one more pair that is treated as if its first impact had already happened, in addition to the
-            pairs marked in the path; -1: no such pair.
-
+    ``hit`` is the index of one more pair that is treated as if its first impact had already happened, in addition to
+    the pairs marked in the path; -1: no such pair.
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     since = cell.times[path.marks[2 * P]]
@@ -78,12 +66,12 @@ def rough_rest(cell: Cell, own: Floats, backwards: float, since: float, path: Pa
     come.
 
     Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
+        cell: the box and the vehicles' commands.
         own: [N] largest speed that each vehicle can reach without an impact, m/s.
         backwards: largest backward speed of any vehicle at the time ``since``, m/s.
         since: present time, s after the first decision.
-        path: worlds of the box with the same impacts so far; the function reads only which pairs have had an impact.
-        hit: index of one more pair that is treated as if its first impact had already happened; -1: no such pair.
+        path: only read for which pairs have had an impact.
+        hit: as in ``rough_harm``.
 
     """
     P, e = cell.gap.shape[0], cell.restitution

@@ -5,9 +5,13 @@ The state of a pair in contact is the motion of its centre of mass, as affine fo
 vehicles deviate from this motion. While both vehicles move forward, only their commands act on the pair. The centre of
 mass then follows the commands alone, no matter how often the two vehicles collide.
 
-A world *creeps* as soon as one of the two vehicles of the pair stands or moves backwards. The brakes of the vehicle
-that stands or moves backwards then hold this vehicle itself, instead of slowing the pair. For a world that creeps, the
-state of the pair contains only limits on the speeds. A *flight* is the time between two impacts of the pair.
+A world *creeps* as soon as one of the two vehicles of the pair stands or moves backwards. The brakes of this vehicle
+then hold the vehicle itself, instead of slowing the pair. For a world that creeps, the state of the pair contains only
+limits on the speeds.
+
+Arguments that several functions share: ``p`` is the index of the pair (vehicle ``p`` in front, vehicle ``p + 1``
+behind), ``touch`` [TOUCH_WIDTH] the state of the pair (a row of ``Path.touch``), and ``length`` the duration of the
+piece, s. Functions that return nothing change ``path``, ``motion`` and ``touch`` in place.
 """
 
 from __future__ import annotations
@@ -53,8 +57,7 @@ UNEVEN = 3.0  # largest ratio of closing to separating speed in a flight, for bo
 def common(cell: Cell, p: int, front: Floats, rear: Floats) -> Floats:
     """Return one quantity (speed, acceleration or distance) of the centre of mass of pair ``p``, as an affine form [W].
 
-    ``front`` and ``rear`` are the same quantity for the front and the rear vehicle, as affine forms. ``cell`` contains
-    the share of each vehicle in the mass of the pair.
+    ``front`` and ``rear`` are the same quantity for the front and the rear vehicle, as affine forms.
     """
     out = product(cell.share[p, 1], front)
     add(out, 1.0, product(cell.share[p, 0], rear))
@@ -63,10 +66,8 @@ def common(cell: Cell, p: int, front: Floats, rear: Floats) -> Floats:
 
 @compiled(apart=True)
 def pressing_together(motion: Motion, p: int) -> tuple[float, float]:
-    """Return the smallest and the largest closing acceleration (m/s2) of pair ``p`` if both vehicles accelerate as
-    commanded.
-
-    ``motion`` contains the motion of all vehicles in the present piece (time interval of constant command).
+    """Return the smallest and the largest closing acceleration (m/s2) of pair ``p`` in a piece if both vehicles
+    accelerate as commanded.
     """
     vague = motion.vague[p] + motion.vague[p + 1]
     least = low(motion.pull[p + 1]) - high(motion.pull[p]) - vague
@@ -75,29 +76,22 @@ def pressing_together(motion: Motion, p: int) -> tuple[float, float]:
 
 @compiled(apart=True)
 def apart(touch: Floats) -> float:
-    """Return the largest possible difference between the speeds of the two vehicles of a pair in contact, m/s.
-
-    ``touch`` [TOUCH_WIDTH] is the state of the pair in contact (a row of ``Path.touch``).
-    """
+    """Return the largest possible difference between the speeds of the two vehicles of a pair in contact, m/s."""
     return float(max(touch[OPENING], touch[CLOSING], 0.0))
 
 
 @compiled(apart=True)
 def faster(cell: Cell, p: int) -> float:
-    """For an impact of pair ``p``, return the largest possible ratio v / u, where v is the front vehicle's speed after
-    the impact, and u is the rear vehicle's speed before the impact. The returned ratio is at least 1. ``cell`` contains
-    the coefficient of restitution and each vehicle's share of the pair's mass.
+    """Return the largest possible ratio v / u, at least 1, for an impact of pair ``p``: v is the front vehicle's speed
+    after the impact, and u is the rear vehicle's speed before the impact.
     """
     return float(max(1.0, (1.0 + cell.restitution) * high(cell.share[p, 0])))
 
 
 @compiled(apart=True)
 def backwards(cell: Cell, p: int) -> float:
-    """Return the largest backward speed of the rear vehicle of pair ``p`` after an impact, as a multiple of this
-    vehicle's speed before the impact.
-
-    The returned multiple is at least 0. ``cell`` contains the coefficient of restitution and each vehicle's share of
-    the pair's mass.
+    """Return the largest backward speed of the rear vehicle of pair ``p`` after an impact, as a multiple (at least 0)
+    of its speed before the impact.
     """
     return float(max(0.0, (1.0 + cell.restitution) * high(cell.share[p, 1]) - 1.0))
 
@@ -108,16 +102,9 @@ def stray(cell: Cell, touch: Floats, p: int) -> float:
     form.
 
     The result is above 0 only if one of the two vehicles may stand or move backwards. Let c be ``touch[CREEP]``, the
-    largest speed of the rear vehicle in worlds in which a vehicle stands or moves backwards. The speed of the centre of
-    mass in its affine form lies between 0 and c. The rear vehicle's speed lies between ``-backwards(cell, p) * c`` and
-    c. The front vehicle's speed lies between 0 and ``faster(cell, p) * c``. An impact never makes the rear vehicle
-    faster.
-
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        touch: [TOUCH_WIDTH] state of the pair in contact, a row of ``Path.touch``.
-        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-
+    largest speed of the rear vehicle in worlds that creep. The speed of the centre of mass in its affine form lies
+    between 0 and c. The rear vehicle's speed lies between ``-backwards(cell, p) * c`` and c. The front vehicle's speed
+    lies between 0 and ``faster(cell, p) * c``. An impact never makes the rear vehicle faster.
     """
     return float(max(faster(cell, p), 1.0 + backwards(cell, p)) * touch[CREEP])
 
@@ -127,23 +114,14 @@ def blur(cell: Cell, path: Path, p: int, side: int) -> float:
     """Return the largest difference (m/s) between the speed of a vehicle in contact and the speed of its pair's centre
     of mass.
 
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
-            interval of constant command).
-        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        side: 0 for the front vehicle of the pair, 1 for the rear vehicle.
-
+    ``side`` is 0 for the front vehicle of the pair, 1 for the rear vehicle.
     """
     return float(high(cell.share[p, side]) * path.touch[p, SPREAD] + stray(cell, path.touch[p], p))
 
 
 @compiled(apart=True)
 def begin_touch(touch: Floats) -> None:
-    """Reset the state of a pair in contact, except for the columns SPREAD and REACH, which describe the present piece.
-
-    ``touch`` [TOUCH_WIDTH] is the state of the pair (a row of ``Path.touch``); the function changes it in place.
-    """
+    """Reset the state of a pair in contact, except for SPREAD and REACH, which describe the present piece."""
     spread, reach = touch[SPREAD], touch[REACH]  # columns of the present piece
     touch[:] = 0.0
     touch[SPREAD], touch[REACH], touch[SOFTEST] = spread, reach, math.inf
@@ -151,20 +129,10 @@ def begin_touch(touch: Floats) -> None:
 
 @compiled(apart=True)
 def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
-    """Move pair ``p``, which is in contact, through the present piece (time interval of constant command).
+    """Move pair ``p``, which is in contact, through the present piece.
 
-    Before the call, ``motion`` describes each vehicle as if this vehicle were alone on the road. After the call,
-    ``motion`` describes the two vehicles as one body, or as two single vehicles if they separate.
-
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
-            interval of constant command); the function updates this state in place.
-        motion: motion of each vehicle in the present piece (time interval of constant command); the function changes it
-            in place.
-        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        length: duration of the piece (time interval of constant command), s.
-
+    Before the call, ``motion`` describes each vehicle as if alone on the road. After the call, it describes the two
+    vehicles as one body, or as two single vehicles if they separate.
     """
     touch, front, rear = path.touch[p], p, p + 1
     touch[SPREAD], touch[REACH] = apart(touch), touch[WIDE]
@@ -199,24 +167,17 @@ def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float)
 @compiled(apart=True)
 def dip_of(cell: Cell, vague: float, length: float) -> float:
     """Return by how much (m/s) a vehicle's speed within a piece may fall below the smaller one of its speeds at the
-    start and at the end of the piece. The speed can fall below both the speed at the start and the speed at the end
-    only if the vehicle's acceleration changes its sign within the piece.
+    start and at the end of the piece.
 
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        vague: largest deviation of the vehicle's acceleration from its mean in the piece, m/s2.
-        length: duration of the piece (time interval of constant command), s.
-
+    The speed can fall below both only if the acceleration changes its sign within the piece. ``vague`` is the largest
+    deviation of the acceleration from its mean in the piece, m/s2.
     """
     return 0.5 * vague * length if cell.moving else 0.0
 
 
 @compiled(apart=True)
 def own_pulls(motion: Motion, p: int) -> tuple[float, float]:
-    """Return the smallest and the largest acceleration (m/s2) that either vehicle of pair ``p`` commands in a piece.
-
-    ``motion`` contains the motion of all vehicles in the piece (time interval of constant command).
-    """
+    """Return the smallest and the largest acceleration (m/s2) that either vehicle of pair ``p`` commands in a piece."""
     weakest = min(low(motion.pull[p]) - motion.vague[p], low(motion.pull[p + 1]) - motion.vague[p + 1])
     return weakest, max(high(motion.pull[p]) + motion.vague[p], high(motion.pull[p + 1]) + motion.vague[p + 1])
 
@@ -225,15 +186,8 @@ def own_pulls(motion: Motion, p: int) -> tuple[float, float]:
 def creep(cell: Cell, touch: Floats, p: int, slowest: float, weakest: float, hardest: float, length: float) -> None:
     """Update the state of a pair in contact for worlds in which one of its vehicles may stand or move backwards.
 
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        touch: [TOUCH_WIDTH] state of the pair in contact (a row of ``Path.touch``); the function changes it in place.
-        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        slowest: smallest speed of the pair's centre of mass in the piece, m/s.
-        weakest: smallest acceleration that either vehicle of the pair commands in the piece, m/s2.
-        hardest: largest acceleration that either vehicle of the pair commands in the piece, m/s2.
-        length: duration of the piece (time interval of constant command), s.
-
+    ``slowest`` is the smallest speed of the pair's centre of mass in the piece, m/s. ``weakest`` and ``hardest`` are
+    the results of ``own_pulls``.
     """
     largest = max(
         high(cell.share[p, 0]), high(cell.share[p, 1])
@@ -257,19 +211,9 @@ def come_to_rest(cell: Cell, path: Path, motion: Motion, p: int, length: float) 
     """Update the state of pair ``p``, which is in contact, over a piece in which the pair's speed, as an affine form,
     is 0.
 
-    In each world, either both vehicles stand, or the world *creeps* (one vehicle stands or moves backwards) and the
-    brakes slow the other vehicle. The brakes reduce the rear vehicle's speed. The front vehicle's speed is at most
-    ``faster(cell, p)`` times the rear vehicle's speed.
-
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
-            interval of constant command); the function updates this state in place.
-        motion: motion of each vehicle in the present piece (time interval of constant command); the function changes it
-            in place.
-        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        length: duration of the piece (time interval of constant command), s.
-
+    In each world, either both vehicles stand, or the world creeps and the brakes slow the other vehicle. The brakes
+    reduce the rear vehicle's speed. The front vehicle's speed is at most ``faster(cell, p)`` times the rear vehicle's
+    speed.
     """
     touch = path.touch[p]
     touch[CREEP] = max(touch[CREEP], touch[SPREAD])
@@ -285,18 +229,9 @@ def come_to_rest(cell: Cell, path: Path, motion: Motion, p: int, length: float) 
 
 @compiled(apart=True)
 def part(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
-    """Separate the vehicles of pair ``p``, which was in contact and whose gap opens in the present piece. After the
-    separation, each vehicle moves under its own command.
+    """Separate the vehicles of pair ``p``, which was in contact and whose gap opens in the present piece.
 
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
-            interval of constant command); the function updates this state in place.
-        motion: motion of each vehicle in the present piece (time interval of constant command); the function changes it
-            in place.
-        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        length: duration of the piece (time interval of constant command), s.
-
+    After the separation, each vehicle moves under its own command.
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     touch, width = path.touch[p], cell.speed.shape[1]
@@ -324,22 +259,14 @@ def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length:
 
     An impact never increases the relative speed. The relative speed therefore grows at most at the rate of the closing
     acceleration that the commands cause. While the closing acceleration lies between b- (``least``) and b+ (``most``),
-    and b- > 0, the relative speed does not grow. Consider a *flight* (the time between two impacts), with gap g and
-    relative speed w at some moment. The gap in this flight is at most ``h = g + w^2 / (2 b-)``, and the flight ends
-    with a closing speed of at most ``sqrt(2 b+ h)``. The next flight starts with a relative speed of e times the
-    closing speed at the end of this flight, where e is the restitution. So the relative speed decreases from flight to
-    flight if ``e sqrt(b+ / b-) < 1``. If one vehicle stands or moves backwards, its own brakes hold it, so that flights
-    are shorter and the relative speeds in them are smaller.
+    and b- > 0, the relative speed does not grow. Consider a flight with gap g and relative speed w at some moment. The
+    gap in this flight is at most ``h = g + w^2 / (2 b-)``, and the flight ends with a closing speed of at most
+    ``sqrt(2 b+ h)``. The next flight starts with a relative speed of e times this closing speed, where e is the
+    restitution. So the relative speed decreases from flight to flight if ``e sqrt(b+ / b-) < 1``. If one vehicle stands
+    or moves backwards, its own brakes hold it, so that flights are shorter and the relative speeds in them are smaller.
 
-    Args:
-        cell: the box (all worlds whose uncertain numbers lie in given intervals) and the vehicles' commands over time.
-        touch: [TOUCH_WIDTH] state of the pair in contact (a row of ``Path.touch``); the function changes it in place.
-        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        least: smallest closing acceleration of the pair in the piece, m/s2.
-        most: largest closing acceleration of the pair in the piece, m/s2.
-        length: duration of the piece (time interval of constant command), s.
-        vague: largest deviation of a vehicle's acceleration from its mean in the piece, m/s2.
-
+    ``least`` and ``most`` are in m/s2. ``vague`` is the largest deviation of a vehicle's acceleration from its mean in
+    the piece, m/s2.
     """
     e, fastest, wide = cell.restitution, apart(touch), touch[WIDE]
     if fastest == 0.0 and wide == 0.0 and least >= 0.0:
@@ -370,16 +297,15 @@ def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: fl
     """Start a new phase of a contact, because the closing acceleration of the pair has changed.
 
     The recorded range of closing accelerations covers both the old and the new phase of the contact, if with this range
-    the relative speed still decreases from impact to impact. If the relative speed does not decrease from impact to
-    impact, the recorded range covers only the new phase.
+    the relative speed still decreases from impact to impact. Otherwise, the recorded range covers only the new phase.
 
     Args:
-        touch: [TOUCH_WIDTH] state of the pair in contact (a row of ``Path.touch``); the function changes it in place.
+        touch: state of the pair.
         e: coefficient of restitution.
-        softest: smallest closing acceleration in the old and the new phase of the contact, m/s2.
-        hardest: largest closing acceleration in the old and the new phase of the contact, m/s2.
-        least: smallest closing acceleration of the new phase of the contact, m/s2.
-        most: largest closing acceleration of the new phase of the contact, m/s2.
+        softest: smallest closing acceleration in both phases, m/s2.
+        hardest: largest closing acceleration in both phases, m/s2.
+        least: smallest closing acceleration of the new phase, m/s2.
+        most: largest closing acceleration of the new phase, m/s2.
 
     """
     if not e * math.sqrt(hardest / softest) < 1.0:
@@ -398,16 +324,11 @@ def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: fl
 def settle(touch: Floats, e: float) -> None:
     """Reset the state of a pair in contact if the pair certainly moves as one body by the end of the present piece.
 
-    Let the closing acceleration of the pair lie between ``b-`` and ``b+``, and let e be the restitution. A *flight*
-    (the time between two impacts) that begins with separating speed s lasts at most ``2 s / b-``. This flight ends with
-    a closing speed of at most ``s sqrt(b+ / b-)``, and the next flight begins with e times this closing speed. So all
-    flights of the pair together last at most ``2 s / (b- (1 - e sqrt(b+ / b-)))``. After the last flight, the two
-    vehicles move as one body, unless one stands or moves backwards.
-
-    Args:
-        touch: [TOUCH_WIDTH] state of the pair in contact (a row of ``Path.touch``); the function changes it in place.
-        e: coefficient of restitution.
-
+    Let the closing acceleration of the pair lie between ``b-`` and ``b+``, and let e be the restitution. A flight that
+    begins with separating speed s lasts at most ``2 s / b-``. This flight ends with a closing speed of at most
+    ``s sqrt(b+ / b-)``, and the next flight begins with e times this closing speed. So all flights of the pair together
+    last at most ``2 s / (b- (1 - e sqrt(b+ / b-)))``. After the last flight, the two vehicles move as one body, unless
+    one stands or moves backwards.
     """
     if touch[SOFTEST] == math.inf or touch[CREEP] > 0.0:
         touch[SINCE] = 0.0
@@ -423,16 +344,7 @@ def is_blurred(path: Path, motion: Motion, N: int, p: int, length: float) -> boo
     """Return whether the gap of pair ``p`` is too uncertain to simulate a further impact of the pair in this piece.
 
     The gap is too uncertain if its uncertainty exceeds the largest distance by which the gap can shrink within the
-    piece. A pair whose gap is too uncertain is treated as in contact from the start of the piece.
-
-    Args:
-        path: the worlds of the box that had the same impacts so far, with their state at the start of the piece (time
-            interval of constant command).
-        motion: motion of each vehicle in the present piece (time interval of constant command).
-        N: number of vehicles.
-        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        length: duration of the piece (time interval of constant command), s.
-
+    piece. Such a pair is treated as in contact from the start of the piece. ``N`` is the number of vehicles.
     """
     if motion.rest[p] != MOVES or motion.rest[p + 1] != MOVES:
         return False

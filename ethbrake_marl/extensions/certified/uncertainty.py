@@ -130,15 +130,13 @@ class Uncertainty:
     def moves_together(self) -> bool:
         """True if the friction is uncertain, so that one uncertain number changes several quantities.
 
-        If the friction is uncertain, the largest and smallest gaps and speeds may occur in worlds that are not corners
-        of the box.
+        The largest and smallest gaps and speeds may then occur in worlds that are not corners of the box.
         """
         return any(each.quantity == "friction" and each.half_width > 0.0 for each in self.intervals)
 
     def members(self, worlds: Worlds) -> Worlds:
         """Return the members of worlds at the alert, [n * M]: each world followed by the corners of its box.
 
-        The *box* of a world is the set of all combinations of values in the intervals around the world's quantities.
         The corners are in the order of binary numbers, with the first interval as the lowest bit (0: smallest value, 1:
         largest value). An interval of width 0 does not increase the number of corners. For friction, eight values
         replace the two ends of the interval, because friction changes all capacities together and harm may rise or fall
@@ -160,21 +158,15 @@ class Uncertainty:
 
     @staticmethod
     def interleaved(parts: list[Worlds]) -> Worlds:
-        """Merge M batches of n worlds each into one batch [n * M].
-
-        The merged batch begins with world 0 of every batch, then has world 1 of every batch, and so on.
+        """Merge M batches of n worlds each into one batch [n * M]: world 0 of every batch, then world 1 of every batch,
+        and so on.
         """
         order = np.arange(parts[0].n * len(parts)).reshape(len(parts), parts[0].n).T.ravel()
         return Worlds.concatenate(parts).take(order)
 
     def draw(self, worlds: Worlds, rng: np.random.Generator, *, corners: bool = False) -> Worlds:
-        """For each of ``worlds`` [n], draw one world from the box of intervals around this world.
-
-        Args:
-            worlds: the reported worlds, [n].
-            rng: generator of the random numbers.
-            corners: if True, draw one of the corners of the box; if False, draw uniformly from the whole box.
-
+        """For each of ``worlds`` [n], draw one world from its box: one of the corners if ``corners`` is True, otherwise
+        uniformly from the whole box.
         """
         sides = self._sides(worlds)
         shares = rng.random((len(sides), worlds.n))
@@ -183,10 +175,7 @@ class Uncertainty:
         return _placed(worlds, sides, lambda k: shares[k])
 
     def _sides(self, worlds: Worlds) -> list[_Side]:
-        """Return the uncertain numbers of ``worlds``, each with its smallest value [n] and its largest value [n].
-
-        Each uncertain number belongs to one quantity and one vehicle or pair (index from 0).
-        """
+        """Return the uncertain numbers of ``worlds``."""
         sides: list[_Side] = []
         for interval in self.intervals:
             every, name = _values(worlds, interval.quantity), interval.quantity
@@ -224,7 +213,7 @@ class Uncertainty:
 
 
 def parse_uncertainty(text: str) -> Uncertainty:
-    """Make an ``Uncertainty`` from a text that consists of entries ``quantity=half-width``, separated by commas, as in
+    """Make an ``Uncertainty`` from a text of entries ``quantity=half-width``, separated by commas, as in
     ``UNCERTAINTY_EXAMPLE``.
 
     A half-width is a number in the quantity's unit, or a percentage of its value. ``.vehicle_2`` or ``.pair_1`` after
@@ -251,9 +240,10 @@ def parse_uncertainty(text: str) -> Uncertainty:
 
 
 def _values(worlds: Worlds, quantity: str) -> Floats:
-    """Return the reported values of the quantity ``quantity``, which is one of ``QUANTITIES``. The shape of the result
-    is [n, P] for gaps, [n, 1] for friction, and [n, N] for every other quantity. Returned capacities are the capacities
-    on a dry road.
+    """Return the reported values of ``quantity``, one of ``QUANTITIES``: [n, P] for gaps, [n, 1] for friction,
+    otherwise [n, N].
+
+    Capacities are those on a dry road.
     """
     if quantity.endswith("_rate_mps3"):
         return np.asarray(getattr(worlds.vehicles, quantity), np.float64)
@@ -269,15 +259,11 @@ def _placed(worlds: Worlds, sides: list[_Side], share: Callable[[int], Floats | 
     """Return the reported worlds, changed so that each uncertain number has a given position in its interval.
 
     Without a V2X channel, a changed latency changes both the time at which the vehicle reacts and the time at which a
-    message arrives. With a V2X channel, a changed latency changes the time at which the vehicle reacts, but not the
-    time at which a message arrives. An uncertain friction limits the capacities of all vehicles together.
+    message arrives. With a V2X channel, a changed latency changes only the time at which the vehicle reacts. An
+    uncertain friction limits the capacities of all vehicles together.
 
-    Args:
-        worlds: the reported worlds, [n].
-        sides: the uncertain numbers and their smallest and largest values, as ``_sides`` returns them.
-        share: function from the index of an uncertain number to the position of this number in its interval; a position
-            is one number for all worlds, or [n]; 0 is the smallest value, 1 the largest.
-
+    ``share`` maps the index of an uncertain number in ``sides`` to the position of this number in its interval; a
+    position is one number for all worlds, or [n]; 0 is the smallest value, 1 the largest.
     """
     changed: dict[str, Any] = {}
     for k, (quantity, place, low, high) in enumerate(sides):
