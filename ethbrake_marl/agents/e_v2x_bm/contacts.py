@@ -145,7 +145,7 @@ def closing_speed_squared(
 
 @compiled
 def least_behind_braking(gap: float, v_l: float, a_l: float, v_f: float, tau: float) -> float:
-    """Return the result of ``least_to_spare_front`` (m/s2) if the leader brakes from the start; ``a_l`` is above 0."""
+    """Return ``least_to_spare_front`` (m/s2) if the leader brakes from the start; ``a_l`` is above 0."""
     coasting = contact_while_coasting(gap, v_l, a_l, v_f, tau)
     if coasting > TOUCH_SQUARED:
         return math.inf
@@ -164,7 +164,7 @@ def least_behind_braking(gap: float, v_l: float, a_l: float, v_f: float, tau: fl
 
 @compiled
 def least_behind_coasting(gap: float, v_l: float, a_l: float, v_f: float, lead: float) -> float:
-    """Return the result of ``least_to_spare_front`` (m/s2) if the follower brakes from the start; ``a_l`` is above 0."""
+    """Return ``least_to_spare_front`` (m/s2) if the follower brakes from the start; ``a_l`` is above 0."""
     if v_f == 0.0:
         return 0.0
     w = v_f - v_l
@@ -199,7 +199,7 @@ def least_to_spare_front(gap: float, v_l: float, a_l: float, onset_l: float, v_f
 
 @compiled
 def most_ahead_of_coasting(gap: float, v_l: float, v_f: float, a_f: float, tau: float) -> float:
-    """Return the result of ``most_to_spare_rear`` (m/s2) if the leader brakes from the start; ``a_f`` is above 0."""
+    """Return ``most_to_spare_rear`` (m/s2) if the leader brakes from the start; ``a_f`` is above 0."""
     reach = v_f * tau + stopping_distance(v_f, a_f)
     touching = gap == 0.0 and v_f == v_l  # in contact from the start: no impact
     if reach <= gap or touching:

@@ -194,7 +194,7 @@ class EV2XBM:
         self._mode, self._harm_count, self._horizon_s = mode, harm_count, horizon_s
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Choose the best deceleration a* of each world at the alert, and return the agent's memory, which contains a*."""
+        """Choose the best deceleration a* of each world at the alert, and return the agent's memory."""
         if self._mode == "pairwise":
             refuse_untold(alert, [vehicle], f"agent {self.name!r}", LOOK_AHEAD[:-1])  # needs no masses
             closed = optimise_pairwise(alert, vehicle)

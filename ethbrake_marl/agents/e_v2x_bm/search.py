@@ -244,8 +244,7 @@ def narrow_minima(line: Line, room: Room) -> int:
 
 @compiled(bare=True)
 def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, to: int) -> int:
-    """Narrow the interval [``low``, ``high``] (m/s2) around a local minimum of the harm to a width of at most 1e-9
-    m/s2.
+    """Narrow the interval from ``low`` to ``high`` (m/s2) around a local minimum of the harm to at most 1e-9 m/s2.
 
     Each round divides the interval on each side of the best deceleration so far into three parts. The best deceleration
     so far is sample ``to`` of ``found``. ``few`` is overwritten with intermediate results.
