@@ -60,7 +60,7 @@ class Watcher(Protocol):
     """
 
     def begun(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
-        """Return the watcher's new memory after episodes have started in ``rows``.
+        """Return the watcher's new memory after episodes have started in the worlds ``rows``.
 
         ``alert`` contains only the worlds in which episodes have started, at t = 0.
         """
@@ -90,7 +90,7 @@ class Guard(Protocol):
     """
 
     def begin(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
-        """Return the guard's new memory after episodes have started in ``rows``.
+        """Return the guard's new memory after episodes have started in the worlds ``rows``.
 
         ``alert`` contains only the worlds in which episodes have started, at t = 0. ``memory`` is None before the first
         episode.
@@ -269,7 +269,7 @@ class Engine:
         return new._now
 
     def _begin(self, rows: Ints, start: Start) -> None:
-        """Start new episodes in ``rows``, in place.
+        """Start new episodes in the worlds ``rows``, in place.
 
         ``start`` contains the worlds of the new episodes, at the alert and at the first decision. Scripts, guard and
         watchers get their memory for the new episodes. Messages that arrive before the first step are delivered, and
@@ -434,7 +434,7 @@ class Engine:
         return Step(reward, outcome, self.reward, {}), some_failed
 
     def _drive_own_grid(self, columns: Floats) -> Way:
-        """Advance the worlds to the last decision that a script makes within the step; return the results up to there."""
+        """Advance the worlds to the last decision that a script makes within the step; return the results so far."""
         way = self._own_grid.drive_step(self.state, self._now.rules, self._in_range(columns))
         self._change(memories=way.memories)
         self._now = self._now._replace(stops=way.stops)
@@ -731,7 +731,10 @@ class Engine:
 
     @property
     def observation(self) -> ObservationSpec:
-        """Observation that all learners have in common. Raises ``InvalidInput`` if learners observe different features."""
+        """Observation that all learners have in common.
+
+        Raises ``InvalidInput`` if learners observe different features.
+        """
         return common_observation(self.observations, self.scenario)
 
     @property
