@@ -83,9 +83,9 @@ def parse_spec(spec: str) -> AgentSpec:
 def split_names(text: str, is_one: Callable[[str], bool] = os.path.lexists) -> list[str]:
     """Split a comma-separated list of names, some of which may contain commas.
 
-    ``is_one`` is a function that returns whether a text with commas is a single name. By default ``is_one`` returns
-    whether a file or folder with this name exists. Each name is the longest beginning of the remaining text for which
-    ``is_one`` returns True; if there is no such beginning, the name ends at the next comma.
+    ``is_one`` returns whether a text with commas is a single name; by default, whether a file or folder with this name
+    exists. Each name is the longest beginning of the remaining text for which ``is_one`` returns True; if there is no
+    such beginning, the name ends at the next comma.
     """
     parts, names = text.split(","), list[str]()
     while parts:
@@ -123,9 +123,8 @@ def _policy_path(core: str) -> str:
 
 
 def _strip_around(spec: str) -> tuple[str, list[str]]:
-    """Split a specification into the agent and the list of its searches and shields.
-
-    If the path of a policy exists, the path is not split at a ``+``.
+    """Split a specification into the agent and the list of its searches and shields; do not split existing paths at a
+    ``+``.
     """
     core, around = spec, list[str]()
     while True:
@@ -156,15 +155,11 @@ def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
 
 
 def _is_meant_around(before: str, core: str, last: str) -> bool:
-    """Return whether an unknown word after a ``+`` is probably a misspelt search or shield.
+    """Return whether an unknown word after a ``+`` is probably a misspelt search or shield, not part of an argument or
+    path.
 
-    If the result is False, the unknown word is part of an argument or a path.
-
-    Args:
-        before: the specification up to the ``+``, without the ``+``.
-        core: the specification up to and including the unknown word.
-        last: the unknown word after the ``+``.
-
+    ``before`` is the specification up to the ``+``, without the ``+``. ``core`` is the specification up to and
+    including the unknown word, ``last``.
     """
     file = _python_file(core)
     if ".py" in last or (file and _IN_FILE.fullmatch(core, len(file))):

@@ -133,7 +133,7 @@ def unflat(arrays: Mapping[str, NDArray[Any]], place: str) -> Memory:
 def _check_kept(before: Memory, after: Memory, who: str) -> None:
     """Raise ``InvalidInput`` if a call of ``act`` changed the keys, shapes or dtypes of a memory.
 
-    Otherwise the engine could not replace the memory of single worlds when new episodes start.
+    After such a change the engine could not replace the memory of single worlds when new episodes start.
     """
     began, kinds = (map_memory(lambda array: (array.dtype, *array.shape[1:]), each) for each in (before, after))
     if began != kinds:

@@ -91,8 +91,7 @@ class OwnGrid:
         return way._replace(in_force=in_force)
 
     def drive_to_start(self, state: State, rules: Rules, rows: Ints, start_s: Floats) -> Way:
-        """Let the scripts make their decisions between the alert and the first step; return the results up to the last
-        of them.
+        """Let the scripts make their decisions between the alert and the first step; return the results (``Way``).
 
         Until the first step the learners and deciders coast, and the scripts observe that these vehicles coast. The new
         episodes, in the worlds ``rows`` of ``state``, are at the alert; they are moved, in place, to the time

@@ -162,8 +162,8 @@ class ProfileProblem(NamedTuple):
     def borne(self, profiles: Profiles) -> dict[HarmCount, Floats]:
         """Return the harm that each vehicle bears if the vehicles follow ``profiles``: {harm count: [n, N] m2/s2}.
 
-        The returned arrays have no column for an obstacle. An engine counts the same harm, to the last bit. Raises the
-        same errors as ``follow``.
+        The returned arrays have no column for an obstacle. An engine whose vehicles follow the same commands counts the
+        same harm, to the last bit. Raises the same errors as ``follow``.
         """
         obstacle, harms = int(np.isinf(self.mass[:, 0]).any()), {}
         for harm_count, pairs in zip(HARM_COUNTS, self.follow_pairs(profiles), strict=True):
@@ -237,8 +237,8 @@ def profile_problem(
         time_step_s: time between two decisions, s.
         others_mps2: constant commands of the other vehicles, [n, N] m/s2 (columns of ``vehicles`` are ignored); None:
             full braking.
-        deciders: the first decision is at the shortest latency of these vehicles (indices) or, if this latency has
-            already elapsed in a world, at the world's present time. None: ``vehicles``.
+        deciders: indices of vehicles; the first decision is at their shortest latency or, if this latency has already
+            elapsed in a world, at the world's present time. None: ``vehicles``.
         written_out: whether the arrays contain an obstacle, as an additional vehicle in front
             (``Worlds.with_obstacle``), even if no world has an obstacle. If some world has an obstacle, the arrays
             always contain one. Worlds without an obstacle then get an obstacle that no vehicle can reach.

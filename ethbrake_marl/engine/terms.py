@@ -61,7 +61,7 @@ class Terms:
         return 0.0 if self._objectives else self.params.harm
 
     def vector(self, step: Step, before: Ledger, state: State) -> Floats:
-        """Return the vector reward of a step, [n, N, K] for K components; 0 in episodes that had ended before the step."""
+        """Return the vector reward of a step, [n, N, K] for K components; 0 if the episode had ended before."""
         vector = vector_of(self.components, state.ledger.since(before), self.params.harm_count, step.terms)
         vector[state.ended & ~step.ended] = 0.0
         return vector
