@@ -69,8 +69,8 @@ class _Changing(metaclass=_WhatChanges):
 def training_environment(model: Any, name: str, *, ignore_wrappers: bool = False) -> Any:
     """Return this package's environment in which a Stable-Baselines3 model was trained, without wrappers around it.
 
-    ``model`` may be any policy. The result is None if it was not trained in an environment of this package. ``name`` is
-    the name of the agent in error messages. If ``ignore_wrappers`` is True, the wrappers are not checked.
+    ``model`` may be any policy; the result is None if the policy was not trained in an environment of this package.
+    ``name`` is the name of the agent in error messages. If ``ignore_wrappers`` is True, the wrappers are not checked.
 
     A model may be trained in several copies of an environment at the same time. Raises ``InvalidInput`` if a wrapper of
     any copy may change observations or actions, if the copies differ in their features or number of actions, or if the
@@ -119,8 +119,8 @@ def _was_normalised(model: Any) -> bool:
     """Return whether the data saved with a Stable-Baselines3 model show that training normalised the observations.
 
     The result is True if the last saved observation lies outside the observation space, or if the model also saved this
-    observation as it was before normalisation. The models of off-policy algorithms always save the latter, so for these
-    models only the observation space is checked.
+    observation as it was before normalisation. The models of off-policy algorithms always save the observation before
+    normalisation, so for these models only the observation space is checked.
     """
     if getattr(model, "_last_original_obs", None) is not None and not hasattr(model, "replay_buffer"):
         return True

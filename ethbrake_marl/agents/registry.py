@@ -181,8 +181,9 @@ def group_names() -> tuple[str, ...]:
 def agents_of_group(group: str) -> tuple[str, ...]:
     """Return the specifications of all agents in ``group``, a name from ``group_names``.
 
-    Extensions can add agents to the group ``ladder`` under a name ``ladder.WORD``. In the result the agents registered
-    under ``ladder`` itself come first; the others follow in alphabetical order of ``WORD``.
+    Extensions can add agents to a group: agents that are registered under a name ``ladder.WORD`` belong to the group
+    ``ladder``. In the result the agents registered under ``ladder`` itself come first; the others follow in
+    alphabetical order of ``WORD``.
     """
     return tuple(spec for name in sorted(GROUPS) if name.partition(".")[0] == group for spec in GROUPS[name])
 

@@ -123,8 +123,9 @@ def _policy_path(core: str) -> str:
 
 
 def _strip_around(spec: str) -> tuple[str, list[str]]:
-    """Split a specification into the agent and the list of its searches and shields; do not split existing paths at a
-    ``+``.
+    """Split a specification into the agent and the list of its searches and shields.
+
+    If the path of a policy exists, the path is not split at a ``+``.
     """
     core, around = spec, list[str]()
     while True:
@@ -155,11 +156,10 @@ def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
 
 
 def _is_meant_around(before: str, core: str, last: str) -> bool:
-    """Return whether an unknown word after a ``+`` is probably a misspelt search or shield, not part of an argument or
-    path.
+    """Return whether the unknown word ``last`` after a ``+`` is probably a misspelt search or shield.
 
-    ``before`` is the specification up to the ``+``, without the ``+``. ``core`` is the specification up to and
-    including the unknown word, ``last``.
+    If not, it is part of an argument or a path. ``before`` is the specification up to the ``+``, without the ``+``, and
+    ``core`` the specification up to and including ``last``.
     """
     file = _python_file(core)
     if ".py" in last or (file and _IN_FILE.fullmatch(core, len(file))):

@@ -443,9 +443,9 @@ class Engine:
     def _add_terms(self, step: Step, harm_before: Ledger | None, start: Worlds | None) -> None:
         """Add to the results of a step, in place, the reward terms that the compiled step cannot compute.
 
-        ``harm_before`` and ``start`` are the harm and the worlds before the step. ``harm_before`` is None if every
-        vehicle's reward counts the harm of the whole line; ``start`` is None if no reward term is computed from single
-        impacts.
+        ``harm_before`` is the harm of each pair from the alert to the beginning of the step; None if every vehicle's
+        reward counts the harm of the whole line. ``start`` are the worlds before the step; None if no reward term is
+        computed from single impacts.
         """
         impacts = self.state.impacts
         if impacts is not None and start is not None:
@@ -618,8 +618,8 @@ class Engine:
         Args:
             worlds: n worlds at any time of their episodes.
             ledger: harm and number of impacts of each pair since the episodes began; None: no harm and no impacts.
-            ended: whether each episode has ended, [n]; steps do not move such a world. None: an episode has ended if
-                its time is at or after the horizon.
+            ended: whether each episode has ended, [n]; steps do not move the world of an ended episode. None: an
+                episode has ended if its time is at or after the horizon.
 
         Raises ``InvalidInput`` if ``worlds`` has another number of worlds or vehicles than the engine, or if a term of
         the reward is computed from single impacts.
@@ -658,11 +658,10 @@ class Engine:
         return alert, new.moment()
 
     def branch(self, state: State) -> Engine:
-        """Return a new engine whose episodes continue from ``state``, under the same guard. This engine does not
-        change.
+        """Return a new engine whose episodes continue from ``state``, under the same guard.
 
-        Raises ``InvalidInput`` if the reward is shaped, because the potentials of shaping depend on more than
-        ``state``.
+        This engine does not change. Raises ``InvalidInput`` if the reward is shaped, because the potentials of shaping
+        depend on more than ``state``.
         """
         if self.reward.shaping > 0.0:
             raise InvalidInput(f"branch: the reward has shaping = {self.reward.shaping:g}; branch needs shaping = 0")

@@ -104,9 +104,9 @@ def _minimise(
 ) -> Floats:
     """Return, for each of the m worlds with the indices ``rows``, the three results of ``search_line``, [3, m].
 
-    The arguments are as in ``optimise_coupled``. ``told`` are the same worlds with other braking capacities, because
-    the closed form assumes full braking: the capacity of each braking vehicle except ``vehicle`` is replaced by the
-    deceleration in ``command`` [n, N] m/s2.
+    ``command`` [n, N] m/s2 are the constant commands of all vehicles; the controlled vehicle's column is ignored.
+    ``told`` are the same worlds with other braking capacities, because the closed form assumes full braking: the
+    capacity of each braking vehicle except ``vehicle`` is replaced by the deceleration in ``command``.
     """
     v = worlds.vehicles
     lines = (

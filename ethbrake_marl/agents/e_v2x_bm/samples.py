@@ -77,7 +77,7 @@ def bound_cells(samples: Samples, n: int, bounds: Floats) -> None:
     """Estimate the least harm in each interval between two neighbouring samples; write it to ``bounds`` [n - 1], m2/s2.
 
     The first ``n`` samples are used; they must be sorted by deceleration. If the harm falls towards an interval from
-    one side, it is assumed to go on falling inside the interval, at most ``STEEPER`` times as steeply as outside.
+    one side, the harm is assumed to go on falling inside the interval, at most ``STEEPER`` times as steeply as outside.
     """
     before, slope = 0.0, _slope(samples, 0)
     for k in range(n - 1):
