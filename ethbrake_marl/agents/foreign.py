@@ -1,7 +1,8 @@
 """Agents that drive with policies of other libraries.
 
-Shared arguments: ``name`` is the name of the agent in error messages; ``seen`` [n, F] are the observations in all n
-worlds, and ``state`` is the policy's memory for all n worlds; ``steps`` [n] are the numbers of steps so far.
+Arguments that several functions share: ``name`` is the name of the agent in error messages; ``seen`` [n, F] are the
+observations in all n worlds, and ``state`` is the policy's memory for all n worlds; ``steps`` [n] are the numbers of
+steps so far.
 """
 
 from __future__ import annotations
@@ -46,8 +47,8 @@ def adapt_policy(policy: Any, name: str, features: int, initial_state: Begin | N
 
     The first function is ``(observations, state) -> (actions, new state)``. The second function is ``n -> initial
     state``, for n episodes; for a policy without a memory, None is returned in its place. ``features`` is the number of
-    features in one observation. ``initial_state`` is the second function, for a function or torch module with a memory;
-    otherwise None. Raises ``InvalidInput`` for a policy of any other kind.
+    features in one observation. For a function or torch module with a memory, ``initial_state`` is a function ``n ->
+    initial state``; for all other policies it is None. Raises ``InvalidInput`` for a policy of any other kind.
     """
     if isinstance(policy, str | os.PathLike):
         policy = _open_onnx(Path(policy), name)
@@ -221,8 +222,8 @@ def policy_agent(
             - a torch module, called without gradients;
             - an ONNX session, or the path of an ``.onnx`` file.
         name: name of the agent in tables and messages; None: the name of the function or class.
-        scenario: scenario (or its name) in which the policy was trained; it determines what the policy observes. None:
-            unknown.
+        scenario: scenario (or its name) in which the policy was trained; the scenario determines what the policy
+            observes. None: unknown.
         observation: features that the policy observes, instead of the scenario's observation (see
             ``choose_observation``). None: the scenario's observation. If ``scenario`` is also None: the observation of
             the model's training environment or of the policy, if known; otherwise the default observation.

@@ -113,7 +113,7 @@ def search_line(line: Line, room: Room, breakpoints: Floats, capacity: float, ou
 
 @compiled(apart=True, bare=True)
 def look_evenly(line: Line, room: Room, breakpoints: Floats, capacity: float) -> int:
-    """Step 1: simulate the grid and the ``breakpoints`` [CANDIDATES] (m/s2), up to the deceleration ``capacity``.
+    """Step 1: simulate the grid, which ends at ``capacity``, and the ``breakpoints`` [CANDIDATES] (m/s2).
 
     The samples of the grid are written to ``room.one``. The samples of grid and breakpoints together are written to
     ``room.two``, sorted by deceleration.
