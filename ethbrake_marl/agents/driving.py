@@ -1,4 +1,16 @@
-"""Let agents drive through whole episodes. Evaluations and rollouts use this module."""
+"""Let agents drive through whole episodes. Evaluations and rollouts use this module.
+
+Arguments that several functions share:
+
+- ``worlds``: n worlds at the alert.
+- ``agent``: an agent that drives ``vehicle``, or a team, whose attribute ``drivers`` states which vehicles it drives.
+- ``vehicle``: index of the vehicle that the agent drives (0 = front); None for a team.
+- ``scenario``: scenario whose scripts drive the other vehicles.
+- ``watched_by``: observers, whose method ``see`` is called after every step.
+- ``summed``: names of reward terms to sum over each episode.
+
+Functions that run episodes raise ``PhysicsError``, which names the worlds, if the physics failed in some worlds.
+"""
 
 from __future__ import annotations
 
@@ -37,14 +49,8 @@ class Episodes:
     ) -> Episodes:
         """Let an engine run from the first decision until the episodes in all worlds have ended.
 
-        Args:
-            engine: an engine that ``episode_engine`` has made and that has not made a step yet.
-            worlds: the engine's worlds at the alert; the first call of each observer gets these worlds as ``before``.
-            watched_by: observers (``Watch``), whose method ``see`` is called after every step.
-            summed: names of reward terms to sum over each episode.
-
-        Raises ``PhysicsError``, which names the worlds, if the physics failed in some worlds.
-
+        ``engine`` was made by ``episode_engine`` and has not made a step yet. The first call of each observer gets
+        ``worlds``, the engine's worlds at the alert, as ``before``.
         """
         at_rest = np.zeros(worlds.n, np.bool_)
         terms: dict[str, Floats] = {}
@@ -88,11 +94,7 @@ class Watch(Protocol):
 def script_agents(scenario: Scenario, *, except_for: int | Collection[int] | None = None) -> dict[int, Agent]:
     """Return a mapping from the index of each scripted vehicle of a scenario (0 = front) to its agent.
 
-    Args:
-        scenario: the scenario.
-        except_for: index or indices of vehicles that the result must not contain; None: the result contains all
-            scripted vehicles.
-
+    ``except_for`` is the index or indices of vehicles to leave out.
     """
     left_out = (except_for,) if isinstance(except_for, int) else except_for or ()
     return {i: make_role(scenario, i) for i in scenario.scripts if i not in left_out}
@@ -106,17 +108,10 @@ def episode_engine(
     The agents decide for the first time as soon as the latency of one controlled vehicle has elapsed, and then at every
     time step, like learners. The engine executes the agents' commands without rounding them. If the team has a shield,
     the agents only propose commands, and the engine treats the controlled vehicles as learners. An agent that looks
-    ahead knows the scripts, and assumes that other controlled vehicles brake fully.
-
-    Args:
-        worlds: n worlds at the alert.
-        agent: an agent that drives ``vehicle``, or a team, whose attribute ``drivers`` states which vehicles it drives.
-        scenario: scenario whose scripts drive the other vehicles.
-        vehicle: index of the vehicle that the agent drives (0 = front); None for a team.
-        reward: reward whose terms the engine computes in every step.
+    ahead knows the scripts, and assumes that other controlled vehicles brake fully. The engine computes the terms of
+    ``reward`` in every step.
 
     Raises ``InvalidInput`` if ``agent`` does not drive every learner of the scenario.
-
     """
     team = agent if isinstance(agent, Team) else Team.of(agent, () if vehicle is None else (vehicle,))
     drivers = team.drivers
@@ -151,17 +146,8 @@ def drive(
 ) -> Episodes:  # fmt: skip
     """Let an agent or a team drive in every world from the alert (t = 0) to the end of its episode.
 
-    Args:
-        worlds: n worlds at the alert.
-        agent: an agent that drives ``vehicle``, or a team, whose attribute ``drivers`` states which vehicles it drives.
-        scenario: scenario whose scripts drive the other vehicles.
-        vehicle: index of the vehicle that the agent drives (0 = front); None for a team.
-        watched_by: observers (``Watch``), whose method ``see`` is called after every step.
-        summed: names of reward terms to sum over each episode; the terms have the default settings of ``RewardParams``.
-
-    Raises ``PhysicsError``, which names the worlds, if the physics failed in some worlds; a new call without these
-    worlds succeeds.
-
+    The terms in ``summed`` have the default settings of ``RewardParams``. After a ``PhysicsError``, a new call without
+    the worlds that it names succeeds.
     """
     reward: Reward = {"harm": 1.0} | dict.fromkeys(summed, 1.0) if summed else "harm"
     engine = episode_engine(worlds, agent, scenario, vehicle, reward)
@@ -169,14 +155,9 @@ def drive(
 
 
 def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_mps2: Floats) -> Worlds:
-    """Pass the engine's last step to the observers; return the worlds after the step.
+    """Pass the engine's last step, with the vehicles' commands, to the observers; return the worlds after the step.
 
-    Args:
-        watched_by: the observers; without observers, the function does nothing and returns ``before``.
-        before: the worlds at the start of the step.
-        engine: the engine after the step.
-        command_mps2: command of every vehicle during the step, [n, N] m/s2.
-
+    Without observers, the function does nothing and returns ``before``.
     """
     if not watched_by:
         return before
@@ -188,11 +169,9 @@ def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_m
 
 
 def record_commands(agent: Driver, worlds: Worlds, scenario: Scenario, vehicle: int, steps: int) -> Floats:
-    """Return the commands of ``agent`` for ``vehicle`` (0 = front) in the first ``steps`` steps, [n, steps] m/s2.
+    """Return the commands of ``agent`` for ``vehicle`` in the first ``steps`` steps, [n, steps] m/s2.
 
-    ``worlds`` are n worlds at the alert. If an episode has fewer than ``steps`` steps, the last command of the episode
-    is repeated in the remaining steps. Raises ``PhysicsError``, which names the worlds, if the physics failed in some
-    worlds.
+    If an episode has fewer than ``steps`` steps, the last command of the episode is repeated in the remaining steps.
     """
     engine = episode_engine(worlds, agent, scenario, vehicle)
     commands = write_down(engine, steps, lambda: engine.wanted_mps2[:, [vehicle]])[:, :, 0]
@@ -204,14 +183,8 @@ def record_commands(agent: Driver, worlds: Worlds, scenario: Scenario, vehicle: 
 def write_down(engine: Engine, steps: int, column: Callable[[], Floats]) -> Floats:
     """Let an engine run to the end of all episodes; record K numbers per world after each of the first ``steps`` steps.
 
-    Args:
-        engine: an engine made by ``episode_engine``.
-        steps: number of steps for which numbers are recorded.
-        column: function without arguments that returns the K numbers to record for each of n worlds, [n, K].
-
-    Returns the recorded numbers of the n worlds, [n, steps, K]. The numbers of a world after the end of its episode are
-    NaN. Raises ``PhysicsError``, which names the worlds, if the physics failed in some worlds.
-
+    ``engine`` was made by ``episode_engine``. ``column`` returns the K numbers to record for each of n worlds, [n, K].
+    Returns the recorded numbers, [n, steps, K]. The numbers of a world after the end of its episode are NaN.
     """
     columns = np.full((steps, *column().shape), np.nan)
     while not engine.ended.all():

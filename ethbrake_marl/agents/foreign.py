@@ -1,4 +1,9 @@
-"""Agents that drive with policies of other libraries."""
+"""Agents that drive with policies of other libraries.
+
+Arguments that several functions share: ``name`` is the name of the agent in error messages; ``seen`` [n, F] are the
+observations in all n worlds, and ``state`` is the policy's memory for all n worlds; ``steps`` [n] are the numbers of
+steps so far.
+"""
 
 from __future__ import annotations
 
@@ -38,19 +43,12 @@ _KINDS = (
 
 
 def adapt_policy(policy: Any, name: str, features: int, initial_state: Begin | None) -> tuple[Infer, Begin | None]:
-    """Return two functions that call the policy: one returns actions and new memory, one returns the initial memory.
+    """Return two functions that call a policy of a kind that ``policy_agent`` accepts.
 
-    Args:
-        policy: a policy of a kind that ``policy_agent`` accepts.
-        name: name of the agent in error messages.
-        features: number of features in one observation.
-        initial_state: for a function or torch module with a memory: function that returns the memory at the start of n
-            episodes; None: ``policy`` has no memory, or is a model with ``predict``.
-
-    The first returned function is ``(observations, state) -> (actions, new state)``. The second returned function is
-    ``n -> initial state``, for n episodes; for a policy without a memory, None is returned in its place. Raises
-    ``InvalidInput`` if ``policy`` is of a kind that ``policy_agent`` does not accept.
-
+    The first function is ``(observations, state) -> (actions, new state)``. The second function is ``n -> initial
+    state``, for n episodes; for a policy without a memory, None is returned in its place. ``features`` is the number of
+    features in one observation. For a function or torch module with a memory, ``initial_state`` is a function ``n ->
+    initial state``; for all other policies it is None. Raises ``InvalidInput`` for a policy of any other kind.
     """
     if isinstance(policy, str | os.PathLike):
         policy = _open_onnx(Path(policy), name)
@@ -83,12 +81,6 @@ def _ask_model(model: Any, name: str, features: int) -> tuple[Infer, Begin | Non
 
     ``predict`` is called once for two worlds and once for three worlds: if ``predict`` also returns a memory, the
     shapes of the memory's arrays show which axis has one entry per world.
-
-    Args:
-        model: the model.
-        name: name of the agent in error messages.
-        features: number of features in one observation.
-
     """
 
     def predict(seen: Observations, **memory: Any) -> tuple[Any, State]:
@@ -241,8 +233,8 @@ def policy_agent(
         clip: True: an action is clipped to [-1, 1], and an index of a discrete action to the valid range. False: an
             action or index outside its range is an error.
         appended: features that were appended to each observation in training, as in ``make_sb3_vec_env``: ``number``
-            (the learner's number) or ``state`` (the true state of the line). If you pass ``appended``, also pass
-            ``scenario``. None: the features of the model's training environment, if known; otherwise no features.
+            (the learner's number) or ``state`` (the true state of the line); needs ``scenario``. None: the features of
+            the model's training environment, if known; otherwise no features.
         ignore_wrappers: whether to accept a model if wrappers of its training environment may have changed observations
             or actions, if its actions have bounds other than -1 and 1, or if its ``VecNormalize`` statistics are
             missing.
@@ -367,14 +359,7 @@ class PolicyAgent:
         return self.weights_sha256()
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Return the agent's memory before the first decision, which contains the policy's initial memory.
-
-        Args:
-            alert: n worlds at the alert.
-            vehicle: index of the controlled vehicle (0 = front).
-            scripts: the scripts of the line; the agent does not use them.
-
-        """
+        """Return the agent's memory before the first decision, which contains the policy's initial memory."""
         n, state = alert.n, None
         try:
             if self._initial_state is not None:
@@ -409,20 +394,14 @@ class PolicyAgent:
             raise AgentFailed(self.name, k, reason) from error
 
     def _answer(self, seen: Observations, state: State, rows: Ints) -> tuple[NDArray[Any], State]:
-        """Return the policy's unchecked actions, and its new memory, for the worlds with the indices ``rows``.
-
-        ``seen`` [n, F] are the observations in all n worlds; ``state`` is the policy's memory for all n worlds.
-        """
+        """Return the policy's unchecked actions, and its new memory, for the worlds with the indices ``rows``."""
         if self._initial_state is None:
             return to_array(self._infer(seen[rows], None)[0]), None
         action, state = self._infer(seen[rows], take_memory(state, rows))
         return to_array(action), checked_memory(state, len(rows))
 
     def _find_failing(self, seen: Observations, state: State) -> int | None:
-        """Return the index of a world for which the policy fails when called for this world alone; None: no such world.
-
-        ``seen`` [n, F] are the observations in all n worlds; ``state`` is the policy's memory for all n worlds.
-        """
+        """Return the index of a world for which the policy fails when called for this world alone, or None."""
 
         def fails(rows: Ints) -> bool:
             try:
@@ -443,8 +422,7 @@ class PolicyAgent:
     def _checked(self, action: NDArray[Any], seen: Observations, worlds: Worlds, steps: Ints) -> Floats:
         """Check the policy's output ``action``, and return the actions as an array [n] in [-1, 1].
 
-        Raises ``AgentFailed`` if ``action`` has a wrong shape or contains an invalid value. ``seen``, ``worlds`` and
-        ``steps`` [n] (number of steps so far) are used only in the error message.
+        Raises ``AgentFailed`` if ``action`` has a wrong shape or contains an invalid value.
         """
         n, what = worlds.n, f"returned {action.dtype} of shape {action.shape} for observations of shape {seen.shape}"
         if self._actions is not None:

@@ -69,15 +69,12 @@ class _Changing(metaclass=_WhatChanges):
 def training_environment(model: Any, name: str, *, ignore_wrappers: bool = False) -> Any:
     """Return this package's environment in which a Stable-Baselines3 model was trained, without wrappers around it.
 
-    Args:
-        model: any policy. The result is None if the policy was not trained in an environment of this package.
-        name: name of the agent in error messages.
-        ignore_wrappers: True: the wrappers of the training environment are not checked.
+    ``model`` may be any policy; the result is None if the policy was not trained in an environment of this package.
+    ``name`` is the name of the agent in error messages. If ``ignore_wrappers`` is True, the wrappers are not checked.
 
     A model may be trained in several copies of an environment at the same time. Raises ``InvalidInput`` if a wrapper of
     any copy may change observations or actions, if the copies differ in their features or number of actions, or if the
     statistics of ``VecNormalize`` are missing.
-
     """
     statistics = normalisation(model)
     if statistics is None and not ignore_wrappers and _was_normalised(model):
@@ -122,8 +119,8 @@ def _was_normalised(model: Any) -> bool:
     """Return whether the data saved with a Stable-Baselines3 model show that training normalised the observations.
 
     The result is True if the last saved observation lies outside the observation space, or if the model also saved this
-    observation as it was before normalisation. The models of off-policy algorithms always save the observation as it
-    was before normalisation, so for these models only the observation space is checked.
+    observation as it was before normalisation. The models of off-policy algorithms always save the observation before
+    normalisation, so for these models only the observation space is checked.
     """
     if getattr(model, "_last_original_obs", None) is not None and not hasattr(model, "replay_buffer"):
         return True
@@ -135,8 +132,7 @@ def _was_normalised(model: Any) -> bool:
 def _layers(env: Any) -> Iterator[Any]:
     """Yield ``env``, then all wrappers and environments inside it, from the outside in.
 
-    If there are several copies of an environment, all of them are yielded. Nothing inside an environment of this
-    package is yielded.
+    All copies of an environment are yielded, but nothing inside an environment of this package.
     """
     yield env
     for name in [] if _is_ours(env) else _INSIDE:
@@ -148,14 +144,8 @@ def _layers(env: Any) -> Iterator[Any]:
 def _look(layer: Any, name: str) -> tuple[str | None, list[Any]]:
     """Return the class in ``layer`` that may change observations or actions, and this package's environments in it.
 
-    Args:
-        layer: a wrapper or environment that ``_layers`` yields.
-        name: name of the agent in error messages.
-
-    Returns two values. The first value is the name of a class that may change observations or actions, or None. The
-    second value is a list of environments of this package: the layer itself, or environments that the layer runs in
-    other processes.
-
+    The class is given by its name; None if there is none. The environments are the layer itself, or environments that
+    the layer runs in other processes.
     """
     if changes(type(layer)):
         modifier = _own(layer).get("modifier_class", type(layer))  # the modifier of a SuperSuit wrapper

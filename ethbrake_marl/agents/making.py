@@ -39,8 +39,7 @@ def make_agent(
             ``my_file.py`` with all your rights, and calls its function ``make_agent`` with the arguments of a factory
             (see ``register_agent``), or without arguments if the function has no parameters.
         scenario: scenario, its name, or the path of its file; teams and wrappers need a scenario.
-        harm_count: harm that an optimising agent minimises: ``first`` (each pair's first impact) or ``total`` (all
-            impacts).
+        harm_count: harm that an optimising agent minimises: ``first`` (first-impact harm) or ``total`` (total harm).
         horizon_s: time after the alert until which an agent looks ahead, s; None: the scenario's horizon, or 8 s.
         most_candidates: a search tries at most this number of plans; a small number makes a quick trial possible. None:
             no limit.
@@ -113,11 +112,10 @@ def make_role(scenario: Scenario, vehicle: int, *, most_candidates: int | None =
 
 
 def find_entry(spec: AgentSpec | str) -> Entry:
-    """Return the registry entry of an agent.
+    """Return the registry entry of an agent, such as ``planner:64`` or ``ppo``.
 
-    ``spec`` is a specification such as ``planner:64`` or ``ppo``, either the text or an ``AgentSpec``. Raises
-    ``UnknownName`` for an unknown agent, with a similar name as a suggestion. Raises ``InvalidInput`` for an argument
-    or policy that the agent does not accept.
+    Raises ``UnknownName`` for an unknown agent, with a similar name as a suggestion. Raises ``InvalidInput`` for an
+    argument or policy that the agent does not accept.
     """
     written = parse_spec(spec) if isinstance(spec, str) else spec
     if written.file is not None:
@@ -144,14 +142,8 @@ def find_entry(spec: AgentSpec | str) -> Entry:
 def _make(entry: Entry, argument: str | None, settings: AgentSettings, *inside: Driver) -> Driver:
     """Make an agent or a team from its registry entry, and check the result.
 
-    If a factory from outside this package raises an error, ``_make`` raises ``InvalidInput`` in its place.
-
-    Args:
-        entry: the registry entry of the agent or wrapper to make.
-        argument: text after the colon in the specification; None if there is no colon.
-        settings: settings for the factory (the function that makes the agent).
-        inside: for a shield or a search: the agent or team to wrap; for an agent: nothing.
-
+    The arguments are as in ``Entry.call``. If a factory from outside this package raises an error, ``_make`` raises
+    ``InvalidInput`` in its place.
     """
     try:
         driver = entry.call(argument, settings, *inside)

@@ -39,12 +39,10 @@ class Knowledge(tuple[Source, ...]):
     def of(cls, *agents: object, also: Source | None = None) -> Knowledge:
         """Return the combined knowledge of several agents or teams.
 
-        Args:
-            agents: agents or teams; for an agent without an attribute ``knows``, the source is ``UNSTATED``.
-            also: source of knowledge that a shield or search around the agents adds; None: no further source.
+        For an agent without an attribute ``knows``, the source is ``UNSTATED``. ``also`` is a source of knowledge that
+        a shield or search around the agents adds.
 
         Raises ``InvalidInput`` if the attribute ``knows`` of an agent contains an unknown source.
-
         """
         known = set() if also is None else {also}
         for agent in agents:
@@ -108,12 +106,8 @@ class Agent(Script, Protocol):
 def check_agent(agent: object, where: str, *, alone: bool = True) -> None:
     """Raise ``InvalidInput`` unless the object ``agent`` implements the interface ``Agent``.
 
-    Args:
-        agent: any object.
-        where: beginning of the error message, for example ``agent 'mine'``.
-        alone: True: only an agent for one vehicle is accepted. False: a team and an agent behind a shield are accepted
-            as well.
-
+    The error message begins with ``where``, for example ``agent 'mine'``. If ``alone`` is False, a team and an agent
+    behind a shield are accepted as well.
     """
     if not isinstance(agent, Agent) and (alone or not isinstance(agent, Team | Shielding)):
         missing = [what for what in ("name", "act") if not hasattr(agent, what)]
@@ -174,10 +168,7 @@ def fixed_commands(
 
 
 class ByPolicy:
-    """Base class of agents whose attribute ``policy`` is a trained policy, or another agent that they wrap.
-
-    A subclass sets ``policy``. The base class reads hash and manifest from ``policy``.
-    """
+    """Base class of agents whose attribute ``policy`` is a trained policy, or another agent that they wrap."""
 
     policy: Any  # the trained policy, or the wrapped agent
 
@@ -202,16 +193,12 @@ def policy_sha256(agent: object) -> str | None:
 
 
 class AgentAround(ByPolicy):
-    """Base class of agents that wrap another agent. The wrapped agent is the attribute ``policy``.
+    """Base class of agents that wrap another agent, the attribute ``policy``.
 
     By default ``begin`` and ``act`` call the wrapped agent; a subclass overrides one or both of them. The class
     attribute ``adds`` is a source of knowledge that the subclass uses in addition to the wrapped agent's sources, for
-    example ``Source.MODEL``; None: no further source.
-
-    Args:
-        policy: the agent to wrap.
-        name: name of the new agent; None: the name of the wrapped agent.
-
+    example ``Source.MODEL``; None: no further source. If ``name`` is None, the new agent has the name of the wrapped
+    agent.
     """
 
     adds: ClassVar[Source | None] = None
@@ -222,7 +209,7 @@ class AgentAround(ByPolicy):
 
     @property
     def knows(self) -> Knowledge:
-        """Sources of knowledge of the wrapped agent, together with the source in the attribute ``adds``."""
+        """Sources of knowledge of the wrapped agent, together with the source ``adds``."""
         return Knowledge.of(self.policy, also=self.adds)
 
     @property
@@ -231,14 +218,7 @@ class AgentAround(ByPolicy):
         return getattr(self.policy, "time_step_s", None)
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Return the wrapped agent's initial memory.
-
-        Args:
-            alert: n worlds at the alert.
-            vehicle: index of the controlled vehicle (0 = front).
-            scripts: mapping from the index of each scripted vehicle to its script.
-
-        """
+        """Return the wrapped agent's initial memory."""
         return begin_script(self.policy, alert, vehicle, scripts)
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
@@ -260,7 +240,7 @@ class Shielding(Protocol):
         """Return a team that drives ``vehicles`` (indices, 0 = front) behind this shield."""
 
     def guard(self, engine: Engine, policies: Mapping[int, Agent]) -> Guard:
-        """Return the guard: the object that checks commands in ``engine`` for the shield.
+        """Return the guard, which checks commands in ``engine``.
 
         ``policies`` maps the index of each learner to the agent that proposes the learner's commands.
         """

@@ -1,5 +1,10 @@
 """Four registries: agents; shields and searches; variants of agents and shields; and groups of agents.
 
+A *wrapper* is a shield or a search around an agent. In an agent specification, a wrapper stands after a ``+``:
+``ppo+step`` is the agent ``ppo`` behind the shield ``step``. A *variant* of an agent or shield is the last word of a
+specification, as in ``e_v2x_bm:estimated`` or ``episode:pairwise:estimated``. Each variant has a function of its own,
+which makes the agent or shield.
+
 The registered names are entry points (``pyproject.toml``), which are loaded on first use (``ethbrake_marl.registry``).
 Therefore this module need not import policies, searches and shields, which import this module.
 """
@@ -20,11 +25,7 @@ from ethbrake_marl.scenario.roles import ScriptSpec
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """Registry entry of an agent or of a wrapper. A wrapper is a shield or a search around an agent.
-
-    In an agent specification, a wrapper stands after a ``+``: ``ppo+step`` is the agent ``ppo`` behind the shield
-    ``step``.
-    """
+    """Registry entry of an agent or of a wrapper."""
 
     name: str  # plain name, without argument
     form: str  # syntax, such as "name[:ARGUMENT][@POLICY]"; no argument without ":", no policy without "@"
@@ -44,11 +45,7 @@ class Entry:
 
     @property
     def whole_form(self) -> str:
-        """``form`` followed by each registered variant in brackets, for example ``e_v2x_bm[:pairwise][:estimated]``.
-
-        A variant, such as ``:estimated``, is the last word of a specification. Each variant has a function of its own,
-        which makes the agent or wrapper.
-        """
+        """``form`` followed by each registered variant in brackets, for example ``e_v2x_bm[:pairwise][:estimated]``."""
         return self.form + "".join(f"[:{variant}]" for variant in variants_of(self.name))
 
     @property
@@ -72,12 +69,9 @@ class Entry:
     def call(self, argument: str | None, settings: AgentSettings, *inside: Driver) -> Driver:
         """Make the agent or wrapper.
 
-        Args:
-            argument: text after the first colon, such as ``pairwise``; None: no argument. If the last word of
-                this text is a registered variant (``pairwise:estimated``), the variant's function is called.
-            settings: settings for the function that makes the agent or wrapper.
-            inside: for a wrapper: the agent or team to wrap; for an agent: nothing.
-
+        ``argument`` is the text after the first colon, such as ``pairwise``; None: no argument. If the last word of
+        this text is a registered variant (``pairwise:estimated``), the variant's function is called. ``inside`` is the
+        agent or team to wrap; nothing if the entry is an agent.
         """
         make: Any = self.make
         before, _, last = (argument or "").rpartition(":")
@@ -107,10 +101,7 @@ def agent_entries() -> tuple[Entry, ...]:
 
 
 def _with_variants(entry: Entry) -> Entry:
-    """Return ``entry`` with its variants added to ``form`` and ``about``, without variants that fail to load.
-
-    For example, the form ``e_v2x_bm`` becomes ``e_v2x_bm[:estimated]``, and the description of the variant is added.
-    """
+    """Return ``entry`` with its variants added to ``form`` and ``about``, without variants that fail to load."""
     usable = VARIANTS.usable()
     for word in variants_of(entry.name):
         if variant := usable.get(f"{entry.name}.{word}"):
@@ -158,28 +149,21 @@ def shield_modes() -> dict[str, Any]:
 
 
 def variants_of(name: str) -> tuple[str, ...]:
-    """Return the variants of the agent or shield called ``name``, for example ``("estimated",)``.
-
-    In a specification the variant is the last word, as in ``episode:pairwise:estimated``. Each variant has a function
-    of its own, which makes the agent or shield.
-    """
+    """Return the variants of the agent or shield called ``name``, for example ``("estimated",)``."""
     keys = (key.rpartition(".") for key in VARIANTS)
     return tuple(variant for of, _, variant in keys if of == name)
 
 
 def is_variant(form: str) -> bool:
-    """Return whether the last word of ``form`` is a registered variant, as in ``step:estimated``.
-
-    ``form`` is the name of an agent or shield with its argument and variant, but without a ``+``.
-    """
+    """Return whether the last word of ``form``, such as ``step:estimated``, is a registered variant."""
     return form.rpartition(":")[2] in variants_of(form.partition(":")[0])
 
 
 def settings_needed(shield: str | None) -> Mapping[str, object]:
     """Return the names of the settings that a shield requires, with examples: ``{"uncertainty": "gaps_m=0.5"}``.
 
-    ``shield`` is a shield with its argument, such as ``robust`` or ``episode:pairwise``, or None. The result is empty
-    if ``shield`` is None or has a variant, such as ``robust:estimated``.
+    ``shield`` may have an argument, such as ``episode:pairwise``. The result is empty if ``shield`` is None or has a
+    variant, such as ``robust:estimated``.
     """
     return {} if shield is None or is_variant(shield) else around_entry(shield).needs
 
@@ -197,8 +181,8 @@ def group_names() -> tuple[str, ...]:
 def agents_of_group(group: str) -> tuple[str, ...]:
     """Return the specifications of all agents in ``group``, a name from ``group_names``.
 
-    Extensions can add agents to a group. For example, agents that are registered under a name ``ladder.WORD`` belong to
-    the group ``ladder``. In the result the agents registered under ``ladder`` itself come first; the others follow in
+    Extensions can add agents to a group: agents that are registered under a name ``ladder.WORD`` belong to the group
+    ``ladder``. In the result the agents registered under ``ladder`` itself come first; the others follow in
     alphabetical order of ``WORD``.
     """
     return tuple(spec for name in sorted(GROUPS) if name.partition(".")[0] == group for spec in GROUPS[name])
@@ -219,15 +203,15 @@ def register_agent(
     refers to the factory, or to a ``Part(factory, about=...)``, which can have further arguments of ``register_agent``.
 
     Args:
-        name: name of the agent as users write it, such as ``idm``, without the colon and the argument after it.
+        name: name of the agent, such as ``idm``, without the colon and the argument after it.
         factory: function ``factory(argument, settings)`` that makes the agent. ``argument`` is the text after the colon
             of the specification, or None; ``settings`` is an ``AgentSettings``.
         about: description in one line, which ``ethbrake agent list`` shows.
         knows: sources of knowledge (``Source``) that the agent uses while it drives; ``ethbrake agent list`` shows
-            these sources.
+            them.
         form: syntax of the agent's specification, which ``ethbrake agent list`` shows; None: ``name[:ARGUMENT]``. If
-            ``form`` contains no ``:``, the agent accepts no argument. If ``form`` contains no ``@``, the agent accepts
-            no policy.
+            ``form`` contains no ``:``, the agent accepts no argument. If ``form`` contains no ``@``, it accepts no
+            policy.
         takes_policy: whether the specification ``name@policy`` is allowed; the factory finds the policy in
             ``AgentSettings.policy``.
 
@@ -297,8 +281,8 @@ def register_variant(key: str, make: Factory | Wrapper, *, about: str = "a varia
 
     Args:
         key: ``name.variant``; for example, ``step.mine`` registers ``step:mine``, a variant of the shield ``step``.
-        make: function that is called in place of the factory or wrapper ``name``, with the same arguments. The
-            ``argument`` that the function ``make`` receives does not contain the name of the variant.
+        make: function that is called in place of the factory or wrapper ``name``, with the same arguments. Its
+            ``argument`` does not contain the name of the variant.
         about: description in one line, which ``ethbrake agent list`` shows.
 
     Raises ``AlreadyExists`` if another variant is registered under ``key``.

@@ -14,11 +14,10 @@ from ethbrake_marl.scenario.roles import ScriptSpec
 class StateFree:
     """Agent with a fixed command: ``full_brake``, ``coast``, ``constant:a`` (deceleration in m/s2) or a ``profile``.
 
-    The constructor's argument ``spec`` is the text of the command, for example ``coast`` or ``constant:3.5``. A profile
-    is a sequence of intervals with constant commands. For a profile, ``act`` returns the command of the first interval,
-    and the engine applies the commands of the later intervals (``Worlds.play_pieces``). In the paper's non-ethical
-    strategy every vehicle follows ``full_brake``. Raises ``InvalidInput`` if ``spec`` is none of these four commands.
-    ``act`` raises ``InvalidInput`` for a constant command beyond the vehicle's capacity.
+    ``spec`` is the text of the command, for example ``constant:3.5``. For a profile, ``act`` returns the command of the
+    first phase, and the engine applies the commands of the later phases (``Worlds.play_pieces``). In the paper's
+    non-ethical strategy every vehicle follows ``full_brake``. Raises ``InvalidInput`` if ``spec`` is none of these four
+    commands. ``act`` raises ``InvalidInput`` for a constant command beyond the vehicle's capacity.
     """
 
     state_free = True

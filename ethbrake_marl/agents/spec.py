@@ -83,9 +83,9 @@ def parse_spec(spec: str) -> AgentSpec:
 def split_names(text: str, is_one: Callable[[str], bool] = os.path.lexists) -> list[str]:
     """Split a comma-separated list of names, some of which may contain commas.
 
-    ``is_one`` is a function that returns whether a text with commas is a single name. By default ``is_one`` returns
-    whether a file or folder with this name exists. Each name is the longest beginning of the remaining text for which
-    ``is_one`` returns True; if there is no such beginning, the name ends at the next comma.
+    ``is_one`` returns whether a text with commas is a single name; by default, whether a file or folder with this name
+    exists. Each name is the longest beginning of the remaining text for which ``is_one`` returns True; if there is no
+    such beginning, the name ends at the next comma.
     """
     parts, names = text.split(","), list[str]()
     while parts:
@@ -156,15 +156,10 @@ def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
 
 
 def _is_meant_around(before: str, core: str, last: str) -> bool:
-    """Return whether an unknown word after a ``+`` is probably a misspelt search or shield.
+    """Return whether the unknown word ``last`` after a ``+`` is probably a misspelt search or shield.
 
-    If the result is False, the unknown word is part of an argument or a path.
-
-    Args:
-        before: the specification up to the ``+``, without the ``+``.
-        core: the specification up to and including the unknown word.
-        last: the unknown word after the ``+``.
-
+    If not, it is part of an argument or a path. ``before`` is the specification up to the ``+``, without the ``+``, and
+    ``core`` the specification up to and including ``last``.
     """
     file = _python_file(core)
     if ".py" in last or (file and _IN_FILE.fullmatch(core, len(file))):

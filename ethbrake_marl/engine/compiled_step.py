@@ -1,8 +1,15 @@
 """The compiled step of an engine: it turns actions into commands, moves the vehicles, ends episodes, computes rewards.
 
-Each of n worlds is a row of the arrays ``state`` and ``params``, whose columns ``physics.columns`` defines. The array
-``clock`` [n, 4] contains, for each world, the time of the first decision, the number of steps taken, the number of the
-step that ends at the horizon, and whether the episode has ended.
+Each of n worlds is a row of the arrays ``state`` and ``params``, whose columns ``physics.columns`` defines. Further
+arrays that several functions share:
+
+- ``clock`` [n, CLOCK_WIDTH]: time of the first decision, number of steps taken, number of the step that ends at the
+  horizon, and whether the episode has ended.
+- ``actions`` [n, L]: actions of the L learners, in [-1, 1].
+- ``pieces`` [N, 2 K]: braking profiles with K pieces, as in ``Vehicles``; K may be 0.
+- ``wanted`` [n, N]: commands of all vehicles, m/s2. A step overwrites the learners' commands.
+- ``reward`` [n, N]: receives the reward of each vehicle.
+- ``outcome`` [OUTCOME_ROWS, n]: receives the harm of the step and whether the episode has ended.
 """
 
 from __future__ import annotations
@@ -112,7 +119,7 @@ class Step(NamedTuple):
 
     @property
     def counted_harm(self) -> Floats:
-        """Harm of this step, summed over the line, [n] m2/s2: first-impact or total harm, whichever the reward uses."""
+        """Harm of this step, summed over the line, [n] m2/s2, under the harm count that the reward uses."""
         return self.first_impact_harm if self.params.harm_count == "first" else self.total_harm
 
     def _is(self, row: int) -> Bools:
@@ -123,9 +130,8 @@ class Step(NamedTuple):
 def place_row(table: Floats, state: Floats, params: Floats, k: int, pieces: Floats) -> None:
     """Write into ``table`` the quantities of world ``k`` that are needed only if brakes take time to build up.
 
-    The present accelerations come from row ``k`` of ``state``, and the rates of build-up from row ``k`` of ``params``.
-    ``pieces`` [N, 2 K] are braking profiles with K intervals of constant command. This code is not inside the loop of
-    ``step_worlds``, because there it would slow down the simulation of worlds whose brakes act at once.
+    This code is not inside the loop of ``step_worlds``, because there it would slow down the simulation of worlds whose
+    brakes act at once.
     """
     column, N = columns(state), pieces.shape[0]
     command, brake_rate, release_rate = column.command, column.brake_rate, column.release_rate
@@ -143,28 +149,13 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
     """Advance the world of every running episode by one step.
 
     If an action is outside [-1, 1], no world moves. A world that the physics cannot advance keeps its state; its
-    episode is truncated with the reward 0, and ``outcome`` contains the status code of the failure.
-
-    Args:
-        state: present motion and harm so far of the worlds, [n, S]; changed in place.
-        params: parameters of the vehicles, one row per world, in the layout of ``physics.columns``.
-        clock: times and numbers of the steps of each episode (see the module docstring), [n, CLOCK_WIDTH]; changed in
-            place.
-        actions: actions of the learners, [n, L].
-        learners: indices of the learners (0 = front), [L].
-        settings: five numbers with the indices ``TIME_STEP``, ``HORIZON``, ``HARM_WEIGHT``, ``HARM_IS_TOTAL`` and
-            ``TERMINAL_WEIGHT``.
-        no_rows: ``NO_ROWS``, an empty array, so that the physics keeps no list of single impacts.
-        builds_up: True if brakes take time to build up in some world, or if a script follows a braking profile.
-        pieces: braking profiles with K intervals of constant command, [N, 2 K]; used only if ``builds_up`` is True.
-        wanted: commands of all vehicles, [n, N] m/s2; this function overwrites the learners' commands.
-        reward: array that receives the reward of each vehicle, [n, N].
-        outcome: array that receives, for each world, the harm of the step and whether the episode has ended,
-            [OUTCOME_ROWS, n].
+    episode is truncated with the reward 0, and ``outcome`` contains the status code of the failure. ``state`` and
+    ``clock`` change in place. ``learners`` and ``settings`` are the fields of ``Rules``. ``no_rows`` is ``NO_ROWS``, so
+    that the physics keeps no list of single impacts. ``pieces`` are used only if ``builds_up`` is True: if brakes take
+    time to build up in some world, or if a script follows a braking profile.
 
     Returns ``(-1, FLAG.DONE)`` if all worlds were advanced. If at least one world was not advanced, returns the row
     number of one of these worlds, and ``BAD_ACTION`` or the status code of the physics.
-
     """
     n, N = wanted.shape
     for k in range(n):
@@ -272,27 +263,16 @@ class Rules(NamedTuple):
     learners: Ints  # [L] indices of the learners
     settings: Floats  # [5] TIME_STEP, HORIZON, HARM_WEIGHT, HARM_IS_TOTAL, TERMINAL_WEIGHT
     builds_up: bool  # whether brakes take time to build up in some world, or a script follows a braking profile
-    pieces: Floats  # [N, 2 K] braking profiles with K intervals of constant command, as in ``Vehicles``; K may be 0
+    pieces: Floats  # [N, 2 K] braking profiles (see the module docstring)
 
     def step(
         self, worlds: Packed, clock: Floats, actions: Floats, wanted: Floats, reward: Floats, outcome: Floats
     ) -> int:
-        """Advance the world of every running episode by one step, and return a status code.
-
-        Args:
-            worlds: n packed worlds, one row per world; changed in place.
-            clock: times and numbers of the steps of each episode (see the module docstring), [n, CLOCK_WIDTH]; changed
-                in place.
-            actions: actions of the learners in [-1, 1], [n, L].
-            wanted: commands of all vehicles, [n, N] m/s2; this function overwrites the learners' commands.
-            reward: array that receives the reward of each vehicle, [n, N].
-            outcome: array that receives, for each world, the harm of the step and whether the episode has ended,
-                [OUTCOME_ROWS, n].
+        """Advance the world of every running episode by one step, in place, and return a status code.
 
         The status code is ``FLAG.DONE`` if all worlds were advanced. The status code is ``BAD_ACTION`` if an action is
         outside [-1, 1]; in this case no world was moved. Any other status code means that a check of the physics failed
         in at least one world.
-
         """
         _, status = step_worlds(
             *worlds, clock, actions, self.learners, self.settings, NO_ROWS, self.builds_up, self.pieces, wanted,

@@ -1,4 +1,8 @@
-"""``Engine``: a batch of running episodes of one scenario, on which all environments are built."""
+"""``Engine``: a batch of running episodes of one scenario, on which all environments are built.
+
+Letters in shapes: n worlds, N vehicles, L learners, P pairs, F features. ``rows`` are indices of worlds, and
+``columns`` [n, L] are the actions of the learners.
+"""
 
 from __future__ import annotations
 
@@ -56,21 +60,17 @@ class Watcher(Protocol):
     """
 
     def begun(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
-        """Return the watcher's new memory after episodes have started in the rows (worlds) with the indices ``rows``.
+        """Return the watcher's new memory after episodes have started in the worlds ``rows``.
 
-        ``alert`` contains the worlds in which episodes have started, at t = 0. ``memory`` is the watcher's memory
-        before the episodes started.
+        ``alert`` contains only the worlds in which episodes have started, at t = 0.
         """
 
     def stepped(self, memory: Any, before: Engine, after: Engine) -> Any:
-        """Return the watcher's memory after a step; ``memory`` is the watcher's memory before the step.
-
-        ``before`` is the engine before the step, and ``after`` the engine after the step.
-        """
+        """Return the watcher's memory after a step that led from the engine ``before`` to the engine ``after``."""
 
 
 class Ruling(NamedTuple):
-    """Answer of a guard (shield) in one step, for n worlds and L learners."""
+    """Answer of a guard (shield) in one step."""
 
     proposed: Floats  # [n, L] actions that the learners proposed; NaN: none, or not a number
     applied: Floats  # [n, L] actions to apply, in [-1, 1]
@@ -85,25 +85,22 @@ class Guard(Protocol):
 
     The engine calls the guard in every ``Engine.step``, so no action can bypass the guard. The engine stores the
     guard's memory and answer together with the state of its episodes, and replaces all three in a single assignment. If
-    a step fails or is interrupted, memory, answer and state stay as they were before the step. For this reason a guard
-    must never change its memory in place.
+    a step fails or is interrupted, all three stay as they were before the step. For this reason a guard must never
+    change its memory in place.
     """
 
     def begin(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
-        """Return the guard's new memory after episodes have started in the rows (worlds) with the indices ``rows``.
+        """Return the guard's new memory after episodes have started in the worlds ``rows``.
 
-        ``alert`` contains the worlds in which episodes have started, at t = 0. ``memory`` is the guard's memory before
-        the episodes started; None before the first episode.
+        ``alert`` contains only the worlds in which episodes have started, at t = 0. ``memory`` is None before the first
+        episode.
         """
 
     def decide(self, running: Engine, memory: Any, proposed: Floats) -> Ruling:
-        """Return the guard's answer (``Ruling``), which contains the actions to apply in the next step.
+        """Return the guard's answer, which contains the actions to apply in the next step.
 
-        Args:
-            running: the engine with its running episodes, before the step.
-            memory: the guard's memory before the step.
-            proposed: actions of the learners, [n, L]; a column of NaN means that this learner proposed no action.
-
+        ``running`` is the engine before the step. ``proposed`` [n, L] are the learners' actions; a column of NaN means
+        that this learner proposed no action.
         """
 
     def check(self, ruling: Ruling, after: Engine) -> Any:
@@ -115,8 +112,7 @@ class Guard(Protocol):
     def report(self, running: Engine) -> dict[str, NDArray[Any]]:
         """Return the infos of the guard about the last step: dictionary from name to values, [n, N].
 
-        Before the first step of an episode, the report describes what the guard decided at the alert. ``running`` is
-        the engine that the guard protects.
+        Before the first step of an episode, the report describes what the guard decided at the alert.
         """
 
 
@@ -138,11 +134,7 @@ class Now(NamedTuple):
         return self._replace(state=self.state.copy(), roster=self.roster.apart(), stream=copy.copy(self.stream))
 
     def kept(self, packed: Packed) -> Packed:
-        """Return the packed worlds ``packed``, with the same columns as the worlds of this engine.
-
-        Columns for an obstacle and columns for messages are added to ``packed`` if the engine's worlds have such
-        columns.
-        """
+        """Return ``packed`` with columns for an obstacle and for messages if this engine's worlds have such columns."""
         return packed.widened(self.obstacle, self.by_link)
 
 
@@ -160,14 +152,14 @@ class Engine:
         learners: indices of the learners (0 = front): the vehicles whose actions the caller passes to ``step``.
         scripts: dictionary from the index of every vehicle that does not learn to the vehicle's script.
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
-        observation: the features that vehicles observe: one observation for all vehicles, or a dictionary vehicle name
-            -> observation; None: the observation of the scenario.
+        observation: one observation for all vehicles, or a dictionary vehicle name -> observation; None: the
+            observation of the scenario.
         seed: seed of the training stream, from which the worlds come if ``worlds`` is None.
         deciders: indices of the vehicles at whose decisions each step begins and ends; None: the learners. In an
             evaluation the engine has no learners; there ``deciders`` are the vehicles that the evaluated agent drives.
         worlds: worlds of the first episodes, at t = 0; None: the first worlds of the training stream.
-        guard: function that receives this engine and returns its guard (shield); None: the engine applies the
-            learners' actions unchanged.
+        guard: function that receives this engine and returns its guard; None: the learners' actions are applied
+            unchanged.
         reward_vector: components of a vector reward, which each step returns in addition to the reward
             (``game.reward_vector``); None: no vector reward.
 
@@ -256,10 +248,9 @@ class Engine:
         self._now = self._started(stream, self._now.state.guarded, worlds, self._now.watched)
 
     def _started(self, stream: Stream, guarded: Any, worlds: Worlds | None, watched: dict[Watcher, Any]) -> Now:
-        """Return new episodes that start in ``worlds`` (n worlds at t = 0).
+        """Return new episodes that start in ``worlds`` or, if it is None, in the next worlds of ``stream``.
 
-        If ``worlds`` is None, the episodes start in the next worlds of ``stream``. ``guarded`` is the previous memory
-        of the guard, and ``watched`` contains the previous memories of the watchers.
+        ``guarded`` and ``watched`` contain the previous memories of the guard and of the watchers.
         """
         if worlds is not None:
             check_alert(worlds, self.n, self.scenario.vehicles)
@@ -278,7 +269,7 @@ class Engine:
         return new._now
 
     def _begin(self, rows: Ints, start: Start) -> None:
-        """Start new episodes in the rows (worlds) with the indices ``rows``, in place.
+        """Start new episodes in the worlds ``rows``, in place.
 
         ``start`` contains the worlds of the new episodes, at the alert and at the first decision. Scripts, guard and
         watchers get their memory for the new episodes. Messages that arrive before the first step are delivered, and
@@ -349,8 +340,7 @@ class Engine:
     def _columns(self, actions: Actions) -> Floats:
         """Return the learners' actions as an array [n, L]; ``actions`` is an array or a mapping, as in ``step``.
 
-        If ``actions`` is an array [n, L] of floats or integers, ``_columns`` does not check whether the numbers are in
-        [-1, 1].
+        If ``actions`` is an array [n, L] of floats or integers, its numbers are not checked.
         """
         shape = (self.n, len(self.learners))
         if type(actions) is np.ndarray and actions.shape == shape and actions.dtype.kind in "fiu":
@@ -374,7 +364,7 @@ class Engine:
         return columns
 
     def _in_range(self, columns: Floats) -> Floats:
-        """Return the learners' actions ``columns`` [n, L]; an action just outside [-1, 1] is clipped to this range.
+        """Return ``columns`` with actions just outside [-1, 1] clipped to this range.
 
         Raises ``InvalidInput`` for an action that is outside [-1, 1] by more than a float32 rounding error.
         """
@@ -382,18 +372,14 @@ class Engine:
         return np.stack(each, axis=1) if each else columns
 
     def _ruled(self, before: Engine, columns: Floats, *, checked: bool) -> Ruling:
-        """Return the guard's answer (``Ruling``) to the learners' actions ``columns`` [n, L].
-
-        ``before`` is the engine before the step. If ``checked`` is True, the caller has already checked that the
-        actions are in [-1, 1].
-        """
+        """Return the guard's answer to the actions ``columns``, which are not checked again if ``checked`` is True."""
         assert self.guard is not None
         if before.guarded is None:
             raise UncertifiedStep("shield: this episode began before the shield was added; call reset first")
         return self.guard.decide(before, before.guarded, columns if checked else self._in_range(columns))
 
     def _advance(self, columns: Floats) -> Step:
-        """Advance every running episode by one time step, in place, under the learners' actions ``columns`` [n, L]."""
+        """Advance every running episode by one time step, in place."""
         harm_before = self.state.ledger if self._terms.by_objective or self._terms.components else None
         start = None if self.state.impacts is None else self.worlds
         asked = self._ask_scripts()
@@ -412,7 +398,7 @@ class Engine:
     def _ask_scripts(self) -> dict[int, Memory]:
         """Let the scripts that have a memory and decide once per step write their commands into ``state.wanted``.
 
-        Returns the scripts' new memories: dictionary from vehicle index to memory.
+        Returns the new memories of these scripts.
         """
         asked: dict[int, Memory] = {}
         own_grid = self._own_grid.scripts
@@ -425,7 +411,7 @@ class Engine:
         return asked
 
     def _move(self, columns: Floats) -> tuple[Step, bool]:
-        """Move the worlds by one step under the learners' actions ``columns`` [n, L], and deliver messages.
+        """Move the worlds by one step, and deliver messages.
 
         Returns the results of the step, and whether at least one world could not be advanced.
         """
@@ -448,26 +434,18 @@ class Engine:
         return Step(reward, outcome, self.reward, {}), some_failed
 
     def _drive_own_grid(self, columns: Floats) -> Way:
-        """Advance the worlds to the last of the decisions that scripts make within the step.
-
-        Returns the results of the step up to this last decision. ``columns`` [n, L] contains the actions of the L
-        learners.
-        """
+        """Advance the worlds to the last decision that a script makes within the step; return the results so far."""
         way = self._own_grid.drive_step(self.state, self._now.rules, self._in_range(columns))
         self._change(memories=way.memories)
         self._now = self._now._replace(stops=way.stops)
         return way
 
     def _add_terms(self, step: Step, harm_before: Ledger | None, start: Worlds | None) -> None:
-        """Add to the results of a step the reward terms that the compiled step cannot compute.
+        """Add to the results of a step, in place, the reward terms that the compiled step cannot compute.
 
-        Args:
-            step: results of the step; changed in place.
-            harm_before: harm of each pair from the alert to the beginning of the step; None if every vehicle's reward
-                counts the harm of the whole line.
-            start: the worlds before the step, needed for reward terms that are computed from single impacts; None if
-                there are no such terms.
-
+        ``harm_before`` is the harm of each pair from the alert to the beginning of the step; None if every vehicle's
+        reward counts the harm of the whole line. ``start`` are the worlds before the step; None if no reward term is
+        computed from single impacts.
         """
         impacts = self.state.impacts
         if impacts is not None and start is not None:
@@ -478,7 +456,7 @@ class Engine:
         self._now = self._now._replace(state=state)
 
     def _change(self, **fields: Any) -> None:
-        """Replace fields of ``self.state`` by the values in ``fields`` (field name -> new value)."""
+        """Replace fields of ``self.state``."""
         self._now = self._now._replace(state=self._now.state._replace(**fields))
 
     def observe(self, vehicle: int) -> Observations:
@@ -624,10 +602,9 @@ class Engine:
         self._now = self._now._replace(state=state, stream=stream, roster=roster, rules=self._rules_for(state))
 
     def _rules_for(self, state: State) -> Rules:
-        """Return the settings of the compiled step (``Rules``) for the worlds of ``state``.
+        """Return the settings of the compiled step for the worlds of ``state``.
 
-        The settings take into account whether brakes take time to build up in a world of ``state``, even if brakes act
-        at once in all worlds of this engine.
+        Brakes may build up in a world of ``state``, even if they act at once in all worlds of this engine.
         """
         builds_up = self.scenario.builds_up or state.packed.builds_up or self.in_pieces
         return self._now.rules._replace(builds_up=builds_up)
@@ -635,14 +612,14 @@ class Engine:
     def place(self, worlds: Worlds, ledger: Ledger | None = None, *, ended: Bools | None = None) -> None:
         """Replace all n worlds, for example by worlds that another simulator has moved.
 
-        ``place`` does not change the parameters of the vehicles, the memories and the times of decisions. The next step
-        leads from the time of ``worlds`` to the next decision.
+        The parameters of the vehicles, the memories and the times of decisions do not change. The next step leads from
+        the time of ``worlds`` to the next decision.
 
         Args:
             worlds: n worlds at any time of their episodes.
             ledger: harm and number of impacts of each pair since the episodes began; None: no harm and no impacts.
-            ended: for each world, True if the episode has ended, [n]; steps do not move such a world. If ``ended`` is
-                None, an episode has ended if its time is at or after the horizon.
+            ended: whether each episode has ended, [n]; steps do not move the world of an ended episode. None: an
+                episode has ended if its time is at or after the horizon.
 
         Raises ``InvalidInput`` if ``worlds`` has another number of worlds or vehicles than the engine, or if a term of
         the reward is computed from single impacts.
@@ -683,8 +660,8 @@ class Engine:
     def branch(self, state: State) -> Engine:
         """Return a new engine whose episodes continue from ``state``, under the same guard.
 
-        ``branch`` does not change the engine that it is called on. Raises ``InvalidInput`` if the reward is shaped,
-        because the potentials of shaping depend on more than ``state``.
+        This engine does not change. Raises ``InvalidInput`` if the reward is shaped, because the potentials of shaping
+        depend on more than ``state``.
         """
         if self.reward.shaping > 0.0:
             raise InvalidInput(f"branch: the reward has shaping = {self.reward.shaping:g}; branch needs shaping = 0")
@@ -718,7 +695,7 @@ class Engine:
 
     @property
     def packed(self) -> Packed:
-        """The running worlds, packed into two arrays (layout: ``physics.columns``); not a copy, so only read them."""
+        """The running worlds in two arrays (layout: ``physics.columns``); not a copy, so only read them."""
         return self._now.state.packed
 
     @property
@@ -728,7 +705,7 @@ class Engine:
 
     @property
     def ledger(self) -> Ledger:
-        """Harm and number of impacts of each pair of vehicles since the running episodes began (a copy)."""
+        """Harm and number of impacts of each pair since the running episodes began (a copy)."""
         return self._now.state.ledger
 
     @property
@@ -743,7 +720,7 @@ class Engine:
 
     @property
     def roster(self) -> Roster:
-        """Record of which world of the training stream runs in each row, and which worlds could not be advanced."""
+        """Record of which world runs in each row, and which worlds could not be advanced."""
         return self._now.roster
 
     @property
@@ -753,7 +730,7 @@ class Engine:
 
     @property
     def observation(self) -> ObservationSpec:
-        """Observation (list of features) that all learners have in common.
+        """Observation that all learners have in common.
 
         Raises ``InvalidInput`` if learners observe different features.
         """
@@ -761,7 +738,7 @@ class Engine:
 
     @property
     def memories(self) -> dict[int, Memory]:
-        """Memories of all scripts that have a memory: dictionary from vehicle index to memory."""
+        """Memories of all scripts that have a memory: vehicle index -> memory."""
         return self._now.state.memories
 
     @property
@@ -776,5 +753,5 @@ class Engine:
 
     @property
     def in_pieces(self) -> bool:
-        """Whether some script follows a braking profile: a sequence of intervals with a constant command each."""
+        """Whether some script follows a braking profile."""
         return bool(self._now.rules.pieces.shape[1] > 0)

@@ -1,4 +1,8 @@
-"""Memories of scripts (nested tuples and mappings of arrays), and functions that call scripts and check the results."""
+"""Memories of scripts (nested tuples and mappings of arrays), and functions that call scripts and check the results.
+
+Arguments that several functions share: ``vehicle`` is the index of the script's vehicle (0 = front), and ``scripts``
+maps the index of each scripted vehicle to its script.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +43,6 @@ def map_memory(function: Callable[..., Any], memory: Memory, *others: Memory) ->
 
 
 def take_memory(memory: Memory, rows: Ints) -> Memory:
-    """Return the memory of the worlds with the indices ``rows``, in new arrays."""
     return map_memory(lambda array: array[rows], memory)
 
 
@@ -130,9 +133,7 @@ def unflat(arrays: Mapping[str, NDArray[Any]], place: str) -> Memory:
 def _check_kept(before: Memory, after: Memory, who: str) -> None:
     """Raise ``InvalidInput`` if a call of ``act`` changed the keys, shapes or dtypes of a memory.
 
-    If ``act`` changed the keys, shapes or dtypes of a memory, the engine could not replace the memory of single worlds
-    when new episodes start. ``before`` is the memory before the call of ``act``, and ``after`` the memory after the
-    call. The error message begins with ``who``.
+    After such a change the engine could not replace the memory of single worlds when new episodes start.
     """
     began, kinds = (map_memory(lambda array: (array.dtype, *array.shape[1:]), each) for each in (before, after))
     if began != kinds:
@@ -158,14 +159,7 @@ def is_ours(script: Script) -> bool:
 def begin_script(script: Script, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
     """Return the first memory of a script for new episodes; None for a script without a memory.
 
-    Args:
-        script: the script.
-        alert: worlds of the new episodes, at t = 0.
-        vehicle: index of the script's vehicle (0 = front).
-        scripts: dictionary from the index of each scripted vehicle to the vehicle's script.
-
     Raises ``InvalidInput``, which names the script, if a user's script raises an exception or its memory is invalid.
-
     """
     begin = getattr(script, "begin", None)
     if begin is None:
@@ -187,11 +181,11 @@ def begin_script(script: Script, alert: Worlds, vehicle: int, scripts: Mapping[i
 
 
 def ask_script(script: Script, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-    """Return a script's command for ``vehicle`` (index, 0 = front), [n] m/s2, and the script's new memory.
+    """Return a script's command for ``vehicle``, [n] m/s2, and the script's new memory.
 
-    ``memory`` is the script's present memory for ``worlds``; None for a script without memory. Raises ``AgentFailed``,
-    which names the script, world and time, if the script does not return one number per world. Raises
-    ``InvalidInput``, which names the script, if a user's script raises an exception or changes its own attributes.
+    ``memory`` is None for a script without memory. Raises ``AgentFailed``, which names the script, world and time, if
+    the script does not return one number per world. Raises ``InvalidInput``, which names the script, if a user's script
+    raises an exception or changes its own attributes.
     """
     remembers = hasattr(script, "begin")
     try:
@@ -224,7 +218,7 @@ def ask_script(script: Script, worlds: Worlds, memory: Memory, vehicle: int) -> 
 
 @contextmanager
 def _as_it_was(script: Script, vehicle: int) -> Iterator[None]:
-    """Context manager: raise ``InvalidInput`` if a script changes its own attributes, which all episodes share."""
+    """Raise ``InvalidInput`` if a script changes its own attributes, which all episodes share."""
     before = dict(getattr(script, "__dict__", {}))
     yield
     for name in {**before, **getattr(script, "__dict__", {})}:
@@ -241,18 +235,10 @@ def _who(script: Script, vehicle: int) -> str:
 
 
 def _named(error: Exception, script: Script, what: str, worlds: Worlds, vehicle: int) -> Exception:
-    """Return the exception to raise instead of ``error``, which a script raised.
+    """Return the exception to raise instead of ``error``, which the script's method ``what`` raised.
 
     The result is an ``InvalidInput`` whose message names the script. If the script belongs to this package, or if
     ``error`` is an ``EthBrakeError``, the result is ``error`` itself.
-
-    Args:
-        error: the exception that the script raised.
-        script: the script.
-        what: name of the script's method that raised the error.
-        worlds: the worlds that were passed to the script's method.
-        vehicle: index of the script's vehicle (0 = front).
-
     """
     if isinstance(error, EthBrakeError) or is_ours(script):
         return error
@@ -264,15 +250,9 @@ def _named(error: Exception, script: Script, what: str, worlds: Worlds, vehicle:
 def within_capacity(
     command_mps2: Floats, worlds: Worlds, vehicle: int, script: Script, due: Bools | None = None
 ) -> Floats:
-    """Return a script's command if it is within the vehicle's capacities; otherwise raise ``AgentFailed``.
+    """Return a script's command [n] m/s2 if it is within the vehicle's capacities; otherwise raise ``AgentFailed``.
 
-    Args:
-        command_mps2: accelerations that the script commands, [n] m/s2.
-        worlds: n worlds.
-        vehicle: index of the vehicle that the script drives (0 = front).
-        script: the script, whose name the error message contains.
-        due: whether to check the command in each world, [n]; None: check the command in all worlds.
-
+    ``due`` [n] says in which worlds to check the command; None: in all worlds.
     """
     low, high = -worlds.vehicles.braking_capacity_mps2[:, vehicle], worlds.vehicles.driving_capacity_mps2[:, vehicle]
     good = (command_mps2 >= low) & (command_mps2 <= high)

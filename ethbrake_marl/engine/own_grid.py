@@ -2,6 +2,9 @@
 
 A script first decides when the latency of its vehicle has elapsed. The engine's first step begins with the first
 decision of the *deciders*: the learners or, in an evaluation, the vehicles that the evaluated agent drives.
+
+Arguments that several methods share: the state ``state`` of all running episodes, the settings ``rules`` of the
+engine's steps, and the learners' ``actions`` [n, L], where L may be 0.
 """
 
 from __future__ import annotations
@@ -48,14 +51,10 @@ class Way(NamedTuple):
     stops: tuple[Stop, ...]  # the worlds at each of the decisions, in order
 
     def add_to(self, motion: Floats, column: Columns, reward: Floats, outcome: Floats) -> None:
-        """Add the results up to the last decision of a script to the results of the rest of the step, in place.
+        """Add these results to the results of the rest of the step, in place.
 
-        Args:
-            motion: state of the worlds after the whole step, [n, S].
-            column: number of the column of ``motion`` that contains each quantity (``physics.columns``).
-            reward: reward of each vehicle in the rest of the step (after the last decision of a script), [n, N].
-            outcome: other results of the rest of the step, as the compiled step returns them, [OUTCOME_ROWS, n].
-
+        ``motion`` [n, S] is the state of the worlds after the whole step, with the columns ``column``. ``reward`` [n,
+        N] and ``outcome`` [OUTCOME_ROWS, n] are the results of the rest of the step.
         """
         reward += self.reward
         outcome[: len(self.harm)] += self.harm
@@ -67,15 +66,10 @@ class Way(NamedTuple):
 class OwnGrid:
     """Scripts that have a memory and may decide in the middle of an engine's step, not only at its beginning.
 
-    Each script first decides when the latency of its vehicle has elapsed, and then once in every time step. An engine's
-    step leads from one decision of its deciders (the learners or the evaluated agent's vehicles) to their next
-    decision, so a script of a vehicle with another latency decides within the step.
-
-    Args:
-        scripts: dictionary from vehicle index (0 = front) to the vehicle's script.
-        time_step_s: time between two decisions of a script, s.
-        horizon_s: time after the alert at which an episode is truncated, s.
-
+    Each script first decides when the latency of its vehicle has elapsed, and then every ``time_step_s`` seconds. An
+    engine's step leads from one decision of its deciders to their next decision, so a script of a vehicle with another
+    latency decides within the step. ``scripts`` maps the index of each vehicle (0 = front) to its script. Episodes are
+    truncated ``horizon_s`` seconds after the alert.
     """
 
     def __init__(self, scripts: Mapping[int, Script], time_step_s: float, horizon_s: float) -> None:
@@ -86,7 +80,6 @@ class OwnGrid:
         """Let the scripts make their decisions within the next step; return the results up to the last decision.
 
         Each world of ``state`` is moved, in place, to the last decision at which a script changed its command.
-        ``rules`` contains the settings of the engine's steps, and ``actions`` the learners' actions, [n, L].
         """
         column = state.packed.column
         in_force = state.motion[:, column.command : column.previous].copy()
@@ -100,17 +93,11 @@ class OwnGrid:
     def drive_to_start(self, state: State, rules: Rules, rows: Ints, start_s: Floats) -> Way:
         """Let the scripts make their decisions between the alert and the first step; return the results (``Way``).
 
-        Until the first step the learners and deciders coast, and the scripts observe that these vehicles coast.
-
-        Args:
-            state: state of all running episodes; the new episodes are at the alert. ``drive_to_start`` moves the new
-                episodes to their first step, in place.
-            rules: settings of the engine's steps.
-            rows: numbers of the rows of ``state`` in which the new episodes start.
-            start_s: time at which the first step of each new episode begins, [len(rows)] s.
+        Until the first step the learners and deciders coast, and the scripts observe that these vehicles coast. The new
+        episodes, in the worlds ``rows`` of ``state``, are at the alert; they are moved, in place, to the time
+        ``start_s`` [len(rows)] s at which their first step begins.
 
         Raises ``PhysicsError``, which lists the worlds that could not be advanced.
-
         """
         n, time_s = len(state.motion), state.time_s
         running, until_s, no_actions = np.zeros(n, np.bool_), time_s.copy(), np.empty((n, 0))
@@ -128,8 +115,7 @@ class OwnGrid:
 
         Only worlds of ``state`` for which the mask ``running`` [n] is True are advanced, in place. ``_decide`` moves a
         world to a decision only if this decision changes a command. If worlds stopped at other decisions, too, their
-        motion would be rounded differently. ``rules`` contains the settings of the engine's steps, and ``actions`` the
-        learners' actions, [n, L].
+        motion would be rounded differently.
         """
         motion, params, _, wanted_so_far, *_ = state
         (n, N), column = wanted_so_far.shape, state.packed.column
@@ -175,14 +161,9 @@ class OwnGrid:
     ) -> tuple[Packed, Floats, Floats]:
         """Return copies of the worlds at ``until_s``, and the rewards [n, N] and results [OUTCOME_ROWS, n] until then.
 
-        Args:
-            state: the worlds before they are advanced. In ``state.wanted`` the learners' commands are overwritten;
-                nothing else in ``state`` changes.
-            rules: settings of the engine's steps.
-            until_s: time to which each world is advanced, [n] s; a world that has reached this time does not move.
-            decision_s: time of the deciders' next decision, [n] s, on which the delivery of periodic messages depends.
-            actions: actions of the learners, [n, L]; L may be 0.
-
+        In ``state.wanted`` the learners' commands are overwritten; nothing else in ``state`` changes. A world that has
+        reached its time ``until_s`` [n] s does not move. The delivery of periodic messages depends on ``decision_s``
+        [n] s, the time of the deciders' next decision.
         """
         n, wanted = len(state.motion), state.wanted
         clock, settings = np.zeros(state.clock.shape), rules.settings.copy()

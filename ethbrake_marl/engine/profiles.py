@@ -1,7 +1,7 @@
 """The problem that searches and shields solve: which commands over a whole episode cause the least harm?
 
 A *profile* contains the commands of the controlled vehicles from the first decision to the horizon. A profile consists
-of at most K *phases*: intervals with constant commands. Each phase ends at a decision.
+of at most K phases. Each phase ends at a decision. C is the number of controlled vehicles.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class SearchWorld(NamedTuple):
 def copy_rows(rows: Floats, to_rows: Floats, n: int) -> None:
     """Copy the first ``n`` rows of ``rows`` to the first ``n`` rows of ``to_rows``, element by element.
 
-    Both arrays have at least ``n`` rows and the same number of columns. ``to_rows[:n] = rows[:n]`` would take ten times
-    longer to compile, because numba would also compile the error message of this assignment.
+    ``to_rows[:n] = rows[:n]`` would take ten times longer to compile, because numba would also compile the error
+    message of this assignment.
     """
     for k in range(n):
         for c in range(rows.shape[1]):
@@ -64,7 +64,7 @@ class ProfileProblem(NamedTuple):
     limit: Floats  # [n, N] speed limits (m/s)
     brake_rate: Floats  # [n, N] rates at which brakes build up (m/s3)
     release_rate: Floats  # [n, N] rates at which brakes are released (m/s3)
-    pieces: Floats  # [n, N, 2 K] braking profiles of scripts with K intervals of constant command, as in ``Vehicles``
+    pieces: Floats  # [n, N, 2 K] braking profiles of scripts with K pieces, as in ``Vehicles``
     identity: UInt64s  # [n] hash of each world's problem, see ``identities``
     weights: Floats  # [n, 2, N] of each pair: share of the front vehicle times the weight of its harm; of the rear one
 
@@ -93,9 +93,9 @@ class ProfileProblem(NamedTuple):
     def constant(self, commands_mps2: Floats) -> Profiles:
         """Return profiles in which each controlled vehicle keeps one command from the first decision to the horizon.
 
-        ``commands_mps2`` [n, Q, C] contains, for each of n worlds, Q commands of each of the C controlled vehicles. The
-        result has n * Q profiles: first the Q profiles of world 0, then the Q profiles of world 1, and so on. Each
-        profile has ``MOST_PHASES`` phases with the same command; a search can later change single phases.
+        ``commands_mps2`` [n, Q, C] contains Q commands for each world and controlled vehicle. The result has n * Q
+        profiles: first the Q profiles of world 0, then the Q profiles of world 1, and so on. Each profile has
+        ``MOST_PHASES`` phases with the same command; a search can later change single phases.
         """
         n, Q, C = commands_mps2.shape
         borders = np.array([2, 5, 9, 14, 20] + (MOST_PHASES - 5) * [np.iinfo(np.int64).max])
@@ -120,14 +120,9 @@ class ProfileProblem(NamedTuple):
     def minimising(self, weights: Floats, *, largest: bool = False) -> ProfileProblem:
         """Return a copy of this problem in which searches minimise a weighted harm of the vehicles.
 
-        ``minimising`` does not change the harm count (first-impact or total harm) and the field ``identity``.
-
-        Args:
-            weights: for each vehicle, the weight (at least 0) of the harm that the vehicle bears, [n, N]; an obstacle
-                has no weight.
-            largest: True: minimise the largest weighted harm of a vehicle; False: minimise the sum of all weighted
-                harms.
-
+        ``weights`` [n, N] (at least 0) are the weights of the harm that each vehicle bears; an obstacle has no weight.
+        If ``largest`` is True, searches minimise the largest weighted harm of a vehicle, otherwise the sum of all
+        weighted harms. The harm count and the field ``identity`` do not change.
         """
         mass, obstacle = self.mass, self.mass.shape[1] - weights.shape[1]
         weights = np.pad(weights, ((0, 0), (obstacle, 0)))
@@ -242,12 +237,11 @@ def profile_problem(
         time_step_s: time between two decisions, s.
         others_mps2: constant commands of the other vehicles, [n, N] m/s2 (columns of ``vehicles`` are ignored); None:
             full braking.
-        deciders: indices of vehicles; the first decision is at the shortest latency of these vehicles. If this latency
-            has already elapsed in a world, the first decision is at the world's present time. None: ``vehicles``.
-        written_out: whether the arrays always contain an obstacle, as an additional vehicle in front
+        deciders: indices of vehicles; the first decision is at their shortest latency or, if this latency has already
+            elapsed in a world, at the world's present time. None: ``vehicles``.
+        written_out: whether the arrays contain an obstacle, as an additional vehicle in front
             (``Worlds.with_obstacle``), even if no world has an obstacle. If some world has an obstacle, the arrays
-            always contain an obstacle. If the arrays contain an obstacle, worlds without an obstacle get an obstacle
-            that no vehicle can reach.
+            always contain one. Worlds without an obstacle then get an obstacle that no vehicle can reach.
 
     Raises ``InvalidInput`` if ``vehicles`` is empty, repeats an index or contains an unknown index, if the harm count
     is unknown, if a command exceeds a capacity, or if the horizon is not after the first decision.
@@ -309,8 +303,8 @@ def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -
     """Return a hash for each world, [n]: 8 bytes of BLAKE2b over all data that affect the harm of a profile.
 
     These data are the world's state and parameters, the ``command`` [n, N] of the vehicles that are not controlled, the
-    times of decisions and the horizon in ``clock`` [n, CLOCK.WIDTH], and the indices ``vehicles`` of the controlled
-    vehicles. The hash is the same for first-impact harm and total harm.
+    times of decisions and the horizon in ``clock``, and the indices ``vehicles`` of the controlled vehicles. The hash
+    is the same for first-impact harm and total harm.
     """
     packed = Packed.of(worlds)
     (state, params), column = packed, packed.column
@@ -359,9 +353,9 @@ class Profiles(NamedTuple):
     commands_mps2: Floats  # [n, K, C] commands in each phase
 
     def at(self, step: Ints) -> Floats:
-        """Return the commands that apply right after decision number ``step`` [n] of each world, [n, C] m/s2.
+        """Return the commands that apply right after decision number ``step`` [n] (from 0) of each world, [n, C] m/s2.
 
-        Decisions are numbered from 0. The command of the last phase also applies after the end of this phase.
+        The command of the last phase also applies after the end of this phase.
         """
         phase = np.minimum((self.ends <= step[:, np.newaxis]).sum(axis=1), self.ends.shape[1] - 1)
         return np.asarray(self.commands_mps2[np.arange(len(phase)), phase], np.float64)
@@ -390,8 +384,8 @@ class Profiles(NamedTuple):
 def make_search_world(problem: ProfileProblem, k: int, random: UInt64s) -> SearchWorld:
     """Return world number ``k`` of ``problem``, with working memory of its own for simulations.
 
-    ``random`` [n] contains the state of each world's random generator. The result contains entry ``k`` of ``random`` as
-    a view (not a copy).
+    ``random`` [n] contains the state of each world's random generator; the result contains entry ``k`` as a view (not a
+    copy).
     """
     N = problem.mass.shape[1]
     table = np.zeros((rows_for(problem.pieces.shape[2]), N))
@@ -407,9 +401,9 @@ def make_search_world(problem: ProfileProblem, k: int, random: UInt64s) -> Searc
 def follow_worlds(
     problem: ProfileProblem, ends: Ints, commands: Floats, first: Floats, total: Floats, failed: Bools
 ) -> None:
-    """Simulate one profile in each world, and write the harm of each pair into two arrays [n, P] m2/s2.
+    """Simulate one profile in each world, and write the harm of each pair to ``first`` and ``total``.
 
-    ``first`` receives the first-impact harm, ``total`` the total harm. ``ends`` [n, K] and ``commands`` [n, K, C] are
+    ``first`` receives the first-impact harm and ``total`` the total harm, [n, P] m2/s2. ``ends`` and ``commands`` are
     the fields of ``Profiles``. If a check of the physics fails in world k, ``failed[k]`` is set to True.
     """
     start, no_random = problem.start, np.zeros(problem.start.shape[0], np.uint64)

@@ -21,7 +21,7 @@ class Script(Protocol):
       vehicles that the evaluated agent drives are not in ``scripts``.
 
     - ``act(worlds, memory, vehicle) -> (command, memory)`` returns the command [n] m/s2, and the new memory. ``worlds``
-      can include worlds in which no decision is due when ``act`` is called; the results for these worlds are ignored.
+      can include worlds in which no decision is due; the results for these worlds are ignored.
 
     A memory is None, an array with one row per world, or a tuple or mapping of memories. The caller may select or
     replace rows of a memory, or pass the same memory to several calls. For this reason a script must never change a
@@ -33,8 +33,4 @@ class Script(Protocol):
     """
 
     def act(self, *args: Any, **kwargs: Any) -> Any:
-        """Return the commanded acceleration in n worlds, [n] m/s2; a script with memory also returns its new memory.
-
-        A script without memory gets the arguments ``(worlds, vehicle)``, and a script with memory the arguments
-        ``(worlds, memory, vehicle)``.
-        """
+        """Return the commanded acceleration in n worlds, [n] m/s2; a script with memory also returns its new memory."""

@@ -29,7 +29,7 @@ class State(NamedTuple):
 
     @property
     def packed(self) -> Packed:
-        """The worlds packed into two arrays (layout: ``physics.columns``); not a copy."""
+        """The worlds in two arrays (layout: ``physics.columns``); not a copy."""
         return Packed(self.motion, self.params)
 
     @property
@@ -49,7 +49,7 @@ class State(NamedTuple):
 
     @property
     def ledger(self) -> Ledger:
-        """Harm and number of impacts of each pair of vehicles since the episodes began (a copy)."""
+        """Harm and number of impacts of each pair since the episodes began (a copy)."""
         packed, column = self.packed, self.packed.column
         params = packed.params
         weight = params[:, column.harm_weight : column.own_latency]
@@ -72,8 +72,8 @@ class State(NamedTuple):
     def join(states: list[State]) -> State:
         """Return one state that contains the worlds of all ``states``, in the order of ``states``.
 
-        All ``states`` must come from the same engine. Raises ``InvalidInput`` if this engine has a guard (shield),
-        because memories of guards cannot be joined.
+        All ``states`` must come from the same engine. Raises ``InvalidInput`` if this engine has a guard, because
+        memories of guards cannot be joined.
         """
         if states[0].guarded is not None:
             raise InvalidInput("states of an engine with a shield cannot be joined; use an engine without a shield")

@@ -52,11 +52,11 @@ class Roster:
     """Record of which world runs in each row of an engine's arrays, and which worlds could not be advanced.
 
     Args:
-        n: number of rows, one per world.
+        n: number of rows.
         seed: seed of the stream from which the worlds come.
-        first: number of the world in row 0, counted from the beginning of the stream; row k has world ``first + k``. If
-            ``first`` is None, the worlds do not come from the stream.
-        given: the worlds at the alert, if the caller has passed worlds; None: the worlds come from the stream.
+        first: number of the world in row 0, counted from the beginning of the stream; row k has world ``first + k``.
+            None: the worlds do not come from the stream.
+        given: the worlds at the alert, if the caller has passed worlds.
 
     """
 
@@ -74,10 +74,7 @@ class Roster:
         return new
 
     def renew(self, rows: Ints, first: int) -> None:
-        """Record that new worlds of the stream run in the rows with the indices ``rows``.
-
-        The new worlds have the numbers ``first``, ``first + 1``, ... in the stream.
-        """
+        """Record that the worlds with the numbers ``first``, ``first + 1``, ... of the stream now run in ``rows``."""
         self.numbers[rows] = first + np.arange(len(rows))
         for row in self.failed.keys() & rows.tolist() if self.failed else ():
             del self.failed[row]
@@ -85,11 +82,8 @@ class Roster:
     def mark(self, status: Ints, from_s: Floats, until_s: Floats) -> None:
         """Record the worlds that a step could not advance, and give a ``FailedWorld`` warning for each of them.
 
-        Args:
-            status: status code of the physics for each world that could not be advanced, 0 for all other worlds, [n].
-            from_s: time at which the last step began in each world, [n] s.
-            until_s: time at which the last step should have ended in each world, [n] s.
-
+        ``status`` [n] is the status code of the physics, 0 for worlds that were advanced. The last step began at
+        ``from_s`` and should have ended at ``until_s``, [n] s.
         """
         new = FLAG.failure(np.where(status == 0, FLAG.DONE, status), from_s, until_s).worlds
         self.failed |= new
@@ -111,7 +105,7 @@ class Stream:
         deciders: indices (0 = front) of the vehicles at whose decisions the engine's steps begin and end. The first
             decision is at the shortest latency of these vehicles.
         scripts: dictionary from the index of each scripted vehicle to the vehicle's script.
-        seed: seed from which the worlds of the stream are drawn.
+        seed: seed of the stream.
 
     """
 
@@ -147,8 +141,8 @@ class Stream:
     def _fill(self, count: int) -> None:
         """Draw further worlds and advance them to their first decision, so that ``take`` can return ``count`` worlds.
 
-        If a world cannot be advanced to its first decision, the next world that can be advanced is used in its place.
-        So all other worlds keep their numbers in the stream. For each world that cannot be advanced, ``_fill`` gives a
+        If a world cannot be advanced to its first decision, the next world that can be advanced is used in its place,
+        so all other worlds keep their numbers in the stream. For each world that cannot be advanced, ``_fill`` gives a
         ``FailedWorld`` warning.
         """
         first, size = self.position, max(4 * count, SAMPLED_AT_ONCE)
@@ -206,11 +200,7 @@ def check_alert(worlds: Worlds, n: int, vehicles: int) -> None:
 def moved(alert: Worlds, wanted: Floats, start_s: Floats) -> Packed:
     """Return worlds advanced from the alert to their first decision, as packed arrays that include the harm so far.
 
-    Args:
-        alert: n worlds at t = 0.
-        wanted: constant commands of the vehicles until the first decision, [n, N] m/s2.
-        start_s: time of the first decision in each world, [n] s.
-
+    ``wanted`` [n, N] m/s2 are the constant commands until the first decision, at the time ``start_s`` [n] s.
     """
     after, impacts = advance(alert, wanted, until_s=start_s)
     return packed_with(after, impacts)

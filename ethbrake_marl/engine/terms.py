@@ -30,8 +30,10 @@ class Terms:
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
         scenario: scenario whose objective is used if the reward has none.
         learners: indices of the vehicles (0 = front) that learn or, in an evaluation, that the evaluated agent drives.
-        vector: components of the vector reward that ``vector`` returns (``game.reward_vector``); None: there is no
-            vector reward.
+        vector: components of the vector reward (``game.reward_vector``); None: there is no vector reward.
+
+    In the methods, ``before`` is the harm of each pair from the alert to the beginning of the step, and ``state`` is
+    the state after the step.
 
     """
 
@@ -59,11 +61,7 @@ class Terms:
         return 0.0 if self._objectives else self.params.harm
 
     def vector(self, step: Step, before: Ledger, state: State) -> Floats:
-        """Return the vector reward of a step, [n, N, K] for K components; 0 if the episode had ended before the step.
-
-        ``step`` contains the results of the step. ``before`` contains the harm of each pair from the alert to the
-        beginning of the step. ``state`` is the state after the step.
-        """
+        """Return the vector reward of a step, [n, N, K] for K components; 0 if the episode had ended before."""
         vector = vector_of(self.components, state.ledger.since(before), self.params.harm_count, step.terms)
         vector[state.ended & ~step.ended] = 0.0
         return vector
@@ -79,18 +77,10 @@ class Terms:
     ) -> State:
         """Add the reward terms of this class to the reward of a step; return the state with the present potentials.
 
-        Episodes that had ended before the step get the reward 0.
-
-        Args:
-            step: results of the compiled step; its fields ``further`` and ``reward`` are changed in place.
-            state: state after the step.
-            scenario: the scenario of the episodes.
-            before: harm of each pair from the alert to the beginning of the step; None if there are no objectives.
-            impacts_before: impacts from the alert to the beginning of the step; None if no reward term is computed from
-                single impacts.
-            worlds: worlds after the step, from which the potentials after the step are computed; None if the reward is
-                not shaped.
-
+        Episodes that had ended before the step get the reward 0. The fields ``further`` and ``reward`` of ``step``
+        change in place. ``before`` is None if there are no objectives. ``impacts_before`` are the impacts from the
+        alert to the beginning of the step; None if no reward term is computed from single impacts. ``worlds`` are the
+        worlds after the step; None if the reward is not shaped.
         """
         if before is not None and self.params.harm > 0.0:
             step.further["harm"] = -added_harm(before, state.ledger, self.params.harm_count, self._objectives)
@@ -114,7 +104,6 @@ class Terms:
         return state
 
     def _outcome(self, step: Step, state: State, time_step_s: float) -> StepOutcome:
-        """Return the ``StepOutcome`` of the step that led to ``state``, from which measures are computed."""
         motion, params, column = state.motion, state.params, state.packed.column
         return StepOutcome(
             step.first_impact_harm,

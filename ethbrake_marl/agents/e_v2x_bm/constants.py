@@ -6,6 +6,9 @@ methods save computing time:
 - The motion until the vehicle's command takes effect is the same for all decelerations, so it is simulated only once.
 - A simulation ends as soon as no pair can have another impact (``will_stay_apart``).
 - A simulation ends as soon as its harm reaches a given number, because the harm can only grow.
+
+Several functions return a status code: ``FLAG.DONE`` or, if a simulation failed, the code of the failed check of the
+physics.
 """
 
 from __future__ import annotations
@@ -60,24 +63,23 @@ def make_line(
     """Return the tables of one world of N vehicles. Call ``share_start`` next.
 
     Args:
-        gap: gap of each pair, [N - 1] m, bumper to bumper.
+        gap: gap of each pair, [N - 1] m.
         speed: speed of each vehicle, [N] m/s.
         hit: whether each pair has had an impact, [N - 1].
         obstacle: distance from Vehicle 1 to an obstacle ahead, m; infinite without an obstacle.
         obstacle_hit: whether Vehicle 1 has had an impact with the obstacle.
         command: constant command of each vehicle, [N] m/s2; the controlled vehicle's entry is ignored.
-        latency: latency of each vehicle (time from the alert until its command takes effect), [N] s.
+        latency: latency of each vehicle, [N] s.
         mass: mass of each vehicle, [N] t.
         limit: speed limit of each vehicle, [N] m/s.
         in_force: acceleration of each vehicle at the start of the simulations, [N] m/s2.
         brake_rate: rate at which the deceleration of each vehicle rises when it brakes, [N] m/s3.
         release_rate: rate at which the deceleration of each vehicle falls when it releases its brakes, [N] m/s3.
-        pieces: braking profile of each vehicle: K intervals with constant commands, in the format of
-            ``Vehicles.pieces``, [N, 2 K].
+        pieces: braking profile of each vehicle, K pieces, in the format of ``Vehicles.pieces``, [N, 2 K].
         time: time at the start of the simulations, s since the alert.
         restitution: restitution of every impact, 0 to 1.
         horizon: time at the end of the simulations, s since the alert.
-        vehicle: index of the controlled vehicle, from 0.
+        vehicle: index of the controlled vehicle (0 = front).
         total: True: total harm is minimised; False: first-impact harm is minimised.
 
     """
@@ -106,8 +108,7 @@ def make_line(
 def share_start(line: Line) -> int:
     """Simulate the motion in ``line.shared`` until the controlled vehicle's command takes effect.
 
-    The duration (s) of the simulated motion is written to ``line.clock``. Returns ``FLAG.DONE`` or, if the simulation
-    failed, the code of the physics check that failed.
+    The duration (s) of this motion is written to ``line.clock``. Returns a status code.
     """
     table, clock = line.shared, line.clock
     copy_table(line.start, table)
@@ -130,18 +131,10 @@ def share_start(line: Line) -> int:
 def simulate(line: Line, samples: Samples, first: int, end: int, bound: float) -> int:
     """Simulate constant decelerations of the controlled vehicle, and write the results into ``samples``.
 
-    Args:
-        line: the world, for which ``share_start`` was called before; ``line.table`` is overwritten.
-        samples: samples whose decelerations ``samples.at`` are simulated; the results are written to the other arrays
-            of ``samples``.
-        first: index of the first sample to simulate.
-        end: index after the last sample to simulate.
-        bound: a simulation stops when its harm reaches this number, m2/s2. The sample of a stopped simulation has a
-            harm of at least ``bound``, and its ``other`` (harm under the other count) and ``course`` (numbers of
-            impacts) have no meaning.
-
-    Returns ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed.
-
+    ``share_start`` must have been called for ``line``; ``line.table`` is overwritten. The decelerations are
+    ``samples.at[first:end]``. A simulation stops when its harm reaches ``bound`` (m2/s2). The sample of a stopped
+    simulation has a harm of at least ``bound``, and its ``other`` and ``course`` have no meaning. Returns a status
+    code.
     """
     for s in range(first, end):
         if s > first and samples.at[s] == samples.at[s - 1]:
@@ -158,10 +151,7 @@ def simulate(line: Line, samples: Samples, first: int, end: int, bound: float) -
 
 @compiled(within=True)
 def _simulate_one(line: Line, command: float, bound: float) -> int:
-    """Simulate the controlled vehicle's ``command`` (m/s2) in ``line.table`` until the harm reaches ``bound`` (m2/s2).
-
-    Returns ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed.
-    """
+    """Simulate one ``command`` (m/s2) of the controlled vehicle until the harm reaches ``bound`` (m2/s2)."""
     table, duration = line.table, line.clock[DURATION]
     table[ROW.COMMAND, line.controlled] = command
     _copy_state(line.start, table)
@@ -203,7 +193,6 @@ def _copy_state(of: Floats, table: Floats) -> None:
 
 @compiled(within=True)
 def copy_table(one: Floats, other: Floats) -> None:
-    """Copy every entry of the table ``one`` into the table ``other`` of the same shape."""
     for row in range(one.shape[0]):
         for i in range(one.shape[1]):
             other[row, i] = one[row, i]
@@ -213,9 +202,9 @@ def copy_table(one: Floats, other: Floats) -> None:
 def will_stay_apart(table: Floats) -> bool:
     """Return whether it is certain that no pair has another impact while the present commands last.
 
-    ``table`` is the table of one world (``physics.rows``). The result is False if a command is not yet in full effect,
-    or if a vehicle drives or moves backward. In all other cases every vehicle keeps its acceleration until it is at
-    rest, and vehicles that press against each other have the same acceleration.
+    The result is False if a command is not yet in full effect, or if a vehicle drives or moves backward. In all other
+    cases every vehicle keeps its acceleration until it is at rest, and vehicles that press against each other have the
+    same acceleration.
 
     Let f be the front vehicle and r the rear vehicle of a pair, with the gap g, the closing speed w, the speeds v_f and
     v_r, and the decelerations d_f and d_r. Each of the following conditions is enough to exclude an impact of the pair:
@@ -223,12 +212,11 @@ def will_stay_apart(table: Floats) -> bool:
     * Vehicle r is at rest, or vehicles r and f move as one body.
     * The closing speed is at most 0 (``w <= 0``), and r brakes at least as hard as f (``d_r >= d_f``), so w stays at
       most 0 until r is at rest.
-    * The following three statements are all true, with margins for rounding errors. First, front vehicle f and rear
-      vehicle r do not touch, or the gap between f and r grows. Second, without an impact, rear vehicle r would stop
-      behind front vehicle f: ``g + v_f^2 / (2 d_f) > v_r^2 / (2 d_r)``. Third, if r closes in and brakes harder than f,
-      the smallest gap is positive: ``w^2 < 2 (d_r - d_f) g``.
-      (If r brakes less hard than f, the gap is smallest now or at the end of the motion: until f is at rest, the gap is
-      a concave function of time; after that, the gap decreases.)
+    * The following three statements are all true, with margins for rounding errors. First, the vehicles do not touch,
+      or their gap grows. Second, without an impact, r would stop behind f: ``g + v_f^2 / (2 d_f) > v_r^2 / (2 d_r)``.
+      Third, if r closes in and brakes harder than f, the smallest gap is positive: ``w^2 < 2 (d_r - d_f) g``. (If r
+      brakes less hard than f, the gap is smallest now or at the end of the motion: until f is at rest, the gap is a
+      concave function of time; after that, the gap decreases.)
     """
     vehicles, hardest = table.shape[1], 0.0
     if pieces_to_come(table):
@@ -267,7 +255,7 @@ def will_stay_apart(table: Floats) -> bool:
 
 @compiled(within=True)
 def _way_to_stop(speed: float, acceleration: float) -> float:
-    """Return the distance (m) in which a vehicle with ``speed`` (m/s) and ``acceleration`` (m/s2, at most 0) stops.
+    """Return the distance (m) in which a vehicle stops; ``acceleration`` (m/s2) is at most 0.
 
     For a moving vehicle with acceleration 0 the distance is infinite.
     """

@@ -8,9 +8,9 @@ gap            bumper to bumper at the start [m], >= 0
 v_l, v_f       speeds at the start [m/s], >= 0
 a_l, a_f       decelerations [m/s2], >= 0, constant to standstill
 onset_l/_f     time from the start until the vehicle brakes [s]; until then it coasts
-tau            time from ``onset_l`` to ``onset_f`` if the leader brakes first [s], >= 0
-lead           time from ``onset_f`` to ``onset_l`` if the follower brakes first [s], > 0
-w              closing speed ``v_f - v_l`` [m/s]
+tau            time until the follower brakes, if the leader brakes from the start [s], >= 0
+lead           time until the leader brakes, if the follower brakes from the start [s], > 0
+w              closing speed ``v_f - v_l`` at the start [m/s]
 =============  ========================================================================
 
 The formulas use only + - * / and sqrt. Therefore the result for a world has the same bits in every batch of worlds.
@@ -32,10 +32,7 @@ _NONE = -1.0
 
 @compiled
 def stopping_time(speed: float, deceleration: float) -> float:
-    """Return the time (s) in which a vehicle stops: 0 if it is at rest, inf if it moves and does not brake.
-
-    The stopping time is ``speed / deceleration``, with the speed in m/s and the deceleration in m/s2.
-    """
+    """Return the time (s) in which a vehicle stops: 0 if it is at rest, inf if it moves and does not brake."""
     if speed == 0.0:
         return 0.0
     return speed / deceleration
@@ -43,10 +40,7 @@ def stopping_time(speed: float, deceleration: float) -> float:
 
 @compiled
 def stopping_distance(speed: float, deceleration: float) -> float:
-    """Return the distance (m) in which a vehicle stops: 0 if it is at rest, inf if it moves and does not brake.
-
-    The stopping distance is ``speed^2 / (2 deceleration)``, with the speed in m/s and the deceleration in m/s2.
-    """
+    """Return the distance (m) in which a vehicle stops: 0 if it is at rest, inf if it moves and does not brake."""
     if speed == 0.0:
         return 0.0
     return speed * speed / (2.0 * deceleration)
@@ -58,14 +52,6 @@ def contact_while_coasting(gap: float, v_l: float, a_l: float, v_f: float, tau: 
 
     docs/internals/proofs/constant-deceleration.md calls such a contact regime A if the leader still moves, and regime
     A' if the leader is at rest.
-
-    Args:
-        gap: gap between leader and follower at the start of the motion, m.
-        v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
-        a_l: the leader's constant deceleration from the start of the motion to standstill, m/s2, >= 0.
-        v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
-        tau: time for which the follower coasts before it brakes, s.
-
     """
     w = v_f - v_l
     stop_l = stopping_time(v_l, a_l)
@@ -87,15 +73,6 @@ def contact_while_both_brake(gap: float, v_l: float, a_l: float, v_f: float, a_f
     """Return the squared closing speed (m2/s2) of a contact while both vehicles brake and move, otherwise -1.
 
     docs/internals/proofs/constant-deceleration.md calls such a contact regime B.
-
-    Args:
-        gap: gap between leader and follower at the start of the motion, m.
-        v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
-        a_l: the leader's constant deceleration from the start of the motion to standstill, m/s2, >= 0.
-        v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
-        a_f: the follower's constant deceleration from the time ``tau`` to standstill, m/s2, >= 0.
-        tau: time for which the follower coasts before it brakes, s.
-
     """
     stop_l = stopping_time(v_l, a_l)
     if not stop_l > tau:
@@ -117,17 +94,7 @@ def contact_while_both_brake(gap: float, v_l: float, a_l: float, v_f: float, a_f
 
 @compiled
 def contact_leader_first(gap: float, v_l: float, a_l: float, v_f: float, a_f: float, tau: float) -> float:
-    """Return the squared closing speed (m2/s2) at the first contact if the leader brakes first; 0 without contact.
-
-    Args:
-        gap: gap between leader and follower at the start of the motion, m.
-        v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
-        a_l: the leader's constant deceleration from the start of the motion to standstill, m/s2, >= 0.
-        v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
-        a_f: the follower's constant deceleration from the time ``tau`` to standstill, m/s2, >= 0.
-        tau: time for which the follower coasts before it brakes, s.
-
-    """
+    """Return the squared closing speed (m2/s2) at the first contact if the leader brakes first; 0 without contact."""
     squared = contact_while_coasting(gap, v_l, a_l, v_f, tau)
     if squared < 0.0:
         squared = contact_while_both_brake(gap, v_l, a_l, v_f, a_f, tau)
@@ -145,14 +112,7 @@ def contact_before_leader_brakes(gap: float, w: float, a_f: float, lead: float) 
     """Return the squared closing speed (m2/s2) if a braking follower hits a leader that still coasts, otherwise -1.
 
     The follower reaches the coasting leader at the time ``2 gap / (w + sqrt(w^2 - 2 a_f gap))``, if this time is at
-    most ``lead``. A touch (contact without an impact) is ignored, because the two vehicles separate again after it.
-
-    Args:
-        gap: gap between leader and follower at the start of the motion, m.
-        w: closing speed at the start of the motion: the follower's speed minus the leader's, m/s.
-        a_f: the follower's constant deceleration from the start of the motion, m/s2, >= 0.
-        lead: time for which the leader coasts before it brakes, s.
-
+    most ``lead``. A touch is ignored, because the two vehicles separate again after it.
     """
     squared = w * w - 2.0 * a_f * gap
     if w > 0.0 and squared > TOUCH_SQUARED and 2.0 * gap / (w + math.sqrt(squared)) <= lead:
@@ -164,18 +124,7 @@ def contact_before_leader_brakes(gap: float, w: float, a_f: float, lead: float) 
 def closing_speed_squared(
     gap: float, v_l: float, a_l: float, onset_l: float, v_f: float, a_f: float, onset_f: float
 ) -> float:
-    """Return the squared closing speed (m2/s2) at the pair's first impact, or 0 if there is no impact.
-
-    Args:
-        gap: gap between leader and follower at the start of the motion, m.
-        v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
-        a_l: the leader's constant deceleration from the time ``onset_l`` to standstill, m/s2, >= 0.
-        onset_l: time for which the leader coasts before it brakes, s.
-        v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
-        a_f: the follower's constant deceleration from the time ``onset_f`` to standstill, m/s2, >= 0.
-        onset_f: time for which the follower coasts before it brakes, s.
-
-    """
+    """Return the squared closing speed (m2/s2) at the pair's first impact, or 0 if there is no impact."""
     w = v_f - v_l
     both_coast = min(onset_l, onset_f)
     if w > 0.0 and gap <= w * both_coast:
@@ -196,18 +145,7 @@ def closing_speed_squared(
 
 @compiled
 def least_behind_braking(gap: float, v_l: float, a_l: float, v_f: float, tau: float) -> float:
-    """Return the follower's smallest deceleration (m/s2) that avoids an impact; inf if every deceleration leads to one.
-
-    This function is for the case that the leader brakes first; ``least_to_spare_front`` covers all cases.
-
-    Args:
-        gap: gap between leader and follower at the start of the motion, m.
-        v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
-        a_l: the leader's constant deceleration from the start of the motion to standstill, m/s2, > 0.
-        v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
-        tau: time for which the follower coasts before it brakes, s, >= 0.
-
-    """
+    """Return ``least_to_spare_front`` (m/s2) if the leader brakes from the start; ``a_l`` is above 0."""
     coasting = contact_while_coasting(gap, v_l, a_l, v_f, tau)
     if coasting > TOUCH_SQUARED:
         return math.inf
@@ -226,19 +164,7 @@ def least_behind_braking(gap: float, v_l: float, a_l: float, v_f: float, tau: fl
 
 @compiled
 def least_behind_coasting(gap: float, v_l: float, a_l: float, v_f: float, lead: float) -> float:
-    """Return the follower's smallest deceleration (m/s2) that avoids an impact; inf if every deceleration leads to one.
-
-    This function is for the case that the follower brakes from the start of the motion, before the leader.
-    ``least_to_spare_front`` covers all cases.
-
-    Args:
-        gap: gap between leader and follower at the start of the motion, m.
-        v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
-        a_l: the leader's constant deceleration from the time ``lead`` to standstill, m/s2, > 0.
-        v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
-        lead: time for which the leader coasts before it brakes, s, > 0.
-
-    """
+    """Return ``least_to_spare_front`` (m/s2) if the follower brakes from the start; ``a_l`` is above 0."""
     if v_f == 0.0:
         return 0.0
     w = v_f - v_l
@@ -257,18 +183,9 @@ def least_behind_coasting(gap: float, v_l: float, a_l: float, v_f: float, lead: 
 def least_to_spare_front(gap: float, v_l: float, a_l: float, onset_l: float, v_f: float, onset_f: float) -> float:
     """Return the follower's smallest deceleration (m/s2) that avoids an impact; inf if every deceleration leads to one.
 
-    With a larger deceleration the follower is further back at every moment. Therefore every larger deceleration avoids
-    the impact as well. With the smallest deceleration that avoids an impact, the follower stops directly behind the
-    leader, or the two vehicles touch with equal speeds while both move.
-
-    Args:
-        gap: gap between leader and follower at the start of the motion, m.
-        v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
-        a_l: the leader's constant deceleration from the time ``onset_l`` to standstill, m/s2, > 0.
-        onset_l: time for which the leader coasts before it brakes, s.
-        v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
-        onset_f: time for which the follower coasts before it brakes, s.
-
+    ``a_l`` must be above 0. With a larger deceleration the follower is further back at every moment. Therefore every
+    larger deceleration avoids the impact as well. With the smallest deceleration that avoids an impact, the follower
+    stops directly behind the leader, or the two vehicles touch with equal speeds while both move.
     """
     w = v_f - v_l
     both_coast = min(onset_l, onset_f)
@@ -282,19 +199,7 @@ def least_to_spare_front(gap: float, v_l: float, a_l: float, onset_l: float, v_f
 
 @compiled
 def most_ahead_of_coasting(gap: float, v_l: float, v_f: float, a_f: float, tau: float) -> float:
-    """Return the leader's largest deceleration (m/s2) that avoids an impact; inf if all avoid it, -inf if none does.
-
-    This function is for the case that the leader brakes from the start of the motion, before the follower.
-    ``most_to_spare_rear`` covers all cases.
-
-    Args:
-        gap: gap between leader and follower at the start of the motion, m.
-        v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
-        v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
-        a_f: the follower's constant deceleration from the time ``tau`` to standstill, m/s2, > 0.
-        tau: time for which the follower coasts before it brakes, s, >= 0.
-
-    """
+    """Return ``most_to_spare_rear`` (m/s2) if the leader brakes from the start; ``a_f`` is above 0."""
     reach = v_f * tau + stopping_distance(v_f, a_f)
     touching = gap == 0.0 and v_f == v_l  # in contact from the start: no impact
     if reach <= gap or touching:
@@ -313,18 +218,9 @@ def most_ahead_of_coasting(gap: float, v_l: float, v_f: float, a_f: float, tau: 
 def most_to_spare_rear(gap: float, v_l: float, onset_l: float, v_f: float, a_f: float, onset_f: float) -> float:
     """Return the leader's largest deceleration (m/s2) that avoids an impact; inf if all avoid it, -inf if none does.
 
-    With a smaller deceleration the leader is further ahead at every moment. Therefore every smaller deceleration avoids
-    the impact as well. If the follower brakes first, the motion until the leader brakes is computed first, because this
-    motion does not depend on the leader's deceleration.
-
-    Args:
-        gap: gap between leader and follower at the start of the motion, m.
-        v_l: speed of the leader (front vehicle) at the start of the motion, m/s.
-        onset_l: time for which the leader coasts before it brakes, s.
-        v_f: speed of the follower (rear vehicle) at the start of the motion, m/s.
-        a_f: the follower's constant deceleration from the time ``onset_f`` to standstill, m/s2, > 0.
-        onset_f: time for which the follower coasts before it brakes, s.
-
+    ``a_f`` must be above 0. With a smaller deceleration the leader is further ahead at every moment. Therefore every
+    smaller deceleration avoids the impact as well. If the follower brakes first, the motion until the leader brakes is
+    computed first, because this motion does not depend on the leader's deceleration.
     """
     w = v_f - v_l
     both_coast = min(onset_l, onset_f)

@@ -58,17 +58,17 @@ def optimise_coupled(
 ) -> CoupledOptimum:
     """Return, for each world, the constant deceleration of ``vehicle`` with the least harm in a simulation.
 
-    If the deceleration that the closed form (``optimise_pairwise``) chooses does no harm in a simulation, this
-    deceleration is the result. If this deceleration does harm, the search simulates evenly spaced decelerations and the
-    breakpoints of the closed form. As a function of the deceleration, the harm may jump where the number of impacts
-    changes. The jumps and local minima with the least harm are located to 1e-9 m/s2; at a jump the result lies on the
-    side with less harm. If several decelerations have the least harm, those with the least harm under the other harm
-    count remain, and the middle one of these is the result. The result for a world does not depend on the other worlds.
+    If the deceleration of the closed form (``optimise_pairwise``) does no harm in a simulation, this deceleration is
+    the result. Otherwise the search simulates evenly spaced decelerations and the breakpoints of the closed form. As a
+    function of the deceleration, the harm may jump where the number of impacts changes. The jumps and local minima with
+    the least harm are located to 1e-9 m/s2; at a jump the result lies on the side with less harm. If several
+    decelerations have the least harm, those with the least harm under the other harm count remain, and the middle one
+    of these is the result. The result for a world does not depend on the other worlds.
 
     Args:
         worlds: n worlds of N vehicles.
-        vehicle: index of the controlled vehicle, from 0.
-        harm_count: harm to minimise: ``first`` (harm of each pair's first impact) or ``total`` (harm of all impacts).
+        vehicle: index of the controlled vehicle (0 = front).
+        harm_count: harm to minimise: ``first`` (first-impact harm) or ``total`` (total harm).
         horizon_s: time at the end of the simulations, s since the alert.
         others_mps2: constant commands of the other vehicles, [n, N] m/s2; the controlled vehicle's column is ignored.
             None: all other vehicles brake fully.
@@ -102,18 +102,11 @@ def optimise_coupled(
 def _minimise(
     worlds: Worlds, told: Worlds, command: Floats, vehicle: int, rows: Ints, harm_count: HarmCount, horizon_s: float
 ) -> Floats:
-    """Return, for each of m worlds, the best deceleration, its harm, and its harm under the other harm count, [3, m].
+    """Return, for each of the m worlds with the indices ``rows``, the three results of ``search_line``, [3, m].
 
-    Args:
-        worlds: n worlds.
-        told: the same worlds with other braking capacities, because the closed form assumes full braking: the capacity
-            of each braking vehicle except ``vehicle`` is replaced by the deceleration in ``command``.
-        command: constant commands of all vehicles, [n, N] m/s2; the controlled vehicle's column is ignored.
-        vehicle: index of the controlled vehicle, from 0.
-        rows: indices of the worlds for which the best deceleration is searched, [m].
-        harm_count: harm to minimise: ``first`` (harm of each pair's first impact) or ``total`` (harm of all impacts).
-        horizon_s: time at the end of the simulations, s since the alert.
-
+    ``command`` [n, N] m/s2 are the constant commands of all vehicles; the controlled vehicle's column is ignored.
+    ``told`` are the same worlds with other braking capacities, because the closed form assumes full braking: the
+    capacity of each braking vehicle except ``vehicle`` is replaced by the deceleration in ``command``.
     """
     v = worlds.vehicles
     lines = (
@@ -153,13 +146,11 @@ def _search_worlds(
     release_rate: Floats, pieces: Floats, restitution: Floats, vehicle: int, rows: Ints, total: bool, horizon: float,
     found: Floats, status: Ints,
 ) -> None:  # fmt: skip
-    """Search for the best deceleration of ``vehicle`` (index) in the worlds with the indices ``rows`` [m].
+    """Search for the best deceleration of ``vehicle`` in the m worlds with the indices ``rows``.
 
-    For each of these m worlds, ``found`` [3, m] receives the best deceleration (m/s2), its harm, and its harm under the
-    other harm count (m2/s2). ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed is
-    written to ``status`` [m]. ``capacity`` [n, N] are the braking capacities (m/s2), and ``onset`` [n, N] are the times
-    from now until each vehicle may brake (s). The other arguments have the same meaning as in ``make_line``, with a new
-    first axis for the n worlds.
+    ``found`` [3, m] receives the results of ``search_line``, and ``status`` [m] its status codes. ``capacity`` [n, N]
+    are the braking capacities (m/s2), and ``onset`` [n, N] are the times from now until each vehicle may brake (s). The
+    other arguments are as in ``make_line``, with a new first axis for the n worlds.
     """
     room, at, best = make_room(), np.empty(CANDIDATES), np.empty(3)
     for m in range(rows.shape[0]):
@@ -181,12 +172,10 @@ class EV2XBM:
     """Agent that brakes with the constant deceleration a* that is predicted to do the least harm.
 
     Args:
-        mode: ``coupled`` minimises the harm in a simulation of the whole line. In mode ``coupled`` the agent assumes
-            that the other vehicles follow their scripts, and that vehicles without a script (learners) brake fully.
-            ``pairwise`` is the paper's closed form, which assumes that all other vehicles brake fully and that impacts
-            change no speed.
-        harm_count: harm that mode ``coupled`` minimises: ``first`` (harm of each pair's first impact) or ``total``
-            (harm of all impacts).
+        mode: ``coupled`` minimises the harm in a simulation of the whole line, and assumes that the other vehicles
+            follow their scripts, and that vehicles without a script (learners) brake fully. ``pairwise`` is the paper's
+            closed form, which assumes that all other vehicles brake fully and that impacts change no speed.
+        harm_count: harm that mode ``coupled`` minimises: ``first`` (first-impact harm) or ``total`` (total harm).
         horizon_s: time at the end of the simulations in mode ``coupled``, s since the alert.
 
     The agent's memory contains ``deceleration_mps2`` [n], which is a*, and ``predicted_harm`` [n] (m2/s2), which is the
@@ -205,14 +194,7 @@ class EV2XBM:
         self._mode, self._harm_count, self._horizon_s = mode, harm_count, horizon_s
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Choose the best deceleration a* of each world at the alert, and return the agent's memory, which contains a*.
-
-        Args:
-            alert: n worlds at the alert.
-            vehicle: index of the controlled vehicle (0 = front).
-            scripts: mapping from the index of each scripted vehicle to its script.
-
-        """
+        """Choose the best deceleration a* of each world at the alert, and return the agent's memory."""
         if self._mode == "pairwise":
             refuse_untold(alert, [vehicle], f"agent {self.name!r}", LOOK_AHEAD[:-1])  # needs no masses
             closed = optimise_pairwise(alert, vehicle)
@@ -239,10 +221,7 @@ class EV2XBM:
 
 
 def make_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
-    """Make E-V2X-BM with the horizon and harm count of ``settings``.
-
-    ``argument`` is the mode: ``pairwise`` or ``coupled``; None means ``coupled``.
-    """
+    """Make E-V2X-BM with the horizon and harm count of ``settings``; ``argument`` None means the mode ``coupled``."""
     if argument not in (None, "coupled", "pairwise"):
         then = "".join(f", then {variant!r}" for variant in variants_of("e_v2x_bm"))
         raise InvalidInput(f"agent {settings.spec!r}: after the first colon, write 'coupled' or 'pairwise'{then}")

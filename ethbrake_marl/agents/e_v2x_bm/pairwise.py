@@ -7,6 +7,10 @@ front and the pair behind do not influence each other. The predicted harm is ``H
 speeds (m/s) at its first contact with the vehicle in front and with the vehicle behind. A formula yields a few
 decelerations, called *breakpoints*. Between two neighbouring breakpoints H(a) is concave, so H(a) is least at a
 breakpoint. docs/internals/proofs/constant-deceleration.md has the derivation.
+
+Arguments that several functions share, for one world: index ``i`` of the controlled vehicle (0 = front), gaps ``gap``
+[P] m, speeds ``speed`` [N] m/s, braking capacities ``capacity`` [N] m/s2, and ``onset`` [N] s, the time from now until
+each vehicle may brake. Arguments for n worlds have a first axis of length n.
 """
 
 from __future__ import annotations
@@ -46,22 +50,16 @@ class PairwiseOptimum(NamedTuple):
 def early_breakpoints(gap: float, w: float, onset_l: float, onset_f: float) -> tuple[float, float]:
     """Return two decelerations (m/s2) of the follower: at the first, the pair's harm has a kink; at the second, a jump.
 
-    Both decelerations are 0 unless the follower may brake before the leader (front vehicle). In the formulas, ``w`` is
-    the closing speed, ``gap`` is the gap at the moment when the follower begins to brake, and ``lead`` is the time from
-    this moment until the leader begins to brake.
+    Both decelerations are 0 unless the follower may brake before the leader (front vehicle). ``onset_l`` and
+    ``onset_f`` are the times (s) from now until the leader begins to brake and until the follower may brake; ``gap``
+    (m) and the closing speed ``w`` (m/s) are the values now. In the formulas, however, ``gap`` is the gap at the moment
+    when the follower begins to brake, and ``lead`` is the time from this moment until the leader begins to brake.
 
     - Kink, at ``2 (w lead - gap) / lead^2``: with this deceleration, the contact happens exactly when the leader begins
       to brake.
     - Jump, at ``w^2 / (2 gap)``: with a slightly smaller deceleration, the follower strikes the coasting leader
       lightly. With a larger deceleration, the follower does not reach the coasting leader, but may strike the leader
       harder once the leader brakes. The returned deceleration lies just below the jump, where the impact is lightest.
-
-    Args:
-        gap: gap at the present time, m.
-        w: closing speed at the present time: the follower's speed minus the leader's, m/s.
-        onset_l: time from now until the leader begins to brake, s.
-        onset_f: time from now until the follower may begin to brake, s.
-
     """
     lead = onset_l - onset_f
     if lead <= 0.0:
@@ -72,11 +70,9 @@ def early_breakpoints(gap: float, w: float, onset_l: float, onset_f: float) -> t
 
 @compiled
 def front_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats) -> float:
-    """Return the predicted harm of an impact of vehicle ``i`` with the vehicle in front, m2/s2; 0 for Vehicle 1.
+    """Return the predicted harm (m2/s2) of an impact of vehicle ``i`` with the vehicle in front; 0 for Vehicle 1.
 
-    Vehicle ``i`` brakes with ``a`` m/s2, and the vehicle in front brakes with its full capacity. The world has the gaps
-    ``gap`` [P] m, the speeds ``speed`` [N] m/s and the braking capacities ``capacity`` [N] m/s2. Vehicle k may brake
-    after ``onset[k]`` seconds.
+    Vehicle ``i`` brakes with ``a`` m/s2, and the vehicle in front brakes with its full capacity.
     """
     if i == 0:
         return 0.0
@@ -85,11 +81,9 @@ def front_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, o
 
 @compiled
 def rear_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats) -> float:
-    """Return the predicted harm of an impact of vehicle ``i`` with the vehicle behind, m2/s2; 0 for the last vehicle.
+    """Return the predicted harm (m2/s2) of an impact of vehicle ``i`` with the vehicle behind; 0 for the last vehicle.
 
-    Vehicle ``i`` brakes with ``a`` m/s2, and the vehicle behind brakes with its full capacity. The world has the gaps
-    ``gap`` [P] m, the speeds ``speed`` [N] m/s and the braking capacities ``capacity`` [N] m/s2. Vehicle k may brake
-    after ``onset[k]`` seconds.
+    Vehicle ``i`` brakes with ``a`` m/s2, and the vehicle behind brakes with its full capacity.
     """
     if i == gap.shape[0]:
         return 0.0
@@ -104,8 +98,7 @@ def find_breakpoints(
 
     All decelerations in ``at`` are in [0, braking capacity]. Returns two more decelerations (m/s2), which may be
     infinite: the smallest deceleration that avoids an impact with the vehicle in front, and the largest deceleration
-    that avoids an impact with the vehicle behind. The world has the gaps ``gap`` [P] m, the speeds ``speed`` [N] m/s
-    and the braking capacities ``capacity`` [N] m/s2. Vehicle k may brake after ``onset[k]`` seconds.
+    that avoids an impact with the vehicle behind.
     """
     low, high = 0.0, math.inf
     at[:] = 0.0
@@ -131,10 +124,9 @@ def minimise_over(
 ) -> tuple[float, float]:
     """Return the deceleration (m/s2) of vehicle ``i`` for which the predicted harm is least, and this harm (m2/s2).
 
-    Only the six decelerations in ``at`` (m/s2) are compared. If several of these decelerations have the least harm,
-    consider the middle between the smallest and the largest of them: if the middle has the least harm as well, the
-    middle is returned; if not, the smallest one is returned. The world has the gaps ``gap`` [P] m, the speeds ``speed``
-    [N] m/s and the braking capacities ``capacity`` [N] m/s2. Vehicle k may brake after ``onset[k]`` seconds.
+    Only the six decelerations in ``at`` (m/s2) are compared. If several of them have the least harm, consider the
+    middle between the smallest and the largest of these: if the middle has the least harm as well, the middle is
+    returned; if not, the smallest one is returned.
     """
     best, first, last = math.inf, 0.0, 0.0
     for k in range(at.shape[0]):
@@ -160,11 +152,8 @@ def optimise_worlds(
 ) -> None:
     """Find the best constant deceleration of vehicle ``i`` in n worlds, in closed form.
 
-    The function writes its results to ``at`` [n, 6] and ``out`` [4, n]. ``at`` receives the decelerations that
-    ``find_breakpoints`` writes (m/s2). ``out`` receives the best deceleration, its predicted harm, and the two
-    decelerations that ``find_breakpoints`` returns. The worlds have the gaps ``gaps`` [n, P] m, the speeds ``speeds``
-    [n, N] m/s and the braking capacities ``capacity`` [n, N] m/s2. In world k, vehicle j may brake after ``onset[k,
-    j]`` seconds.
+    ``at`` [n, 6] receives the decelerations that ``find_breakpoints`` writes (m/s2). ``out`` [4, n] receives the best
+    deceleration, its predicted harm, and the two decelerations that ``find_breakpoints`` returns.
     """
     for k in range(gaps.shape[0]):
         low, high = find_breakpoints(at[k], i, gaps[k], speeds[k], capacity[k], onset[k])
@@ -180,9 +169,8 @@ def optimise_worlds(
 def contacts_of_worlds(gaps: Floats, speeds: Floats, deceleration: Floats, onset: Floats, out: Floats) -> None:
     """Write to ``out`` [n, P] the squared closing speed (m2/s2) at each pair's first impact, or 0 without an impact.
 
-    It is assumed that impacts change no speed, so that pairs do not influence each other. The worlds have the gaps
-    ``gaps`` [n, P] m and the speeds ``speeds`` [n, N] m/s. In world k, vehicle j coasts for ``onset[k, j]`` seconds and
-    then brakes with the constant ``deceleration[k, j]`` m/s2.
+    It is assumed that impacts change no speed, so that pairs do not influence each other. In world k, vehicle j coasts
+    for ``onset[k, j]`` seconds and then brakes with the constant ``deceleration[k, j]`` m/s2.
     """
     for k in range(gaps.shape[0]):
         for p in range(gaps.shape[1]):
@@ -195,11 +183,10 @@ def contacts_of_worlds(gaps: Floats, speeds: Floats, deceleration: Floats, onset
 def optimise_pairwise(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
     """Return the best constant deceleration a* of ``vehicle`` (index from 0) in every world, in closed form.
 
-    ``a*`` minimises ``H(a) = c_front^2 + c_rear^2`` over ``a`` in [0, capacity], where ``c_front`` and ``c_rear`` are
-    the closing speeds (m/s) at the first contacts with the two neighbours. If an interval of decelerations avoids both
-    impacts, ``a*`` is the middle of this interval; otherwise ``a*`` is the breakpoint with the least H. The first and
-    the last vehicle of a line have one neighbour, so H has only one of the two terms. Only gaps, speeds, capacities and
-    latencies of the vehicle and its neighbours are used.
+    ``a*`` minimises the predicted harm ``H(a)`` (module docstring) over ``a`` in [0, capacity]. If an interval of
+    decelerations avoids both impacts, ``a*`` is the middle of this interval; otherwise ``a*`` is the breakpoint with
+    the least H. The first and the last vehicle of a line have one neighbour, so H has only one of the two terms. Only
+    gaps, speeds, capacities and latencies of the vehicle and its neighbours are used.
 
     Raises ``InvalidInput`` if ``vehicle`` is not in the line, if a vehicle moves backward, or if brakes build up
     gradually.
@@ -220,15 +207,11 @@ def closed_form(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
 def pairwise_harm(worlds: Worlds, deceleration_mps2: ArrayLike) -> Floats:
     """Return the predicted harm of each pair, [n, P] m2/s2, as if no pair influenced another pair.
 
-    Every vehicle coasts until its latency has elapsed, and then brakes with its constant deceleration to rest. The harm
-    that E-V2X-BM predicts for a vehicle is the sum of the predicted harms of the pairs that contain this vehicle.
-
-    Args:
-        worlds: n worlds.
-        deceleration_mps2: constant deceleration of each vehicle, [n, N] m/s2, or a shape that broadcasts to [n, N].
+    Every vehicle coasts until its latency has elapsed, and then brakes to rest with the constant ``deceleration_mps2``,
+    [n, N] or a shape that broadcasts to [n, N]. The harm that E-V2X-BM predicts for a vehicle is the sum of the
+    predicted harms of the pairs that contain this vehicle.
 
     Raises ``InvalidInput`` for a deceleration that is negative or not finite, and for brakes that build up gradually.
-
     """
     worlds.refuse_build_up("the closed form of E-V2X-BM and planner")
     onset = onset_s(worlds, 0)

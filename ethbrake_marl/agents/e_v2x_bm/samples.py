@@ -37,7 +37,7 @@ def make_samples(most: int) -> Samples:
 
 @compiled(bare=True)
 def copy_sample(one: Samples, k: int, other: Samples, to: int) -> None:
-    """Copy the sample with the index ``k`` in ``one`` to the index ``to`` in ``other``."""
+    """Copy sample ``k`` of ``one`` to the index ``to`` in ``other``."""
     other.at[to] = one.at[k]
     other.harm[to] = one.harm[k]
     other.other[to] = one.other[k]
@@ -48,7 +48,7 @@ def copy_sample(one: Samples, k: int, other: Samples, to: int) -> None:
 def merge(one: Samples, n: int, other: Samples, m: int, into: Samples) -> None:
     """Merge the first ``n`` samples of ``one`` with the first ``m`` of ``other``; both are sorted by deceleration.
 
-    The first ``n + m`` samples of ``into`` are overwritten with the merged samples, sorted by deceleration.
+    The first ``n + m`` samples of ``into`` are overwritten with the result, which is sorted as well.
     """
     i, j = 0, 0
     for to in range(n + m):
@@ -109,8 +109,8 @@ def least_harm(samples: Samples, n: int) -> float:
 def find_smallest(values: Floats, n: int, places: Ints) -> None:
     """Write the indices of the smallest of the first ``n`` entries of ``values`` to ``places``, smallest entry first.
 
-    The length of ``places``, at most ``n``, is the number of entries to find. Of equal values, the one with the lower
-    index comes first.
+    As many indices are written as ``places`` has entries, at most ``n``. Of equal values, the one with the lower index
+    comes first.
     """
     count = 0
     for k in range(n):
@@ -128,8 +128,8 @@ def find_smallest(values: Floats, n: int, places: Ints) -> None:
 def find_minima(samples: Samples, n: int, depth: Floats, places: Ints) -> None:
     """Write to ``places`` the indices of the lowest local minima among the first ``n`` samples, lowest harm first.
 
-    ``depth`` [n or more] is overwritten: with the harm at each local minimum, and with infinity at all other samples.
-    If there are fewer local minima than entries in ``places``, the remaining entries are indices of other samples.
+    ``depth`` [n or more] receives the harm at each local minimum, and infinity at all other samples. If there are fewer
+    local minima than entries in ``places``, the remaining entries are indices of other samples.
     """
     for k in range(n):
         falls = k == 0 or samples.harm[k] < samples.harm[k - 1]
@@ -142,7 +142,7 @@ def find_minima(samples: Samples, n: int, depth: Floats, places: Ints) -> None:
 def choose(samples: Samples, n: int, room: Floats) -> float:
     """Return the deceleration (m/s2) with the least harm among the first ``n`` samples.
 
-    If several samples have the least harm, those with the least harm under the other harm count (``other``) remain, and
+    Of several samples with the least harm, those with the least harm under the other harm count (``other``) remain, and
     the middle one of these is returned. ``room`` [n or more] is an array for intermediate results. The function is
     faster if the samples are sorted.
     """

@@ -1,9 +1,12 @@
 """The coupled search for the best constant deceleration in one world, in five steps. Compiled.
 
-The search simulates evenly spaced decelerations, then more decelerations where the harm may be least. Then the search
-simulates decelerations around local minima and around *borders*, at which the number of impacts changes. If the result
-lies close to a jump of the harm, the search finally moves the result away from the jump. docs/evaluate.md gives the
-reasons for these steps.
+The search simulates evenly spaced decelerations (the *grid*), then more decelerations where the harm may be least. Then
+the search simulates decelerations around local minima and around *borders*, at which the number of impacts changes. If
+the result lies close to a jump of the harm, the search finally moves the result away from the jump. docs/evaluate.md
+gives the reasons for these steps.
+
+Each function that simulates returns a status code: ``FLAG.DONE`` or, if a simulation failed, the code of the failed
+check of the physics. ``capacity`` is the braking capacity of the controlled vehicle (m/s2).
 """
 
 from __future__ import annotations
@@ -34,11 +37,11 @@ from ethbrake_marl.physics.state import Floats, Ints
 
 GRID = 161  # number of evenly spaced decelerations from 0 to the capacity in the first step
 
-CELLS = 24  # largest number of grid cells (intervals between neighbouring grid points) that are refined
+CELLS = 24  # largest number of grid cells that are refined
 
 INSIDE = 16  # number of samples inside a refined cell
 
-BORDERS = 6  # largest number of borders (decelerations at which the number of impacts changes) that are located
+BORDERS = 6  # largest number of borders that are located
 
 MINIMA = 6  # number of local minima that are refined
 
@@ -65,8 +68,7 @@ _FIFTHS = np.arange(1, 5) / 5  # new samples between the two sides of a border
 class Room(NamedTuple):
     """Arrays for intermediate results of a search, reused for every world of a batch.
 
-    A *cell* is the interval between two neighbouring decelerations of the grid. A *border* is a deceleration at which
-    the number of impacts changes.
+    A *grid cell* is the interval between two neighbouring decelerations of the grid.
     """
 
     one: Samples  # samples of the grid; after step 2 all samples
@@ -92,16 +94,8 @@ def make_room() -> Room:
 def search_line(line: Line, room: Room, breakpoints: Floats, capacity: float, out: Floats) -> int:
     """Find the best constant deceleration of the controlled vehicle in one world.
 
-    Args:
-        line: the world, as ``make_line`` returns it.
-        room: arrays for intermediate results.
-        breakpoints: decelerations that are simulated in addition to an even grid, [CANDIDATES] m/s2.
-        capacity: braking capacity of the controlled vehicle, m/s2.
-        out: array [3] for the result: best deceleration (m/s2), its harm, and its harm under the other harm count
-            (m2/s2).
-
-    Returns ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed.
-
+    ``breakpoints`` [CANDIDATES] (m/s2) are decelerations that are simulated in addition to the grid. ``out`` [3]
+    receives the best deceleration (m/s2), its harm, and its harm under the other harm count (m2/s2).
     """
     status = share_start(line)
     if status == FLAG.DONE:
@@ -119,11 +113,10 @@ def search_line(line: Line, room: Room, breakpoints: Floats, capacity: float, ou
 
 @compiled(apart=True, bare=True)
 def look_evenly(line: Line, room: Room, breakpoints: Floats, capacity: float) -> int:
-    """Step 1: simulate evenly spaced decelerations and the ``breakpoints`` [CANDIDATES] (m/s2) in the world ``line``.
+    """Step 1: simulate the grid, which ends at ``capacity``, and the ``breakpoints`` [CANDIDATES] (m/s2).
 
-    The samples of the evenly spaced decelerations (the *grid*) are written to ``room.one``. The samples of grid and
-    breakpoints together are written to ``room.two``, sorted by deceleration. The largest deceleration of the grid is
-    ``capacity`` (m/s2). Returns ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed.
+    The samples of the grid are written to ``room.one``. The samples of grid and breakpoints together are written to
+    ``room.two``, sorted by deceleration.
     """
     grid, new = room.one, room.few
     for k in range(GRID):
@@ -140,12 +133,11 @@ def look_evenly(line: Line, room: Room, breakpoints: Floats, capacity: float) ->
 
 @compiled(apart=True, bare=True)
 def look_inside(line: Line, room: Room) -> int:
-    """Step 2: simulate more decelerations in some cells (intervals between neighbouring decelerations of the grid).
+    """Step 2: simulate more decelerations in some grid cells.
 
-    The search simulates more decelerations in a cell if the number of impacts changes in this cell, or if the estimated
-    least harm of the cell is below the harm of all samples so far. All samples, old and new, are written to
-    ``room.one``; the last sample is repeated until there are ``_LOOKED`` samples. Returns ``FLAG.DONE`` or, if a
-    simulation failed, the code of the physics check that failed.
+    These are the cells in which the number of impacts changes, or whose estimated least harm is below the harm of all
+    samples so far. All samples, old and new, are written to ``room.one``; the last sample is repeated until there are
+    ``_LOOKED`` samples.
     """
     grid, looked, new, cells, bounds = room.one, room.two, room.new, room.cells, room.values
     best = least_harm(looked, GRID + CANDIDATES)
@@ -184,12 +176,11 @@ def _put_in_order(places: Ints, n: int) -> None:
 
 @compiled(apart=True, bare=True)
 def locate_borders(line: Line, room: Room) -> int:
-    """Step 3: locate borders (decelerations at which the number of impacts changes) near which the harm may be least.
+    """Step 3: locate the borders near which the harm may be least.
 
     Between two borders the harm has no jumps. Therefore, if the harm falls towards a border, the harm is least directly
     at this border. For each located border, the search finds two samples that are at most 1e-9 m/s2 apart, one on each
-    side of the border. All samples, old and new, are written to ``room.two``. Returns ``FLAG.DONE`` or, if a simulation
-    failed, the code of the physics check that failed.
+    side of the border. All samples, old and new, are written to ``room.two``.
     """
     looked, new, few, places, bounds = room.one, room.new, room.few, room.borders, room.values
     best = least_harm(looked, _LOOKED)
@@ -216,8 +207,7 @@ def locate_borders(line: Line, room: Room) -> int:
 def _cut(line: Line, few: Samples) -> int:
     """Move samples 0 and 5 of ``few`` towards the border between them until these samples are at most 1e-9 m/s2 apart.
 
-    A border is a deceleration at which the number of impacts changes. Each round divides the distance between the two
-    samples by five. Returns ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed.
+    Each round divides the distance between the two samples by five.
     """
     while few.at[5] - few.at[0] > NARROWEST_MPS2:
         low, width = few.at[0], few.at[5] - few.at[0]
@@ -238,10 +228,7 @@ def _cut(line: Line, few: Samples) -> int:
 
 @compiled(apart=True, bare=True)
 def narrow_minima(line: Line, room: Room) -> int:
-    """Step 4: locate the lowest local minima of the harm to 1e-9 m/s2, and append them to ``room.two``.
-
-    Returns ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed.
-    """
+    """Step 4: locate the lowest local minima of the harm to 1e-9 m/s2, and append them to ``room.two``."""
     inner, minima, last = room.two, room.minima, _NARROWED - 1
     find_minima(inner, _NARROWED, room.values, minima)
     for m in range(MINIMA):
@@ -257,20 +244,10 @@ def narrow_minima(line: Line, room: Room) -> int:
 
 @compiled(bare=True)
 def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, to: int) -> int:
-    """Narrow an interval around a local minimum of the harm until it is at most 1e-9 m/s2 wide.
+    """Narrow the interval from ``low`` to ``high`` (m/s2) around a local minimum of the harm to at most 1e-9 m/s2.
 
-    Each round divides the interval on each side of the best deceleration so far into three parts. Returns ``FLAG.DONE``
-    or, if a simulation failed, the code of the physics check that failed.
-
-    Args:
-        line: the world.
-        few: array of samples, which is overwritten with intermediate results.
-        low: lower end, at the start of the search, of the interval to narrow, m/s2.
-        high: upper end, at the start of the search, of the interval to narrow, m/s2.
-        found: samples, of which sample ``to`` has the least harm in the interval so far. Sample ``to`` is overwritten
-            whenever a deceleration with less harm is found.
-        to: index in ``found`` of the sample with the least harm so far.
-
+    Each round divides the interval on each side of the best deceleration so far into three parts. The best deceleration
+    so far is sample ``to`` of ``found``. ``few`` is overwritten with intermediate results.
     """
     while high - low > NARROWEST_MPS2:
         middle = found.at[to]
@@ -301,18 +278,8 @@ def step_back(line: Line, around: Samples, best: float, capacity: float, out: Fl
 
     When the agent drives, the engine simulates the same motion step by step, with other rounding errors than this
     search. If the agent braked with a deceleration directly at a jump, the engine's rounding errors would decide on
-    which side of the jump the harm lies.
-
-    Args:
-        line: the world.
-        around: array of samples, which is overwritten with intermediate results.
-        best: best deceleration that the earlier steps of the search have found, m/s2.
-        capacity: braking capacity of the controlled vehicle, m/s2.
-        out: array [3] for the result: best deceleration (m/s2), its harm, and its harm under the other harm count
-            (m2/s2).
-
-    Returns ``FLAG.DONE`` or, if a simulation failed, the code of the physics check that failed.
-
+    which side of the jump the harm lies. ``best`` is the best deceleration of the earlier steps (m/s2). ``out``
+    receives the same three numbers as in ``search_line``. ``around`` is overwritten with intermediate results.
     """
     for k in range(5):
         around.at[k] = min(max(best + NARROWEST_MPS2 * (k - 2.0), 0.0), capacity)
