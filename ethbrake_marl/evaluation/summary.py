@@ -182,9 +182,9 @@ class SummaryTable(list[SummaryRow]):
         return DataFrame(columns, index=Index([row.agent for row in self], name="agent"), dtype=float)
 
     def notes(self) -> list[Note]:
-        """Return the notes to print below the table, each a pair: kind (``note`` or the less prominent ``quiet``), text.
+        """Return the notes to print below the table: first about the agents, then about the rows ``beside``.
 
-        Notes about the agents come first, then notes about the rows ``beside``.
+        A note is a pair: its kind (``note``, or ``quiet`` for a less prominent note) and its text.
         """
         return [*notes_of(self), *(self.beside.notes if self and self.beside else ())]
 
