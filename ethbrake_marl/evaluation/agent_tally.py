@@ -1,7 +1,7 @@
 """Sums of one agent's measures over many worlds, and the means and intervals computed from these sums.
 
 The sums are exact, so they do not depend on the order in which worlds are added. In all functions, ``worlds`` is the
-number of worlds in the evaluation. If a measure lacks a value in at least one of them, its mean is None.
+number of worlds in the evaluation. A measure that lacks a value in at least one of them has no result (None).
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ class SummaryRow:
 
     """
 
-    agent: str  # name of the agent
+    agent: str
     episodes: int  # number of worlds
     estimates: Mapping[str, Estimate | None]  # value and 95 % interval of every measure, by its name in JSON
     collisions: int  # number of worlds with at least one impact
@@ -70,10 +70,7 @@ class SummaryRow:
 
     @property
     def metrics(self) -> dict[str, Estimate]:
-        """Estimates of the measures that the user registered, by name.
-
-        A measure with one value per vehicle has the names ``NAME_1``, ``NAME_2`` and so on.
-        """
+        """Estimates of the measures that the user registered, by name (``NAME_1`` and so on for one value per vehicle)."""
         registered = {
             name.removeprefix(COLUMN): each for name, each in self.estimates.items() if name.startswith(COLUMN)
         }
@@ -86,9 +83,7 @@ class SummaryRow:
 
     @property
     def exploits(self) -> Exploits:
-        """The agent's exploits: shoving Vehicle 1, and vehicles that still move at the horizon. Neither exploit adds to
-        the harm.
-        """
+        """The agent's exploits, which do not add to the harm."""
         shoved = self.estimates["vehicle_1_shoved_m"]
         return Exploits(None if shoved is None else shoved.value, self.horizon_ends / self.episodes)
 

@@ -130,7 +130,7 @@ class ArrayArchive:
             self._read_header(member)
 
     def unpack(self, wanted: Sequence[ArrayRow]) -> dict[str, NDArray[Any]]:
-        """Return the arrays by name, read-only, after ``check_arrays``."""
+        """Return the arrays by name, read-only; raises the errors of ``check_arrays``."""
         check_arrays(self.headers, wanted)
         arrays = {}
         for member in self._members:

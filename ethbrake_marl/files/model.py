@@ -203,7 +203,10 @@ def _describe(detail: ErrorDetails, path: YamlPath, wording: Wording) -> str:
 
 
 def _show(detail: ErrorDetails) -> str:
-    """Return the invalid value as text (empty if the whole file is invalid); floats for whole numbers keep their point."""
+    """Return the invalid value as text for the message, or an empty text if the whole file is invalid.
+
+    A float in place of a whole number is shown with its decimal point.
+    """
     value = detail["input"]
     if isinstance(value, BaseModel) or not detail["loc"]:
         return ""
