@@ -100,7 +100,10 @@ def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
 
 
 def _dependencies() -> Iterator[Check]:
-    """Yield one check per dependency. It fails if a wrong version is installed, or if the core needs a missing package."""
+    """Yield one check per dependency, which succeeds if a required version is installed.
+
+    If a missing package is needed only by an extra, its check does not fail.
+    """
     from packaging.version import Version
 
     pinned = _pinned_versions(_CHECKOUT / "constraints.txt")

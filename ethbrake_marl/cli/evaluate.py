@@ -216,7 +216,7 @@ def _evaluate_group(
 
 
 def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, report: bool) -> None:
-    """Raise an error, before any work, if the folder ``output`` is missing, not writable or contains results already."""
+    """Raise an error, before any work, if the results and the requested files cannot be written to ``output``."""
     if output is None:
         for option in (name for name, value in (("--per-world", per_world), ("--report", report)) if value):
             raise InvalidInput(f"{option}: needs a folder for its file; add --output FOLDER")

@@ -1,6 +1,6 @@
 """Two measures that are computed while episodes run: how far Vehicle 1 is shoved, and the paper's sampled harm.
 
-Create the object of a measure with ``of``, and call ``see`` for each step.
+Create the object of a measure with ``of``, and call ``see`` for each step (arguments: ``Tape.see``).
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class ShovedFront:
         return cls(worlds, way[:, 0])
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Add the distance that Vehicle 1 drives in the step from ``before`` to ``until_s`` (since the alert, [n]).
+        """Add the distance that Vehicle 1 drives in one step.
 
         The distance is the decrease of Vehicle 1's gap to an obstacle. For this computation, an obstacle is put into
         worlds without an obstacle, so far ahead that Vehicle 1 cannot reach it in this step.
@@ -102,8 +102,7 @@ class SampledHarm:
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
         """Apply the commands of one step in the paper's equations of motion, and add the harm of one time sample.
 
-        In a world whose episode has ended, ``until_s`` (time since the alert, [n]) is the end of the episode, and the
-        last commands of the vehicles are applied again.
+        In a world whose episode has ended, the last commands of the vehicles are applied again.
         """
         running = until_s > before.time_s
         self._command = np.where(running[:, np.newaxis] | (self._samples < 0), command_mps2, self._command)

@@ -80,7 +80,7 @@ class Conditions(dict[str, Any]):
             task: the scenario and the controlled vehicles.
             seed: seed of the evaluation list; None for worlds that the caller passed.
             count: number of worlds.
-            because: result of ``silent_because``.
+            because: result of ``measure_sets.silent_because``.
             quantities: result of ``of`` or ``of_ranges``.
             recordings: number of recordings that the worlds come from, or 0.
             rejected: number of drawn worlds that were rejected because of an early impact. It is listed (as
@@ -126,7 +126,7 @@ class Conditions(dict[str, Any]):
 
     @property
     def quantities(self) -> str:
-        """All quantities in one line, such as ``d = 7 m; v = (20, 18, 20) m/s``; equal values are written only once."""
+        """All quantities in one line: ``d = 7 m; v = (20, 18, 20) m/s`` if all gaps are 7 m."""
         parts = []
         for key, (symbol, unit) in _SYMBOLS.items():
             if key in self:

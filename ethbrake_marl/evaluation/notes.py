@@ -99,7 +99,7 @@ def _no_impact(rows: Sequence[SummaryRow]) -> str:
 
 
 def _knowledge(rows: Sequence[SummaryRow]) -> str:
-    """Return the note about what the V2X channel hides, and which agents know it nevertheless; "" if it hides nothing."""
+    """Return the note about what the V2X channel hides, and which agents know it anyway; "" if it hides nothing."""
     hidden = rows[0].hidden_share
     if not hidden:
         return ""

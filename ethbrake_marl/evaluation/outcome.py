@@ -70,7 +70,10 @@ class Outcome:
 
     @classmethod
     def join(cls, parts: Sequence[Outcome]) -> Outcome:
-        """Join the outcomes of one agent in consecutive chunks of worlds; a field that is None in one part is None."""
+        """Join the outcomes of one agent in consecutive chunks of worlds.
+
+        A field that is None in one of ``parts`` is None in the result.
+        """
         first, columns = parts[0], dict[str, Any]()
         for name in _COLUMNS:
             values = [getattr(part, name) for part in parts]
@@ -91,7 +94,7 @@ class Outcome:
         return self.ledger.impacts
 
     def world_harm(self, harm_count: HarmCount) -> Floats:
-        """Return the harm of the whole line in each world, [n] m2/s2."""
+        """Return the harm (``first``-impact or ``total``) of the whole line in each world, [n] m2/s2."""
         return self.ledger.world_harm(harm_count)
 
     @property
@@ -105,7 +108,7 @@ class Outcome:
         return self.ledger.world_harm("total")
 
     def vehicle_harm(self, harm_count: HarmCount) -> Floats:
-        """Return the harm that each vehicle bears in each world, [n, N] m2/s2."""
+        """Return the harm (``first``-impact or ``total``) that each vehicle bears in each world, [n, N] m2/s2."""
         return self.ledger.vehicle_harm(harm_count)
 
     @property

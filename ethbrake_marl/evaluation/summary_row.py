@@ -70,7 +70,10 @@ class SummaryRow:
 
     @property
     def metrics(self) -> dict[str, Estimate]:
-        """Estimates of the measures that the user registered, by name (``NAME_1`` and so on for one value per vehicle)."""
+        """Estimates of the measures that the user registered, by name.
+
+        A measure with one value per vehicle has the names ``NAME_1``, ``NAME_2`` and so on.
+        """
         registered = {
             name.removeprefix(COLUMN): each for name, each in self.estimates.items() if name.startswith(COLUMN)
         }

@@ -75,7 +75,7 @@ def _run_file(path: Path, what: str) -> tuple[str, ModuleType]:
 
 
 def _run(content: bytes, path: Path, sha256: str, what: str) -> ModuleType:
-    """Run the content of a Python file as a new module, which is in ``sys.modules`` so that its classes can be pickled."""
+    """Run the content of a Python file as a new module, in ``sys.modules`` so that its classes can be pickled."""
     module = ModuleType(f"ethbrake_file_{path.stem}_{sha256[:12]}")
     module.__file__ = str(path)
     if path in _BEING_RUN:
