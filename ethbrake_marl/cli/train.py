@@ -47,8 +47,8 @@ OutputOption = Annotated[
 def run_folder(scenario: scenarios.Scenario, recipe: training.TrainingRecipe, seed: int | None) -> Path:
     """Return the default folder of a run: ``runs/SCENARIO-RECIPE-seedSEED``.
 
-    If the recipe has a scheme for several learners, the name is ``runs/SCENARIO-RECIPE-SCHEME-seedSEED``. If ``seed``
-    is None, it is the recipe's.
+    If the recipe has a scheme for several learners, the name is ``runs/SCENARIO-RECIPE-SCHEME-seedSEED``. Without
+    ``seed``, the name has the recipe's seed.
     """
     plan = recipe.name if recipe.scheme is None else f"{recipe.name}-{recipe.scheme}"
     return RUNS / f"{scenario.name}-{plan}-seed{recipe.seed if seed is None else seed}"

@@ -99,7 +99,7 @@ class MeasureSet:
     # values [n], or None if there are none.
     per_world: Mapping[str, Callable[[Outcome, Any], Values | None]] = {}
     texts: frozenset[str] = frozenset()  # names of the ``per_world`` columns that contain texts
-    because_key: str | None = None  # key in a result's conditions of the reason why the set does not apply
+    because_key: str | None = None  # key in a result's conditions for the reason why the set does not apply
     not_in_long_lists: str = ""  # why the set does not apply to more than 100,000 worlds; "": the set applies
 
     def prepare(self, evaluation: Any) -> Any:

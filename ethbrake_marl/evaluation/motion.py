@@ -141,7 +141,7 @@ def join_pieces(pieces: Floats, vehicles: int) -> Floats:
 
 
 def state_at(piece: Floats, time_s: float, vehicles: int) -> Floats:
-    """Return the state [4 N] at a time (since the alert) within a piece, a row of ``EpisodeMotion.pieces``.
+    """Return the state [4 N] at ``time_s`` (since the alert) within ``piece``, a row of ``EpisodeMotion.pieces``.
 
     The state is the position of Vehicle 1 (m), gaps (m), speeds (m/s), accelerations (m/s2) and jerks (m/s3) of N =
     ``vehicles`` vehicles.

@@ -21,7 +21,7 @@ class Rescored:
     each: tuple[Estimate, ...]  # mean value per world (m2/s2) for each vehicle, front to rear
 
     def to_json(self) -> dict[str, Any]:
-        """Return the objective, the count of harm, and each vehicle's mean with its interval."""
+        """Return the objective, the count of harm, and each vehicle's mean with its interval, for JSON."""
         each = Estimate.side_by_side({f"vehicle_{i + 1}": estimate for i, estimate in enumerate(self.each)})
         return {"objective": self.objective, "harm_count": self.harm_count, **each}
 

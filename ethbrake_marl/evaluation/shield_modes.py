@@ -145,7 +145,7 @@ def compare_modes(
         agents: agents or teams by name, without a shield. The objects that you pass do not change.
         worlds: worlds at the alert.
         task: the scenario, the controlled vehicles, and the count of harm that the shield bounds.
-        behind: whether ``agents`` already have shields. Then the policies behind shields in episode or step mode are
+        behind: whether ``agents`` already have shields. If so, the policies behind shields in episode or step mode are
             compared, and other agents are omitted. If no agent has such a shield, the result is empty.
         clusters: name of each world's recording, [n]; None: all worlds are independent.
         on_progress: called with an agent's name and the number of worlds that the agent has driven so far.

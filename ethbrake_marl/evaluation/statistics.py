@@ -82,7 +82,7 @@ _UPPER = 0.5 + 0.5 * CONFIDENCE  # quantile at the upper end of an interval
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """Number, exact sum and exact sum of squares of some values. ``a + b`` describes the values of both.
+    """Number n, exact sum and exact sum of squares of some values. ``a + b`` describes the values of both.
 
     >>> import numpy as np
     >>> from ethbrake_marl.evaluation.statistics import Moments

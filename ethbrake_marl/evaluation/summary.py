@@ -122,7 +122,7 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", ["Agent", "Knows", *columns], lines)
 
     def terminal(self) -> Sheet:
-        """Return the table for a terminal with at least 80 columns, with a text about the worlds and the intervals."""
+        """Return the table for a terminal with at least 80 columns, with the same text below as in ``markdown``."""
         narrow = self._narrow()
         columns = [
             replace(each, wide=each.name not in narrow, interval="below" if each.name in _BELOW else "hidden")
@@ -150,7 +150,7 @@ class SummaryTable(list[SummaryRow]):
         return [self.terminal(), own] if lines else [self.terminal()]
 
     def markdown(self) -> str:
-        """Return the table as Markdown, followed by a text about the worlds and the intervals."""
+        """Return the table as Markdown, followed by a text about the worlds, the intervals and other notes."""
         return f"{self.sheet().markdown()}\n\n{self._conditions()}\n"
 
     def _conditions(self) -> str:

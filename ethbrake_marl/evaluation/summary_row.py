@@ -86,7 +86,7 @@ class SummaryRow:
 
     @property
     def exploits(self) -> Exploits:
-        """The agent's exploits, which do not add to the harm."""
+        """The agent's exploits (shoving Vehicle 1, moving at the horizon), which do not add to the harm."""
         shoved = self.estimates["vehicle_1_shoved_m"]
         return Exploits(None if shoved is None else shoved.value, self.horizon_ends / self.episodes)
 

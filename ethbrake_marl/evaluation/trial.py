@@ -127,9 +127,7 @@ def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
 
 
 def _refusals(scenario: Scenario, worlds: Worlds) -> dict[str, str]:
-    """Return the error message of each agent, shield (``+NAME``) and ``early_impacts: reject`` that refuses the
-    scenario.
-    """
+    """Return what refuses the scenario (agents, shields as ``+NAME``, ``early_impacts: reject``), and the messages."""
 
     def drive_by(spec: str, needs: Mapping[str, Any]) -> None:
         check_agents(

@@ -188,7 +188,7 @@ def _npy_header(name: str, beginning: bytes) -> tuple[ArrayHeader, int]:
 def _check_directory(data: bytes) -> None:
     """Raise ``ValueError`` unless ``data`` ends with a small zip directory, as a plain ``.npz`` archive does.
 
-    This must be checked before the archive is opened, because a zip reader creates an object for every entry.
+    Check this before the archive is opened, because a zip reader creates an object for every entry.
     """
     if len(data) < 22 or data[-22:-18] != b"PK\x05\x06":
         raise ValueError("not a plain .npz archive")
