@@ -21,7 +21,7 @@ def check_agents(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenari
     """Let every agent decide once, so that an error in an agent is raised before a long evaluation.
 
     An agent whose commands do not depend on the state (``state_free``) decides in all worlds. Other agents decide only
-    in the first world. With ``warn``, call also ``warn_unfamiliar``.
+    in the first world. With ``warn``, also call ``warn_unfamiliar``.
     """
     if warn:
         warn_unfamiliar(agents, worlds, scenario, scenario.learners)

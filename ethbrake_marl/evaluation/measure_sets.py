@@ -83,7 +83,7 @@ class MeasureSet:
 
     A subclass must list its measures in ``measures``. It may override ``prepare``, which computes the context once per
     evaluation; ``row``, which adds fields to JSON results; and ``warnings`` and ``notes``, which add texts to a results
-    table with the rows ``rows`` (``SummaryRow``, one per agent).
+    table, whose rows are their argument (``SummaryRow``, one per agent).
     """
 
     measures: tuple[Measure, ...] = ()  # measures with a column or a JSON key, in the order of JSON
