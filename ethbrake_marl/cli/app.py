@@ -63,7 +63,7 @@ def _about(
 
 
 def main() -> None:
-    """Run the command line of this process, and exit with its status. Entry point of the program ``ethbrake``."""
+    """Run the command line of this process, and exit with its status."""
     gc.set_threshold(20_000)  # Python's default of 700 costs a run 1.5 CPU-s, and there are hardly any reference cycles
     prepare_streams()
     sys.exit(run_command(sys.argv[1:]))
@@ -72,9 +72,9 @@ def main() -> None:
 def run_command(arguments: Sequence[str]) -> int:
     """Run a command line (the arguments after ``ethbrake``) and return its exit status.
 
-    The exit status is 0 for success. The exit status is 2 for invalid input, wrong usage or a file error; the reason is
-    then printed in one line on stderr. The exit status is 1 if the reader of the output has closed the pipe. Other
-    errors are defects of the program and are raised.
+    The exit status is 0 for success, 2 for invalid input, wrong usage or a file error (the reason is printed in one
+    line on stderr), and 1 if the reader of the output has closed the pipe. Other errors are defects of the program and
+    are raised.
     """
     asked = _shell_asks(os.environ)
     try:
@@ -111,8 +111,8 @@ def run_command(arguments: Sequence[str]) -> int:
 def _shell_asks(environment: Mapping[str, str]) -> bool:
     """Return whether a shell runs this command in order to complete a command line (see ``--show-completion``).
 
-    ``environment``: environment variables. A variable that requests a completion is ignored if the other variables of
-    the completion script are missing, so a command never fails because a stray variable is set.
+    A variable that requests a completion is ignored if the other variables of the completion script are missing, so a
+    command never fails because a stray variable is set.
     """
     if environment.get("_ETHBRAKE_COMPLETE") == "complete_bash":
         return "COMP_WORDS" in environment and environment.get("COMP_CWORD", "").isdecimal()
@@ -121,7 +121,7 @@ def _shell_asks(environment: Mapping[str, str]) -> bool:
 
 
 def _refuse(reason: str) -> int:
-    """Print the reason of an error in one line on stderr, and return 2, the exit status for an error."""
+    """Print the reason of an error in one line on stderr, and return the exit status, 2."""
     Out().note(f"ethbrake: error: {reason}")
     return 2
 
@@ -154,13 +154,8 @@ def prepare_streams() -> None:
 def tell_compilation(folder: Path, empty: bool) -> None:
     """Announce that kernels are being compiled, and print every ten seconds how many are done.
 
-    A background thread prints the number of compiled kernels, because compiling a single kernel may take a minute.
-
-    Args:
-        folder: folder in which compiled kernels are stored; if this folder is temporary, it is deleted when the process
-            ends.
-        empty: True if this process has not loaded any kernel from this folder.
-
+    A background thread prints, because compiling a single kernel may take a minute. ``empty`` says that this process
+    has not loaded any kernel from ``folder``, in which compiled kernels are stored.
     """
     once = "the physics for the first time, which takes minutes" if empty else "parts of the physics for the first time"
     always = (
@@ -206,7 +201,7 @@ def add_command(name: str, command: typer.Typer | Callable[..., Any], *, epilog:
     An installed package adds a command with an entry point of the group ``ethbrake_marl.commands``.
 
     Args:
-        name: name of the command; ``GROUP.NAME`` for a command inside an existing group of commands.
+        name: ``NAME``, or ``GROUP.NAME`` for a command inside an existing group of commands.
         command: a function that Typer's ``app.command`` accepts, or a ``Typer`` object with several commands.
         epilog: text at the end of the help page, if ``command`` is a function.
 
@@ -235,7 +230,7 @@ COMMANDS: Registry[Any] = Registry("command", "commands", add_command, dict.from
 class Installed(TyperCommand):
     """A command of an extension or installed package, which is imported only when the command is called.
 
-    ``entry``: name of the command's entry point, ``NAME`` or ``GROUP.NAME``.
+    ``entry`` is the name of the entry point, ``NAME`` or ``GROUP.NAME``.
     """
 
     def __init__(self, entry: str) -> None:
@@ -251,26 +246,19 @@ class Installed(TyperCommand):
         return with_installed(command, self.entry)
 
     def make_context(self, *arguments: Any, **settings: Any) -> Any:
-        """Return the context in which the imported command runs. The arguments are the same as in Typer's method."""
+        """Return the context in which the imported command runs (Typer's method)."""
         return self.command().make_context(*arguments, **settings)
 
     def get_short_help_str(self, limit: int = 45) -> str:
         """Return the short description for the list of commands, of at most ``limit`` characters.
 
-        For a command of another package the description is the name of the package, so that the package need not be
-        imported.
+        For another package's command it is the name of the package, so that the package need not be imported.
         """
         return str(self.command().get_short_help_str(limit) if self.is_ours else super().get_short_help_str(limit))
 
 
 def with_installed(group: Any, name: str) -> Any:
-    """Add the commands of the entry points ``NAME.COMMAND`` to the command group ``name``; return the group.
-
-    Args:
-        group: the command group, a Typer (click) command with subcommands; the function adds commands to it.
-        name: name of the command group.
-
-    """
+    """Add the commands of the entry points ``NAME.COMMAND`` to the command group ``name``; return the group."""
     for entry in points(COMMANDS.group):
         of, _, own = entry.rpartition(".")
         if of == name:
@@ -279,10 +267,9 @@ def with_installed(group: Any, name: str) -> Any:
 
 
 def whole_command() -> Any:
-    """Return the program ``ethbrake`` as a Typer (click) group of commands.
+    """Return all commands (of the core, extensions, installed packages and ``add_command``) as a Typer (click) group.
 
-    The group contains the commands of the core, of extensions, of installed packages, and those that ``add_command``
-    added. Raises ``AlreadyExists`` if two commands have the same name.
+    Raises ``AlreadyExists`` if two commands have the same name.
     """
     added = [name for name in COMMANDS if name not in _OURS and "." not in name]
     names = [*_names(), *added]

@@ -65,11 +65,8 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print the results on s
 def schema_option(module: str, model: str, kind: str) -> Any:
     """Return the type of a Typer option ``--schema``, which prints the JSON Schema of a kind of file and exits.
 
-    Args:
-        module: name of the module that defines ``model``; it is imported only when the option is used.
-        model: name of the pydantic model's class, whose method ``json_schema`` returns the schema.
-        kind: kind of file, for the help text, such as ``recipe``.
-
+    The method ``json_schema`` of the class ``model`` returns the schema; its ``module`` is imported only when the
+    option is used. ``kind`` names the kind of file in the help text.
     """
 
     def show_schema(asked: bool) -> None:
@@ -82,7 +79,7 @@ def schema_option(module: str, model: str, kind: str) -> Any:
 
 
 def example(*lines: str) -> str:
-    """Return the examples at the end of a help page. ``lines``: command lines without ``ethbrake``."""
+    """Return the examples at the end of a help page, from command lines without ``ethbrake``."""
     return "\n\n".join(f"Example: ethbrake {line}" for line in lines)
 
 
@@ -95,13 +92,8 @@ class Out:
     """Output of a command of ``ethbrake``, used as ``with Out() as out``.
 
     Inside the ``with`` block only results go to stdout. All other output, for instance of a user's agent, goes to
-    stderr. Ctrl-C ends the command with a message of one line and exit status 130.
-
-    Args:
-        as_json: True: print results as JSON instead of texts and tables.
-        force: True: replace existing files.
-        remains: text about the files that remain after Ctrl-C, for the end of the message.
-
+    stderr. Ctrl-C ends the command with a message of one line and exit status 130. The message ends with ``remains``, a
+    text about the files that remain.
     """
 
     def __init__(self, *, as_json: bool = False, force: bool = False, remains: str = "nothing was written") -> None:
@@ -123,24 +115,14 @@ class Out:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop redirecting stdout; if the block was ended by Ctrl-C, print a message and exit with status 130.
-
-        The arguments describe the exception that ended the block, as for every context manager.
-        """
+        """Stop redirecting stdout; if the block was ended by Ctrl-C, print a message and exit with status 130."""
         self._turned.__exit__(kind, error, trace)
         self.end_progress()
         if isinstance(error, KeyboardInterrupt):
             self.interrupted(f"interrupted; {self.remains}")
 
     def result(self, content: Any, *shown: RenderableType, end: str = "\n") -> None:
-        """Print the result of the command on stdout.
-
-        Args:
-            content: result as plain data (dictionaries, lists, texts, numbers), printed if JSON is requested.
-            shown: texts and tables, printed if JSON is not requested.
-            end: characters printed after each text.
-
-        """
+        """Print the result of the command on stdout: as JSON the plain data ``content``, otherwise ``shown``."""
         if self.as_json:
             self.print_json(content)
         else:
@@ -169,13 +151,10 @@ class Out:
         say(text)
 
     def check(self, path: Path | None, *endings: str, what: str = "the file") -> None:
-        """Raise ``InvalidInput`` or ``AlreadyExists`` if a file cannot be written; call this method first.
+        """Raise ``InvalidInput`` or ``AlreadyExists`` if a file cannot be written; call this method before any work.
 
-        Args:
-            path: path of the file; None: no file was requested, and nothing is checked.
-            endings: allowed endings of the file's name, such as ``.csv``; if none is given, every ending is allowed.
-            what: name of the file's content in the error message, for example ``worlds``.
-
+        ``endings`` are the allowed endings of the file's name, such as ``.csv``; without them every ending is allowed.
+        ``what`` names the file's content in the error message. If ``path`` is None, nothing is checked.
         """
         if path is None:
             return
@@ -186,10 +165,7 @@ class Out:
         check_target(path, force=self.force)
 
     def write(self, path: Path, content: bytes | str, what: str | None = None) -> None:
-        """Write ``content`` to a file, completely or not at all, and print the line ``WHAT: PATH`` on stderr.
-
-        ``what``: word for the content, printed as WHAT; None: print no line.
-        """
+        """Write ``content`` to a file, completely or not at all; with ``what``, print ``WHAT: PATH`` on stderr."""
         from ethbrake_marl.files.store import write_output
 
         write_output(path, content.encode() if isinstance(content, str) else content, force=self.force)
@@ -202,18 +178,11 @@ class Out:
         raise typer.Exit(130)  # 128 + SIGINT, as shells expect
 
     def progress(self, name: str, done: int, total: int, harm: str = "", note: str = "") -> None:
-        """Show the progress of a task of the command: ``done`` of ``total`` units of work are done.
+        """Show the progress of the task ``name``: ``done`` of ``total`` units of work are done.
 
-        A terminal shows one progress bar per task. If stderr is not a terminal, a line is printed at the beginning and
-        every ten seconds.
-
-        Args:
-            name: name of the task; a task ``TASK: STAGE`` has the same bar as ``TASK``.
-            done: number of units of work that are done.
-            total: number of all units of work.
-            harm: text with the harm in the latest evaluation, shown after the name of the task.
-            note: message to print once, above the progress bars.
-
+        A terminal shows one progress bar per task; a task ``TASK: STAGE`` has the same bar as ``TASK``. If stderr is
+        not a terminal, a line is printed at the beginning and every ten seconds. ``harm`` is a text that is shown after
+        the name, ``note`` is a message that is printed above the progress bars.
         """
         label = one_line(f"{name}, {harm}" if harm else name)
         if not self._stderr.is_terminal:
@@ -241,7 +210,7 @@ class Out:
             self._said_s = now
 
     def show_progress(self, progress: PartProgress) -> None:
-        """Show the progress that a function of the package reports to its argument ``on_progress``."""
+        """Show the progress that a function of the package reports to ``on_progress``."""
         self.progress(progress.name, progress.done, progress.total, progress.harm, progress.note)
 
     def end_progress(self) -> None:
@@ -254,16 +223,13 @@ class Out:
 class _PlainConsole(Console):
     """Console of rich that prints texts literally, without interpreting markup, and escapes control characters.
 
-    ``width``: width of the console in characters; None: width of the terminal.
+    Without ``width`` (in characters), the console is as wide as the terminal.
     """
 
     def __init__(self, file: TextIO, *, width: int | None = None) -> None:
         super().__init__(file=file, width=width, markup=False, emoji=False, highlight=False)
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
-        """Yield the styled segments of ``renderable`` (a text or table), with control characters escaped.
-
-        ``options``: options of rich for this output.
-        """
+        """Yield the styled segments of a text or table, with control characters escaped."""
         for piece in super().render(renderable, options):
             yield piece if piece.control else Segment(plain_text(piece.text, keep=_KEPT), piece.style)

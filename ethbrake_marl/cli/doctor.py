@@ -1,7 +1,4 @@
-"""The command ``doctor``: check the versions and folders of this installation, and the physics on known results.
-
-With ``--compile`` the command also compiles the physics.
-"""
+"""The command ``doctor``: check the versions and folders of this installation, and the physics on known results."""
 
 from __future__ import annotations
 
@@ -78,8 +75,7 @@ class Check:
 def diagnose(*, compile_all: bool = False) -> list[Check]:
     """Run all checks of the installation; return their results in the order in which the user should solve problems.
 
-    A check that raises an error is reported as failed. ``compile_all``: True: also call the usual commands on a few
-    worlds, which compiles and stores all kernels that they use.
+    With ``compile_all``, also compile the kernels (``compile_ahead``).
     """
     has_torch = find_spec("torch") is not None
     return [
@@ -106,7 +102,7 @@ def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
 def _dependencies() -> Iterator[Check]:
     """Yield one check per dependency, which succeeds if a required version is installed.
 
-    If a missing package is needed only by an extra, the check of this package does not fail.
+    If a missing package is needed only by an extra, its check does not fail.
     """
     from packaging.version import Version
 
@@ -129,8 +125,7 @@ def _dependencies() -> Iterator[Check]:
 def _requirements() -> list[tuple[str, Requirement]]:
     """Return the dependencies of the package as pairs (extra, requirement); the extra is "" for a core dependency.
 
-    The dependencies are read from ``pyproject.toml`` in a source checkout, or else from the metadata of the installed
-    package.
+    They are read from ``pyproject.toml`` in a source checkout, or else from the metadata of the installed package.
     """
     from packaging.requirements import Requirement
 
@@ -173,8 +168,7 @@ def _scenarios() -> tuple[bool, str]:
 def _golden_impact() -> tuple[bool, str]:
     """Check the physics: a car at 10 m/s brakes with 5 m/s2, 8 m behind a standing car.
 
-    The exact harm, the square of the impact speed, is ``10^2 - 2 * 5 * 8 = 20`` m2/s2. Returns whether the computed
-    harm equals the exact harm, and a text with both values.
+    The exact harm, the square of the impact speed, is ``10^2 - 2 * 5 * 8 = 20`` m2/s2.
     """
     import numpy as np
 
@@ -194,8 +188,7 @@ def _golden_impact() -> tuple[bool, str]:
 def _golden_baseline() -> tuple[bool, str]:
     """Check the baseline E-V2X-BM in the paper's distance scenario with gaps of 7 m and 7 m.
 
-    The known result is a deceleration of 5.17021 m/s2 and a harm of 4.03447 m2/s2. Returns whether the computed result
-    equals the known result, and a text with both results.
+    The known result is a deceleration of 5.17021 m/s2 and a harm of 4.03447 m2/s2.
     """
     import numpy as np
 
@@ -216,13 +209,9 @@ def _golden_baseline() -> tuple[bool, str]:
 def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str]:
     """Compile and store the kernels that the usual commands use, by calling these commands on a few worlds.
 
-    The commands run in parallel on all cores, and the progress is printed. Returns whether all commands succeeded, and
-    a message.
-
-    Args:
-        training: True: also call ``ethbrake run``, which needs torch.
-        run_alone: True: call only the single command that compiles nearly all kernels of ``ethbrake run``.
-
+    The commands run in parallel on all cores, and the progress is printed. With ``training``, also call ``ethbrake
+    run``, which needs torch. With ``run_alone``, call only the single command that compiles nearly all kernels of
+    ``ethbrake run``. Returns whether all commands succeeded, and a message.
     """
     if is_temporary(cache_folder()):
         return False, "no folder for compiled kernels is writable; set NUMBA_CACHE_DIR to a writable folder"

@@ -45,14 +45,9 @@ _POLICIES = {"same": "the same", "other": "another", "none": ""}
 
 
 def read_task(scenario: str, settings: Sequence[str] | None) -> Task:
-    """Load a scenario, apply ``settings`` to it, and return the task of controlling its learners.
+    """Load a scenario (name or path), apply settings ``KEY=VALUE``, and return the task of controlling its learners.
 
-    Args:
-        scenario: name of a scenario, or path of its file.
-        settings: settings ``KEY=VALUE`` of the scenario, and ``harm_count=total``; None: no settings.
-
-    Raises ``InvalidInput`` if the scenario has no learner.
-
+    The settings may include ``harm_count=total``. Raises ``InvalidInput`` if the scenario has no learner.
     """
     return _task_of(scenario, training.read_settings(settings, of_agents=("harm_count",)))
 
@@ -65,15 +60,7 @@ def _task_of(scenario: str, chosen_settings: Settings) -> Task:
 
 
 def make_drivers(agents: str | Sequence[str], task: Task, *, bare: bool = False) -> dict[str, Any]:
-    """Return the agents named on a command line, by name; see ``make_lineup``.
-
-    Args:
-        agents: names of agents, as a list or as a text with commas.
-        task: the scenario with its controlled vehicles, and the count of harm that the agents minimise.
-        bare: True: raise ``InvalidInput`` for an agent with a shield, because the calling command adds the shields
-            itself.
-
-    """
+    """Return the agents named on a command line, by name; the arguments are as in ``make_lineup``."""
     return evaluation.make_lineup(agents, task.scenario, harm_count=task.harm_count, bare=bare)
 
 
@@ -165,17 +152,7 @@ def evaluate_command(
 def _evaluate_long_list(
     out: Out, lineup: evaluation.Lineup, episodes: int, seed: int, jobs: int | None, ray: str | None
 ) -> evaluation.SummaryTable:
-    """Evaluate the agents on an evaluation list that is too long for the memory; return the results table.
-
-    Args:
-        out: object that prints the output of the command.
-        lineup: the agents to evaluate, and the scenario whose evaluation list is used.
-        episodes: number of worlds in the evaluation list.
-        seed: seed of the evaluation list.
-        jobs: number of parallel processes; None: one process.
-        ray: address of a Ray cluster, or ``local``; None: without Ray.
-
-    """
+    """Return the results table of an evaluation list that is too long for the memory."""
     scenario = lineup.scenario
     evaluation.check_agents(lineup.make(), scenario.sample(1_000, seed).worlds, scenario, warn=True)
     tally = evaluation.tally_list(lineup, episodes, seed, jobs=jobs, ray=ray, on_done=_tell_worlds(out, episodes))
@@ -192,19 +169,7 @@ def _tell_worlds(out: Out, worlds: int) -> Callable[[int], None]:
 def _evaluate_group(
     out: Out, output: Path | None, group: Sequence[Task], agents: str, episodes: int | None, seed: int | None
 ) -> None:
-    """Evaluate each agent in each scenario of a group, and print a table with a row per agent and scenario.
-
-    For each agent and scenario the table shows the collision rate, the hardest impact, and the mean harm.
-
-    Args:
-        out: object that prints the output of the command.
-        output: folder for the results as JSON; None: do not write them.
-        group: the scenarios in which the agents are evaluated, each with its controlled vehicles.
-        agents: names of agents, with commas between them.
-        episodes: number of worlds of each scenario; None: ``GROUP_EPISODES``.
-        seed: seed of the evaluation lists; None: the default seed.
-
-    """
+    """Evaluate each agent in each scenario of a group, and print a table with a row per agent and scenario."""
     objects: list[dict[str, Any]] = []
     rows: list[Any] = []
     seed = evaluation.LIST_SEED if seed is None else seed
@@ -251,11 +216,7 @@ def _evaluate_group(
 
 
 def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, report: bool) -> None:
-    """Raise an error, before any work, if the folder ``output`` is not writable or contains results already.
-
-    ``per_world`` (``csv``, ``parquet`` or None) and ``report`` say which files the user requested besides
-    ``results.json``; these files need a folder ``output``.
-    """
+    """Raise an error, before any work, if the results and the requested files cannot be written to ``output``."""
     if output is None:
         for option in (name for name, value in (("--per-world", per_world), ("--report", report)) if value):
             raise InvalidInput(f"{option}: needs a folder for its file; add --output FOLDER")
@@ -266,11 +227,7 @@ def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, repo
 
 
 def _write_worlds(out: Out, output: Path | None, result: evaluation.Evaluation, per_world: str | None) -> Path | None:
-    """Write the file with one row per world and agent into the folder ``output``, and return its path.
-
-    ``per_world``: format of the file, ``csv`` or ``parquet``. If ``per_world`` or ``output`` is None, write nothing and
-    return None.
-    """
+    """Write the file with one row per world and agent, if it was requested, and return its path."""
     if output is None or per_world is None:
         return None
     file = output / f"{WORLDS}.{per_world}"
@@ -281,10 +238,7 @@ def _write_worlds(out: Out, output: Path | None, result: evaluation.Evaluation, 
 
 
 def _write_results(out: Out, output: Path | None, results: object, *beside: str) -> None:
-    """Write ``results.json`` into the folder ``output``; delete earlier result files that ``beside`` does not name.
-
-    If ``output`` is None, do nothing.
-    """
+    """Write ``results.json``, if requested; delete earlier result files that ``beside`` does not name."""
     if output is None:
         return
     output.mkdir(parents=True, exist_ok=True)
@@ -299,15 +253,7 @@ def _json_text(content: object) -> str:
 
 
 def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: float) -> None:
-    """Print in how many worlds at least one vehicle still moves at the horizon, if there are such worlds.
-
-    Args:
-        out: object that prints the output of the command.
-        moving: for each agent with a shield, number of worlds in which at least one vehicle still moves at the horizon.
-        worlds: number of all evaluated worlds.
-        horizon_s: time of the horizon (s).
-
-    """
+    """Print in how many of all ``worlds`` a vehicle still moves at the horizon, for each agent (``moving``)."""
     text = ", ".join(f"{name} {count}" for name, count in moving.items() if count)
     if text:
         out.note(
@@ -317,10 +263,7 @@ def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: f
 
 
 def _moving(rows: Sequence[evaluation.SummaryRow]) -> dict[str, int]:
-    """Return a dictionary: agent with a shield -> number of worlds in which some vehicle still moves at the horizon.
-
-    ``rows``: rows of the results table, one per agent.
-    """
+    """Return a dictionary: agent with a shield -> number of worlds in which some vehicle still moves at the horizon."""
     return {row.agent: row.horizon_ends for row in rows if row.policy_share is not None}
 
 
@@ -387,10 +330,7 @@ def shield_command(
 
 
 def _measure_modes(out: Out, agents: str, sample: Sample, task: Task) -> evaluation.ShieldModes:
-    """Compare agents without and with the shield in the worlds of ``sample``, and show the progress on stderr.
-
-    ``agents``: names of agents without a shield, with commas between them.
-    """
+    """Compare agents without and with the shield in the worlds of ``sample``, and show the progress on stderr."""
     lineup = make_drivers(agents, task, bare=True)
     n = sample.worlds.n
     return evaluation.compare_modes(
@@ -400,7 +340,7 @@ def _measure_modes(out: Out, agents: str, sample: Sample, task: Task) -> evaluat
 
 
 def _tell_left_out(out: Out, left_out: LeftOutRows, whole: int) -> None:
-    """Print on stderr which worlds were left out of the results, if any; ``whole``: number of all worlds."""
+    """Print which of all ``whole`` worlds were left out of the results, if any."""
     if left_out:
         texts = [f"world {world} of seed {evaluation.LIST_SEED} ({reason})" for world, reason in left_out]
         out.note(evaluation.LeftOut.line(texts, whole))

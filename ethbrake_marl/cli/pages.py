@@ -1,6 +1,4 @@
-"""Registry of the functions that draw pages and pictures for commands. An extension registers its own functions
-here.
-"""
+"""Registry of the functions that draw pages and pictures for commands, in which extensions register their own."""
 
 from __future__ import annotations
 
@@ -14,15 +12,13 @@ from ethbrake_marl.registry import Registry
 def register_page(shows: str, write: Callable[..., None]) -> None:
     """Register the function that a command calls to write its page (a report) or its picture.
 
-    With an entry point of the group ``ethbrake_marl.pages``, an installed package registers a function that writes
-    pages.
+    An installed package registers its function with an entry point of the group ``ethbrake_marl.pages``.
 
     Args:
         shows: subject of the page: ``"evaluation"`` (``evaluate --report``) or ``"worlds"`` (``scenario sample``).
-        write: function that writes the page. The arguments of ``write`` are, for ``"evaluation"``, the path of the
-            file, the evaluation, the results table and the agents by name; for ``"worlds"``, the path of the file, the
-            scenario and the sample. The calls in ``cli.evaluate`` and ``cli.scenario`` show the keyword arguments of
-            ``write``.
+        write: function that writes the page. Its arguments are, for ``"evaluation"``, the path of the file, the
+            evaluation, the results table and the agents by name; for ``"worlds"``, the path of the file, the scenario
+            and the sample. The calls in ``cli.evaluate`` and ``cli.scenario`` show its keyword arguments.
 
     """
     PAGES.add(shows, write, lambda other: other is write)
@@ -32,7 +28,7 @@ PAGES: Registry[Callable[..., Any]] = Registry("page", "pages", register_page)
 
 
 def page_of(shows: str, option: str) -> Callable[..., None]:
-    """Return the registered function that writes the page about ``shows``, such as ``"evaluation"``.
+    """Return the registered function that writes the page about ``shows``.
 
     Raises ``InvalidInput``, whose message begins with the command's ``option``, if no such function is registered.
     """

@@ -112,10 +112,9 @@ def scenario_validate(path: NameArgument, as_json: JsonOption = False) -> None:
 
 
 def _drawn_lines(scenario: scenarios.Scenario, sample: scenarios.Sample) -> tuple[list[str], str, dict[str, Any]]:
-    """Return (lines, text, columns), three descriptions of the quantities in the worlds of ``sample``.
+    """Return the ranges of varying quantities as lines, the fixed quantities as text, and all quantities for JSON.
 
-    ``lines`` is a table with the range of each varying quantity, and ``text`` lists the fixed quantities. ``columns``
-    is plain data for JSON, such as ``{"gap_1_m": {"least": 5.0, "median": 7.0, "largest": 9.0}}``.
+    An example for JSON is ``{"gap_1_m": {"least": 5.0, "median": 7.0, "largest": 9.0}}``.
     """
     import numpy as np
 
@@ -168,7 +167,7 @@ def scenario_explain(scenario: NameArgument, as_json: JsonOption = False) -> Non
 
 
 def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
-    """Yield sentences that describe the scenario, one per aspect; an empty text for an aspect without a description."""
+    """Yield sentences that describe the scenario; some may be empty."""
     from ethbrake_marl.agents.making import find_entry
     from ethbrake_marl.game.objectives import OBJECTIVES
 
@@ -225,9 +224,8 @@ def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
 def _refused(scenario: scenarios.Scenario, sample: scenarios.Sample | None = None) -> str:
     """Return the number of draws rejected for an impact before any learner can act: ``: 3 of 203 draws (1.5 %)``.
 
-    The returned text is empty for a scenario without a table. If the scenario has a table, rejections change how often
-    each row of the table occurs in the worlds. ``sample``: worlds whose rejected draws are counted; None: draw 200
-    worlds.
+    The rejected draws of ``sample`` are counted; None: draw 200 worlds. The text is empty for a scenario without a
+    table. If there is a table, rejections change how often each of its rows occurs in the worlds.
     """
     if all(each.table is None for each in scenario.members or (scenario,)):
         return ""
@@ -258,7 +256,7 @@ def _declared_in_words(scenario: scenarios.Scenario, key: str) -> str:
 
 
 def _in_words(quantity: Any) -> str:
-    """Return a description of ``quantity``, a number or distribution of a scenario: ``5 to 9 (uniform)``."""
+    """Return a description of a number or distribution: ``5 to 9 (uniform)``."""
     if isinstance(quantity, float):
         return f"{quantity:g}"
     (kind, shape), *more = quantity.model_dump(exclude_none=True).items()

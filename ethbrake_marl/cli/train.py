@@ -47,8 +47,8 @@ OutputOption = Annotated[
 def run_folder(scenario: scenarios.Scenario, recipe: training.TrainingRecipe, seed: int | None) -> Path:
     """Return the default folder of a run: ``runs/SCENARIO-RECIPE-seedSEED``.
 
-    If the recipe has a scheme for several learners, the name is ``runs/SCENARIO-RECIPE-SCHEME-seedSEED``. ``seed``:
-    seed of the training run; None: the recipe's seed.
+    If the recipe has a scheme for several learners, the name is ``runs/SCENARIO-RECIPE-SCHEME-seedSEED``. Without
+    ``seed``, the name has the recipe's seed.
     """
     plan = recipe.name if recipe.scheme is None else f"{recipe.name}-{recipe.scheme}"
     return RUNS / f"{scenario.name}-{plan}-seed{recipe.seed if seed is None else seed}"
@@ -210,8 +210,7 @@ def train_command(
 def _show(out: Out, result: training.TrainResult, scenario: str | None = None) -> None:
     """Print the harm of the trained agent and of full braking on stdout, and how the training ended on stderr.
 
-    ``scenario``: name or path of the scenario in the command that is printed; None: the name of the scenario of the
-    training run.
+    The printed command names ``scenario`` (name or path); None: the scenario of the training run.
     """
     from ethbrake_marl.training.fixed_list import measure_full_braking
     from ethbrake_marl.training.progress import objective_in_words

@@ -1,4 +1,7 @@
-"""Two measures that are computed while episodes run: how far Vehicle 1 is shoved, and the paper's sampled harm."""
+"""Two measures that are computed while episodes run: how far Vehicle 1 is shoved, and the paper's sampled harm.
+
+Create the object of a measure with ``of``, and call ``see`` for each step (arguments: ``Tape.see``).
+"""
 
 from __future__ import annotations
 
@@ -19,14 +22,9 @@ from ethbrake_marl.scenario.task import Task
 class ShovedFront:
     """Measure how far other vehicles shove Vehicle 1 beyond the place that it would reach if nobody touched it.
 
-    ``shoved = distance that Vehicle 1 drives - distance that it would drive until the horizon if nobody touched it``.
-    ``shoved`` is negative if Vehicle 1 ends short of the place that it would reach, for instance because an obstacle
-    threw it back. Create the object with ``of``, and call ``see`` for each step.
-
-    Args:
-        worlds: the n worlds at the alert.
-        own_way_m: distance that Vehicle 1 would drive until the horizon if nobody touched it, [n] m.
-
+    ``shoved = distance that Vehicle 1 drives - own_way_m``, where ``own_way_m`` is the distance [n] that it would drive
+    until the horizon if nobody touched it. ``shoved`` is negative if Vehicle 1 ends short of that place, for instance
+    because an obstacle threw it back.
     """
 
     def __init__(self, worlds: Worlds, own_way_m: Floats) -> None:
@@ -35,7 +33,7 @@ class ShovedFront:
 
     @classmethod
     def of(cls, worlds: Worlds, task: Task) -> ShovedFront | None:
-        """Return the object that measures shoving in ``worlds``, or None if shoving is not defined for the task.
+        """Return the object for ``worlds`` at the alert, or None if shoving is not defined.
 
         Shoving is not defined if Vehicle 1 is controlled, if its script reacts to the state of the world, or if brake
         force builds up gradually.
@@ -51,16 +49,10 @@ class ShovedFront:
         return cls(worlds, way[:, 0])
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Add the distance that Vehicle 1 drives in one step to the distance that it has driven so far.
+        """Add the distance that Vehicle 1 drives in one step.
 
-        The distance that Vehicle 1 drives is computed as the decrease of its gap to an obstacle. For this computation,
-        an obstacle is put into worlds without an obstacle, so far ahead that Vehicle 1 cannot reach it in this step.
-
-        Args:
-            before: the worlds at the beginning of the step.
-            command_mps2: commanded accelerations during the step (m/s2), [n, N].
-            until_s: time since the alert at which the step ends (s), [n].
-
+        The distance is the decrease of Vehicle 1's gap to an obstacle. For this computation, an obstacle is put into
+        worlds without an obstacle, so far ahead that Vehicle 1 cannot reach it in this step.
         """
         post = before.with_post_ahead(until_s - before.time_s)
         after, _ = advance(post, command_mps2, until_s=until_s)
@@ -80,15 +72,8 @@ class SampledHarm:
     """Compute the sampled harm of the episodes: the paper's sum of squared closing speeds over time samples.
 
     The commands that the agents gave in the exact physics are applied again in the paper's equations of motion with a
-    fixed step (``advance_sampled``). The agents make no new decisions. Every world is simulated in the paper's
-    equations up to the horizon. If the episode of a world ended earlier in the exact physics, the last commands of its
-    vehicles remain in force. Create the object with ``of``, call ``see`` for each step, and get the harm from
-    ``finish``.
-
-    Args:
-        worlds: the n worlds at the alert; they are copied.
-        scenario: scenario of the worlds, which sets the time step and the horizon.
-
+    fixed step (``advance_sampled``), up to the horizon. The agents make no new decisions. If the episode of a world
+    ended earlier in the exact physics, the last commands of its vehicles remain in force.
     """
 
     def __init__(self, worlds: Worlds, scenario: Scenario) -> None:
@@ -101,12 +86,11 @@ class SampledHarm:
 
     @classmethod
     def of(cls, worlds: Worlds, task: Task) -> SampledHarm | None:
-        """Return the object that computes the sampled harm in ``worlds``, or None if sampled harm is not defined.
+        """Return the object for ``worlds`` at the alert, or None if sampled harm is not defined.
 
-        The time samples of sampled harm are the times of Vehicle 2's decisions. Sampled harm is therefore defined only
-        if Vehicle 2 is the only controlled vehicle and no script reacts to the state of the world. With an obstacle, or
-        with brake force that builds up gradually, sampled harm is not defined, because the paper's equations describe
-        neither obstacles nor such brakes.
+        The time samples are the times of Vehicle 2's decisions. Sampled harm is therefore defined only if Vehicle 2 is
+        the only controlled vehicle and no script reacts to the state of the world. It is not defined with an obstacle
+        or with brake force that builds up gradually, because the paper's equations describe neither.
         """
         obstacle = task.scenario.has_obstacle or worlds.obstacle_ahead.any()
         if task.vehicles != (VEHICLE_2,) or obstacle or worlds.vehicles.build_up.any():
@@ -119,13 +103,6 @@ class SampledHarm:
         """Apply the commands of one step in the paper's equations of motion, and add the harm of one time sample.
 
         In a world whose episode has ended, the last commands of the vehicles are applied again.
-
-        Args:
-            before: the worlds at the beginning of the step.
-            command_mps2: commanded accelerations during the step (m/s2), [n, N].
-            until_s: time since the alert at which the step ends (s), [n]; in a world whose episode has ended, the time
-                at which the episode ended.
-
         """
         running = until_s > before.time_s
         self._command = np.where(running[:, np.newaxis] | (self._samples < 0), command_mps2, self._command)
@@ -140,7 +117,7 @@ class SampledHarm:
         self._harm += sum_rows(impacts.total_harm)
 
     def finish(self) -> Floats:
-        """Advance every world to the horizon, and return the sampled harm of each world, [n] m2/s2."""
+        """Advance every world to the horizon, and return its sampled harm, [n] m2/s2."""
         while (self._worlds.time_s < self._horizon_s - 1e-6 * self._step_s).any():
             self._move()
         return self._harm

@@ -1,6 +1,7 @@
 """Sums of one agent's measures over many worlds, and the means and intervals computed from these sums.
 
-The sums are exact, so they do not depend on the order in which worlds are added.
+The sums are exact, so they do not depend on the order in which worlds are added. In all functions, ``worlds`` is the
+number of worlds in the evaluation. A measure that lacks a value in at least one of them has no result (None).
 """
 
 from __future__ import annotations
@@ -46,20 +47,12 @@ class AgentTally:
         return self.counts.get(name, (0, 0))[0]
 
     def share(self, name: str, worlds: int) -> float | None:
-        """Return the fraction (0 to 1) of the worlds in which the true/false measure ``name`` is true.
-
-        ``worlds`` is the number of worlds in the evaluation. The result is None if the measure lacks a value in at
-        least one world of the evaluation.
-        """
+        """Return the fraction (0 to 1) of worlds in which the true/false measure ``name`` is true."""
         so, of = self.counts.get(name, (0, 0))
         return so / worlds if of == worlds else None
 
     def sums(self, name: str, worlds: int) -> Moments | None:
-        """Return the sum and the sum of squares of the numeric measure ``name``, and the number of its values.
-
-        ``worlds`` is the number of worlds in the evaluation. The result is None if the measure lacks a value in at
-        least one world of the evaluation.
-        """
+        """Return the sums of the numeric measure ``name``; None if it lacks a value in some world."""
         moments = self.moments.get(name)
         return moments if moments is not None and moments.count == worlds else None
 
@@ -72,17 +65,15 @@ def tally_agents(
     objectives: Sequence[str] | None = None,
     clusters: Texts | None = None,
 ) -> dict[str, AgentTally]:
-    """Return the sums of every agent's measures over the same worlds: name of the agent -> sums.
+    """Return the sums of every agent's measures over the same worlds, by the agent's name.
 
     Args:
         outcomes: outcome of each agent, by the agent's name.
-        contexts: data that each set of measures computed once for these worlds (``contexts_of``), by the set's name.
-        baseline: name of the agent with which the other agents are compared, unless a set of measures names its own
-            baseline.
-        objectives: objectives such as ``"social:45"`` (docs/cooperation.md). If ``objectives`` is a list, even an empty
-            list, the result also contains two kinds of sums for each vehicle: the sum of the harm that the vehicle
-            bears, and the sum of the value of each objective.
-        clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
+        contexts: context of each set of measures (``contexts_of``), by the set's name.
+        baseline: name of the agent with which the others are compared, unless a set of measures names its own baseline.
+        objectives: objectives such as ``"social:45"`` (docs/cooperation.md). If this is a list, even an empty list, the
+            result also contains for each vehicle the sum of the harm that it bears and of the value of each objective.
+        clusters: name of each world's recording, [n]; None: all worlds are independent.
 
     """
     values: dict[str, dict[str, Values]] = {}
@@ -120,14 +111,8 @@ def estimate_all(
 ) -> dict[str, Estimate | None]:
     """Return the estimate (mean and 95 % interval) of every measure of one agent, by the measure's name.
 
-    Args:
-        tallies: sums of the measures of every agent, by the agent's name.
-        agent: name of the agent whose measures are estimated.
-        worlds: number of worlds in the evaluation. The estimate of a measure is None if the measure lacks a value in at
-            least one world of the evaluation.
-        baseline: name of the agent with which ``agent`` is compared. If the baseline was not evaluated, all comparisons
-            with it are None.
-
+    ``baseline`` is the name of the agent with which ``agent`` is compared. If ``tallies`` does not contain it, all
+    comparisons with it are None.
     """
     own = tallies[agent]
     columns = [
@@ -147,16 +132,8 @@ def _estimate(
 ) -> Estimate | None:
     """Return the estimate of one measure of one agent; None if values that the estimate needs are missing.
 
-    Args:
-        measure: the measure.
-        own: sums of the measures of the agent whose measure is estimated.
-        baseline: sums of the measures of the baseline agent; None if the baseline agent was not evaluated. Without
-            these sums, comparisons have no estimate.
-        worlds: number of worlds in the evaluation. The result is None if the measure lacks a value in at least one
-            world of the evaluation.
-        whole: name of a true/false measure (``MeasureSet.whole``). A comparison with the baseline has an estimate only
-            if this measure is true in all worlds. None: there is no such condition.
-
+    A comparison with the baseline has an estimate only if the true/false measure ``whole`` (``MeasureSet.whole``), if
+    there is one, is true in all worlds.
     """
     name = measure.name if callable(measure.of) else measure.of
     if own.share(name, worlds) is not None:
@@ -174,14 +151,7 @@ def _estimate(
 def lower_bounds(tally: AgentTally, worlds: int) -> frozenset[str]:
     """Return the names of the measures whose means, for one agent, are only lower bounds of the true means.
 
-    A set of measures may name a true/false measure (``MeasureSet.whole``) that says whether the set's values in a world
-    are complete. If this true/false measure is false in some world, the means of all measures in the set are lower
-    bounds.
-
-    Args:
-        tally: sums of the agent's measures.
-        worlds: number of worlds in the evaluation.
-
+    These are the measures of a set whose values are incomplete in some world (``MeasureSet.whole``).
     """
 
     def is_partial(each: MeasureSet) -> bool:

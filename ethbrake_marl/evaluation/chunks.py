@@ -1,6 +1,12 @@
 """Evaluate long lists of worlds in chunks: in this process, in several processes, or on a Ray cluster.
 
 Chunks have a fixed size, and sums over worlds are exact. Results are therefore the same for any number of processes.
+
+Arguments that several functions share: ``agents`` are names as on the command line, such as ``full_brake`` and
+``ppo+step``. ``seed`` is the seed of the worlds, None if they were not drawn from a seed. ``jobs`` is the number of
+processes; None: one process, or with Ray one per core of the cluster. ``ray`` is the address of a Ray cluster, or
+``local`` for this machine; None: Ray is not used. ``on_done`` is called after each chunk with the number of worlds
+evaluated so far.
 """
 
 from __future__ import annotations
@@ -37,7 +43,7 @@ from ethbrake_marl.scenario.task import Task
 
 MOST_EPISODES = 10**12
 
-OnDone = Callable[[int], None]  # called with the number of worlds evaluated so far
+OnDone = Callable[[int], None]
 
 # Agents of the lineup that this process built last, by ``Lineup.same``. An evaluation drives copies of them.
 _BUILT: dict[str, Mapping[str, Driver]] = {}
@@ -48,18 +54,16 @@ class Lineup:
     """List of the agents of an evaluation as plain data, from which every worker process builds the same agents.
 
     Args:
-        agents: names of the agents as on the command line, such as ``full_brake`` and ``ppo+step``.
+        agents: names of the agents.
         scenario: scenario whose learners the agents drive.
-        harm_count: count of harm that agents minimise, each pair's first impact (``first``) or all impacts (``total``).
-        uncertainty: how far quantities such as gaps and speeds may differ from their stated values, as a text such as
-            ``gaps_m=0.5``; only some shields need this argument; None: no agent has such a shield.
+        harm_count: count of harm that agents minimise.
+        uncertainty: how far quantities may differ from their stated values, such as ``gaps_m=0.5``, for shields that
+            need it; None: no agent has such a shield.
         measures: names of the user's measures that every process loads (``load_measures``), some as ``FILE:NAME``.
         reported: names of all measures of the user whose values the evaluation reports.
-        sets: names of the sets of measures that the main process has. Every worker process must also have these sets.
-        same: hash of the policies, measures and software versions (``Lineup.of``). The hash must be equal in every
-            process.
-        packages: version of each extension package that the main process uses, by the package's name. Every worker
-            process must have these versions.
+        sets: names of the sets of measures that every process must have.
+        same: hash of the policies, measures and software versions, which must be equal in every process.
+        packages: version of each extension package that every process must have, by the package's name.
 
     """
 
@@ -75,17 +79,10 @@ class Lineup:
 
     @classmethod
     def of(cls, agents: Sequence[str], scenario: Scenario, **how: Any) -> Lineup:
-        """Return a lineup (list of agents), with a hash of policies, measures and software versions.
+        """Return a lineup with the values of this process in ``reported``, ``sets``, ``same`` and ``packages``.
 
-        Every worker process computes this hash again, and refuses the lineup if the result differs (``make``).
-
-        Args:
-            agents: names of the agents as on the command line, such as ``full_brake`` and ``ppo+step``.
-            scenario: scenario whose learners the agents drive.
-            how: further arguments of ``Lineup``: ``harm_count``, ``uncertainty`` and ``measures``.
-
-        Raises the errors of ``make_lineup``.
-
+        ``how`` are the arguments ``harm_count``, ``uncertainty`` and ``measures`` of ``Lineup``. Raises the errors of
+        ``make_lineup``.
         """
         load_measures(how.pop("measures", ()))
         sets = tuple(name for name, _ in MEASURE_SETS.items())  # loads the sets, so that their versions are known
@@ -97,7 +94,7 @@ class Lineup:
         return replace(lineup, same=same, packages=versions_used())
 
     def make(self) -> Mapping[str, Driver]:
-        """Return the agents by their names on the command line; each process builds the agents only once.
+        """Return the agents by name; each process builds them only once.
 
         Raises ``InvalidInput`` if this process has other policies, measures or versions than the process that created
         the lineup.
@@ -153,16 +150,9 @@ def evaluate_held(
     ray: str | None = None,
     on_done: OnDone | None = None,
 ) -> Evaluation:
-    """Let the agents of ``lineup`` drive all worlds of ``sample``, and return their outcomes.
+    """Let the agents of ``lineup`` drive all worlds of ``sample``, and keep all outcomes in memory.
 
-    Args:
-        lineup: the agents to evaluate.
-        sample: worlds in which the agents drive; all these worlds are kept in memory.
-        seed: seed of the worlds, which the result records; None for worlds that were not drawn from a seed.
-        jobs: number of processes; None: one process, or with Ray one per core of the cluster.
-        ray: address of a Ray cluster, or ``local`` for this machine; None: Ray is not used.
-        on_done: function that is called after each chunk of worlds with the number of worlds evaluated so far.
-
+    ``seed`` is only recorded in the result.
     """
     calls: Iterator[Call] = ((_drive, lineup, part, seed, first) for first, part in chunks_of(sample))
     parts: list[Evaluation] = []
@@ -180,7 +170,7 @@ def _drive(lineup: Lineup, part: Sample, seed: int | None, first: int) -> Evalua
 
 
 def _only(outcome: Outcome, names: Sequence[str]) -> Outcome:
-    """Return a copy of the outcome in which ``metrics`` contains only the columns of the user's measures ``names``."""
+    """Return the outcome with only the columns of the user's measures ``names`` in ``metrics``."""
     metrics = {c: each for c, each in outcome.metrics.items() if c in names or c.rpartition("_")[0] in names}
     return replace(outcome, metrics=metrics)
 
@@ -195,22 +185,12 @@ def tally_list(
     ray: str | None = None,
     on_done: OnDone | None = None,
 ) -> Tally:
-    """Let the agents of ``lineup`` drive an evaluation list of any length, and return sums of their measures.
+    """Let the agents of ``lineup`` drive an evaluation list of 1 to 10^12 worlds, and return sums of their measures.
 
     The worlds are drawn and driven chunk by chunk, so memory does not grow with the length of the list. The result
-    omits sets of measures whose computation takes longer than the simulation of the episodes.
-
-    Args:
-        lineup: the agents to evaluate.
-        episodes: number of worlds in the list, 1 to 10^12.
-        seed: seed from which the worlds are drawn.
-        objectives: objectives such as ``"social:45"`` (docs/cooperation.md). If objectives are passed, the result also
-            contains two kinds of sums for each vehicle: the sum of the harm that the vehicle bears, and the sum of the
-            value of each objective.
-        jobs: number of processes; None: one process, or with Ray one per core of the cluster.
-        ray: address of a Ray cluster, or ``local`` for this machine; None: Ray is not used.
-        on_done: function that is called after each chunk of worlds with the number of worlds evaluated so far.
-
+    omits sets of measures whose computation takes longer than the simulation of the episodes. If ``objectives`` such as
+    ``"social:45"`` (docs/cooperation.md) are passed, the result also contains for each vehicle the sum of the harm that
+    it bears and of the value of each objective.
     """
     check_whole_number("episodes", episodes, 1, MOST_EPISODES)
     check_whole_number("seed", seed, 0)
@@ -235,15 +215,9 @@ def _report(on_done: OnDone | None, chunks: int, worlds: int) -> None:
 
 
 def summarise_tally(lineup: Lineup, tally: Tally, seed: int) -> SummaryTable:
-    """Return the results table of an evaluation list that ``tally_list`` evaluated, with one row per agent.
-
-    Args:
-        lineup: the evaluated agents.
-        tally: sums of each agent's measures, the result of ``tally_list``.
-        seed: seed of the evaluation list.
+    """Return the results table of an evaluation list, with one row per agent, from the result of ``tally_list``.
 
     Raises ``PhysicsError`` if every world was left out because of an error.
-
     """
     if not tally.worlds:
         raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in tally.left_out})

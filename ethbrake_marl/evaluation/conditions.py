@@ -35,8 +35,7 @@ _STAY = "\u00a0"  # a non-breaking space
 class Conditions(dict[str, Any]):
     """Dictionary that says how a result was obtained: scenario, seed, vehicles, scripts, and quantities of the worlds.
 
-    ``of`` and ``of_ranges`` return a dictionary with only the quantities of the worlds; ``of_test`` returns a
-    dictionary with all entries.
+    ``of`` and ``of_ranges`` return only the quantities of the worlds, ``of_test`` returns all entries.
     """
 
     @classmethod
@@ -44,20 +43,17 @@ class Conditions(dict[str, Any]):
         """Return a dictionary: key of a quantity -> value in ``worlds``, such as ``{"gaps_m": [7.0, [5.0, 9.0]]}``.
 
         The value of a quantity of vehicles or pairs is a list with one entry per vehicle or pair, front to rear. A
-        quantity of the whole world has a single entry. An entry is a number if the quantity is equal in all worlds. If
-        the quantity differs between worlds, the entry is ``[smallest, largest]``.
+        quantity of the whole world has a single entry. An entry is a number or, if the quantity differs between worlds,
+        ``[smallest, largest]``.
         """
         return cls.of_ranges({key: rule.of(worlds).T for key, rule in QUANTITY.of(worlds).items()})
 
     @classmethod
     def of_ranges(cls, ranges: Mapping[str, Iterable[Any]]) -> Conditions:
-        """Return the same dictionary as ``Conditions.of``, computed from arrays of the quantities' values.
+        """Return the same dictionary as ``of``.
 
-        Args:
-            ranges: key of a quantity -> arrays of its values: one array per vehicle or pair, or a single array for a
-                quantity of the whole world. Each array contains the values of a quantity in all worlds, or only the
-                smallest and the largest value.
-
+        ``ranges`` maps a quantity's key to one array per vehicle or pair, or to a single array for the whole world.
+        Each array has the values of all worlds, or only the smallest and the largest value.
         """
         ends_of = {
             key: [(float(np.nanmin(each)), float(np.nanmax(each))) for each in entries]
@@ -84,13 +80,11 @@ class Conditions(dict[str, Any]):
             task: the scenario and the controlled vehicles.
             seed: seed of the evaluation list; None for worlds that the caller passed.
             count: number of worlds.
-            because: key of a set of measures (``MeasureSet.because_key``) -> reason why the set does not apply to these
-                worlds; None if the set applies.
-            quantities: quantities of the worlds: the result of ``of`` or ``of_ranges``.
-            recordings: number of recordings that the worlds come from; 0 if the worlds come from no recordings.
-            rejected: number of drawn worlds that were rejected because of an early impact. The returned dictionary
-                contains the number of rejected worlds (as ``rejected_draws``) only if this number is above 0 and the
-                scenario takes its worlds from a table.
+            because: result of ``measure_sets.silent_because``.
+            quantities: result of ``of`` or ``of_ranges``.
+            recordings: number of recordings that the worlds come from, or 0.
+            rejected: number of drawn worlds that were rejected because of an early impact. It is listed (as
+                ``rejected_draws``) only if it is above 0 and the scenario takes its worlds from a table.
 
         """
         scenario = task.scenario
@@ -122,11 +116,9 @@ class Conditions(dict[str, Any]):
 
     @property
     def by_recording(self) -> str:
-        """Part of a caption that says how many recordings the worlds come from; "" if the worlds come from no
-        recordings.
+        """Part of a caption, such as ``; 95 % intervals by 55 recordings``; "" if the worlds come from no recordings.
 
-        An example is ``; 95 % intervals by 55 recordings``. If all worlds come from one recording, the text says that
-        there are no intervals.
+        If all worlds come from one recording, the text says that there are no intervals.
         """
         number = self.get("recordings", 0)
         many = f"; 95 % intervals by {number:,} recordings" if number else ""
@@ -134,10 +126,7 @@ class Conditions(dict[str, Any]):
 
     @property
     def quantities(self) -> str:
-        """All quantities in one line, with symbols and units, such as ``d = 7 m; v = (20, 18, 20) m/s``.
-
-        If a quantity has the same value for all vehicles (or pairs), the value is written only once.
-        """
+        """All quantities in one line: ``d = 7 m; v = (20, 18, 20) m/s`` if all gaps are 7 m."""
         parts = []
         for key, (symbol, unit) in _SYMBOLS.items():
             if key in self:
@@ -149,15 +138,12 @@ class Conditions(dict[str, Any]):
 
 
 def _plain(tells: Tells) -> Any:
-    """Return the contents of messages as plain data for JSON: one list for all vehicles, or one list per vehicle."""
+    """Return the contents of messages as plain data for JSON."""
     return {name: [*each] for name, each in tells.items()} if isinstance(tells, Mapping) else [*tells]
 
 
 def message_words(scenario: Scenario) -> str:
-    """Return a text about what messages contain, for instance ``messages of all contain place``.
-
-    The text is empty if the scenario does not set ``tells``, the key for the contents of messages.
-    """
+    """Return a text such as ``messages of all contain place``; empty if the scenario does not set the key ``tells``."""
     tells = scenario.v2x.channel.tells
     return "" if tells is None else _message_words(tells)
 

@@ -58,7 +58,7 @@ class Evaluation:
     worlds: Worlds  # the n worlds at the alert
     index: Ints  # [n] number of each world in the evaluation list, from 0
     seed: int | None  # seed of the evaluation list; None for worlds that the caller passed
-    outcomes: dict[str, Outcome]  # results of each agent in these worlds, by the agent's name
+    outcomes: dict[str, Outcome]  # by the agent's name
     left_out: tuple[LeftOut, ...] = ()  # worlds that could not be simulated with some agent; no array contains them
     # Names of the groups that each world belongs to, [n]: ``scenario`` if the scenario is a mixture,
     # ``vehicle_2_type`` and so on if it has vehicle types, ``recording`` if its worlds come from recordings.
@@ -79,12 +79,12 @@ class Evaluation:
 
     @property
     def vehicle(self) -> int:
-        """Index (0 = front) of the only controlled vehicle; raises ``InvalidInput`` if there are several or none."""
+        """Index (0 = front) of the only controlled vehicle; raises ``InvalidInput`` unless there is exactly one."""
         return self.task.vehicle
 
     @property
     def task(self) -> Task:
-        """The ``Task`` of this evaluation: its scenario and its controlled vehicles."""
+        """Scenario and controlled vehicles."""
         return Task(self.scenario, self.vehicles)
 
     def once(self, compute: Callable[[Evaluation], T]) -> T:
@@ -96,13 +96,9 @@ class Evaluation:
 
     @classmethod
     def join(cls, parts: Sequence[Evaluation]) -> Evaluation:
-        """Join evaluations of consecutive chunks of worlds into one evaluation of all these worlds.
-
-        Args:
-            parts: evaluations of the same agents, one per chunk of worlds, in the order of the worlds.
+        """Join evaluations of the same agents in consecutive chunks of worlds.
 
         Raises ``PhysicsError`` if every world was left out because of an error.
-
         """
         left_out = tuple(left for part in parts for left in part.left_out)
         some = [part for part in parts if part.worlds.n]
@@ -121,11 +117,10 @@ class Evaluation:
         )
 
     def take(self, rows: Ints | Bools) -> Evaluation:
-        """Return the evaluation restricted to some of its worlds. In the result, ``left_out`` is empty and ``rejected``
-        is 0.
+        """Return the evaluation restricted to some of its worlds, with empty ``left_out`` and with ``rejected`` 0.
 
         Args:
-            rows: row numbers of the worlds to keep, or a mask [n] that is true for the worlds to keep.
+            rows: row numbers of the worlds to keep, or a mask [n] that is true for these worlds.
 
         """
         outcomes = {name: outcome.take(rows) for name, outcome in self.outcomes.items()}
@@ -157,7 +152,7 @@ class Evaluation:
 
     @property
     def conditions(self) -> Conditions:
-        """Conditions of this evaluation (scenario, seed, controlled vehicles, quantities), for captions and JSON."""
+        """Scenario, seed, controlled vehicles and quantities, for captions and JSON."""
         because = silent_because(contexts_of(self))
         return Conditions.of_test(
             self.task, self.seed, self.worlds.n, because, Conditions.of(self.worlds),
@@ -167,12 +162,11 @@ class Evaluation:
     def per_world(self, objectives: Sequence[Declared] = ()) -> Columns:
         """Return a table with one row per agent and world, as a dictionary: name of a column -> its values.
 
-        docs/evaluate.md lists the columns of the table. Columns of initial quantities have names such as ``gap_1_m``,
+        docs/evaluate.md lists the columns. Columns of initial quantities have names such as ``gap_1_m``,
         ``speed_1_mps``, ``latency_2_s`` and ``restitution``. A missing value is None.
 
         Args:
-            objectives: objectives such as ``"social:45"``; each objective adds columns with its value for every
-                vehicle.
+            objectives: objectives such as ``"social:45"``, each of which adds columns with its value for every vehicle.
 
         """
         n, contexts = self.worlds.n, contexts_of(self)
@@ -204,10 +198,7 @@ class Evaluation:
         return table
 
     def arrays(self, objectives: Sequence[Declared] = ()) -> dict[str, NDArray[Any]]:
-        """Return the columns of ``per_world`` as a dictionary: name of a column -> array of its values.
-
-        A missing number is NaN, and a missing text is empty. ``objectives`` is the same argument as in ``per_world``.
-        """
+        """Return the columns of ``per_world`` as arrays. A missing number is NaN, and a missing text is empty."""
         arrays, of_sets = {}, [each.texts for each in MEASURE_SETS.values()]
         for name, values in self.per_world(objectives).items():
             texts = name in _TEXTS.union(*of_sets) or (name.startswith("vehicle_") and name.endswith("_type"))
@@ -215,10 +206,9 @@ class Evaluation:
         return arrays
 
     def to_pandas(self) -> Any:
-        """Return a pandas ``DataFrame`` with one row per agent and world.
+        """Return the columns of ``arrays`` as a pandas ``DataFrame`` with one row per agent and world.
 
-        docs/evaluate.md lists the columns of the table. A missing number is NaN. ``arrays`` returns the same columns
-        without pandas. Raises ``MissingExtra`` if pandas is not installed.
+        docs/evaluate.md lists the columns. Raises ``MissingExtra`` if pandas is not installed.
         """
         with naming_extras():
             from pandas import DataFrame
@@ -229,8 +219,7 @@ class Evaluation:
         """Return the mean value of each objective over the worlds, for every agent, vehicle and count of harm.
 
         Args:
-            declared: objectives such as ``"total"`` or ``"social:45"``; None: the standard objectives
-                (``standard_objectives``).
+            declared: objectives such as ``"total"`` or ``"social:45"``; None: ``standard_objectives``.
 
         """
         return Rescores(
@@ -244,7 +233,7 @@ class Evaluation:
         )
 
     def _repr_html_(self) -> str:
-        """Return a table with the collisions and harm of each agent as HTML, for a notebook."""
+        """Return the collisions and harm of each agent as an HTML table."""
         by, share = self.clusters, Column("Collisions", digits=1, scale=100.0, unit=" %")
         rows = [
             (agent, share_of(each.collided, by), mean(each.first_impact_harm, by), mean(each.total_harm, by))
@@ -255,15 +244,13 @@ class Evaluation:
         return Sheet(repr(self), ("Agent", share, Column("First-impact harm"), Column("Total harm")), rows, note).html()
 
     def complete(self) -> Evaluation:
-        """Return this evaluation if no world was left out. If a world was left out, raise ``PhysicsError``, which lists
-        the left-out worlds.
-        """
+        """Return this evaluation; raise ``PhysicsError``, which lists the left-out worlds, if there are any."""
         if self.left_out:
             raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in self.left_out})
         return self
 
     def outcome(self, agent: str) -> Outcome:
-        """Return the results of the agent with this name; raise ``InvalidInput`` if it was not evaluated."""
+        """Return the results of an agent; raise ``InvalidInput`` if it was not evaluated."""
         if agent not in self.outcomes:
             raise InvalidInput(f"agent {agent!r} was not evaluated; evaluated agents: {', '.join(self.outcomes)}")
         return self.outcomes[agent]

@@ -23,16 +23,10 @@ _TRAINED = 2_000  # number of worlds drawn from the training scenario to find th
 def warn_unfamiliar(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenario, vehicles: Sequence[int]) -> None:
     """Warn (``Unfamiliar``) about each trained policy that is to drive in worlds unlike its training worlds.
 
-    A policy's manifest contains its training scenario; ``worlds`` are compared with worlds drawn from this scenario. If
-    no worlds of the training scenario can be drawn on this machine, there is no warning. The comparison considers only
-    two features of the V2X channel: the latencies and the contents of messages.
-
-    Args:
-        agents: agents by name; agents without a trained policy are ignored.
-        worlds: worlds at the alert in which the agents are to drive.
-        scenario: scenario of ``worlds``.
-        vehicles: indices (0 = front) of the vehicles that each agent drives.
-
+    A policy's manifest contains its training scenario; ``worlds`` at the alert are compared with worlds drawn from this
+    scenario. If no worlds of the training scenario can be drawn on this machine, there is no warning. The comparison
+    considers only two features of the V2X channel: the latencies and the contents of messages. ``vehicles`` are the
+    indices (0 = front) of the vehicles that each agent drives.
     """
     drives: dict[str, tuple[str, Manifest, dict[str, None]]] = {}  # by hash: the first agent, vehicles in order
     for name, agent in agents.items():
@@ -61,8 +55,8 @@ def warn_unfamiliar(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scen
 def _beyond(before: Worlds, worlds: Worlds) -> list[str]:
     """Return descriptions of quantities of ``worlds`` that lie outside the range of the training worlds ``before``.
 
-    For instance, ``["latency_s in 40 % of the worlds", "no friction"]`` means that a latency lies outside the training
-    range in 40 % of the worlds, and that friction limits the brakes in the training worlds only.
+    For instance, ``["latency_s in 40 % of the worlds", "no friction"]`` means: a latency lies outside the training
+    range in 40 % of the worlds, and friction limits the brakes in the training worlds only.
     """
     unfamiliar, known, here = [], QUANTITY.of(before), QUANTITY.of(worlds)
     for key, rule in here.items():

@@ -17,12 +17,10 @@ def summarise_by(evaluation: Evaluation, by: str, *, baseline: str = BASELINE) -
 
     Args:
         evaluation: outcomes of the agents in worlds of a mixture of scenarios, or of a scenario with vehicle types.
-        by: what the worlds are grouped by: ``scenario`` (one of the mixture's scenarios), or the type of a vehicle,
-            such as ``vehicle_2_type``.
+        by: ``scenario`` (one of the mixture's scenarios), or the type of a vehicle, such as ``vehicle_2_type``.
         baseline: name of the agent with which the other agents are compared.
 
-    Raises ``InvalidInput`` if the worlds have no groups (they come from one scenario without vehicle types), and
-    ``UnknownName`` if ``by`` is unknown.
+    Raises ``InvalidInput`` if the worlds have no groups, and ``UnknownName`` if ``by`` is unknown.
 
     >>> import ethbrake_marl as eb
     >>> delays = eb.load_scenario("mixture-delays")

@@ -43,13 +43,9 @@ HASHES = 1 << 256  # sums of hashes are taken modulo this number
 def worlds_sha256(worlds: Worlds, index: Ints) -> str:
     """Return a hash of worlds as 64 hexadecimal digits. Equal worlds have equal hashes on every machine.
 
-    The hash is the SHA-256 of all arrays of ``worlds`` (little-endian, with their names) and of ``index``. For more
-    than 100,000 worlds, ``hash_of_chunks`` computes another hash, which needs less memory.
-
-    Args:
-        worlds: the n worlds at the alert.
-        index: number of each world in its evaluation list, [n].
-
+    The hash is the SHA-256 of all arrays of ``worlds`` at the alert (little-endian, with their names) and of ``index``,
+    the number of each world in its evaluation list, [n]. For more than 100,000 worlds, ``hash_of_chunks`` computes
+    another hash, which needs less memory.
     """
     if worlds.n > HELD:
         return f"{hash_of_chunks(worlds, index):064x}"
@@ -63,13 +59,7 @@ def _hash_at_once(worlds: Worlds, index: Ints) -> str:
 def hash_of_chunks(worlds: Worlds, index: Ints) -> int:
     """Return a hash of worlds: the sum, modulo 2^256, of the SHA-256 of all chunks of 2,500 worlds.
 
-    The first chunk contains the worlds with numbers 0 to 2,499, the second chunk the worlds with numbers 2,500 to
-    4,999, and so on.
-
-    Args:
-        worlds: the n worlds at the alert.
-        index: number of each world in its evaluation list, [n].
-
+    The first chunk contains the worlds with numbers (``index``) 0 to 2,499, and so on.
     """
     chunks = [np.flatnonzero(index // CHUNK == number) for number in np.unique(index // CHUNK)]
     return sum(int(_hash_at_once(worlds.take(chunk), index[chunk]), 16) for chunk in chunks) % HASHES
@@ -86,8 +76,7 @@ def _arrays_sha256(arrays: dict[str, np.ndarray]) -> str:
 
 
 def _arrays(value: Any) -> dict[str, np.ndarray]:
-    """Return the arrays in the fields of the dataclass ``value`` and of the dataclasses inside ``value``, by the
-    field's name.
+    """Return the arrays in the dataclass ``value`` and in the dataclasses inside it, by the field's name.
 
     Some arrays are omitted if they have no effect: messages and braking profiles if the worlds have none, build-up
     rates of brakes if all are infinite, and weights of harm if all are 1.
@@ -104,10 +93,7 @@ def _arrays(value: Any) -> dict[str, np.ndarray]:
 
 
 def scenario_sha256(scenario: Scenario) -> str:
-    """Return the SHA-256 (hexadecimal) of everything in a scenario that affects an episode, including default values.
-
-    The scenario's name, title, description and source do not affect the hash.
-    """
+    """Return the SHA-256 of a scenario, including default values, without its name, title, description and source."""
     content = scenario.content(without=_WORDS)
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
@@ -123,8 +109,8 @@ def policies_of(drivers: Mapping[int, object]) -> dict[str, str]:
 def result_versions() -> dict[str, str]:
     """Return the versions of Python and of every package on which the numbers of a result depend, by name.
 
-    The result includes the extension packages that this process used. The result also includes the SHA-256 of each
-    Python file of the user that this process ran.
+    These include the extension packages that this process used, and the SHA-256 of each Python file of the user that
+    this process ran.
     """
     return own_versions() | versions_used() | {name: f"SHA-256 {sha256}" for name, sha256 in files_run().items()}
 
@@ -137,18 +123,10 @@ def own_versions() -> dict[str, str]:
 def result_identity(
     kind: Kind, scenario: Scenario, sample: Sample | None, left_out: Collection[int] = ()
 ) -> dict[str, Any]:
-    """Return the entries that identify a result in a JSON results file.
+    """Return ``kind``, ``scenario_sha256``, ``worlds_sha256`` and ``versions`` for a JSON results file.
 
-    The entries are ``kind``, ``scenario_sha256``, ``worlds_sha256`` and ``versions``.
-
-    Args:
-        kind: kind of results, such as ``evaluate`` or ``shield``.
-        scenario: scenario of the worlds.
-        sample: the worlds of the result; None if the file contains results of several samples of worlds. If ``sample``
-            is None, the result has no ``worlds_sha256``.
-        left_out: row numbers of the worlds in ``sample`` that were left out because of errors. The hash
-            ``worlds_sha256`` is computed without the worlds that were left out.
-
+    The rows ``left_out`` of ``sample`` do not affect ``worlds_sha256``. If the file contains results of several
+    samples of worlds, pass None as ``sample``; the result then has no ``worlds_sha256``.
     """
     identity: dict[str, Any] = {
         "kind": kind,

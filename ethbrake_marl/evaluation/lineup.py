@@ -21,15 +21,7 @@ def check_agents(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenari
     """Let every agent decide once, so that an error in an agent is raised before a long evaluation.
 
     An agent whose commands do not depend on the state (``state_free``) decides in all worlds. Other agents decide only
-    in the first world.
-
-    Args:
-        agents: agents or teams by name.
-        worlds: worlds at the alert in which the agents are to drive.
-        scenario: scenario whose learners the agents drive.
-        warn: whether to also warn about policies that drive in worlds unlike their training worlds
-            (``warn_unfamiliar``).
-
+    in the first world. With ``warn``, also call ``warn_unfamiliar``.
     """
     if warn:
         warn_unfamiliar(agents, worlds, scenario, scenario.learners)
@@ -58,15 +50,14 @@ def make_lineup(
     """Build one agent for each text in ``specs``, and return a dictionary: text -> agent.
 
     Args:
-        specs: texts that name agents (``"full_brake"``, ``"ppo+step"``), as a list or as one text with commas between
-            the specs. The name of a group of agents, such as ``ladder``, is replaced by all agents of the group.
+        specs: a list, or one text with commas between the specs. The name of a group of agents, such as ``ladder``, is
+            replaced by all agents of the group.
         scenario: scenario whose learners the agents drive.
-        harm_count: count of harm that optimising agents minimise, ``first`` or ``total``.
-        uncertainty: how far quantities such as gaps and speeds may differ from their stated values, for instance
-            ``gaps_m=0.5``; only some shields need this argument (see ``make_agent``).
-        alone: whether to refuse teams, because the caller needs agents that drive a single vehicle.
-        bare: whether to refuse agents that already have a shield, because the caller will add one. If ``bare`` is true
-            and the scenario has one learner, teams are also refused.
+        harm_count: count of harm that optimising agents minimise.
+        uncertainty: how far quantities may differ from their stated values, for instance ``gaps_m=0.5``, for shields
+            that need it (``make_agent``).
+        alone: whether to refuse teams.
+        bare: whether to refuse agents that already have a shield and, if the scenario has one learner, also teams.
 
     Raises ``InvalidInput`` for a repeated spec, for an uncertainty that is missing or unused, and for a team or shield
     that is refused. Also raises the errors of ``make_agent``.
@@ -100,14 +91,5 @@ def make_lineup(
 
 
 def make_agents(specs: Sequence[str], scenario: Scenario, *, harm_count: HarmCount = "first") -> dict[str, Agent]:
-    """Build an agent that drives a single vehicle for each text in ``specs``; return a dictionary: text -> agent.
-
-    Args:
-        specs: texts that name agents, such as ``full_brake``.
-        scenario: scenario whose learners the agents drive.
-        harm_count: count of harm that optimising agents minimise, ``first`` or ``total``.
-
-    Raises ``InvalidInput`` if a spec names a team, and the errors of ``make_lineup``.
-
-    """
+    """Return the result of ``make_lineup``; raise ``InvalidInput`` if a spec names a team."""
     return make_lineup(specs, scenario, harm_count=harm_count, alone=True)  # type: ignore[return-value]  # no teams

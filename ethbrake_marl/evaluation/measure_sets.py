@@ -27,8 +27,8 @@ BASELINE = "full_brake"
 
 @dataclass(frozen=True, slots=True)
 class Measure:
-    """One measure of an agent. Tables show the mean of the measure over the worlds or, for a true/false measure, the
-    share of worlds in which the measure is true.
+    """One measure of an agent. Tables show its mean over the worlds or, for a true/false measure, the share of worlds
+    in which it is true.
 
     The field ``of`` is a function of the agent's outcome and of the context that ``MeasureSet.prepare`` returned. The
     function returns one value per world, [n], or None if the measure is not defined for this outcome. If the measure
@@ -37,7 +37,7 @@ class Measure:
     """
 
     name: str  # key in JSON results, different for all measures
-    of: Callable[[Outcome, Any], Values | None] | str  # function that computes the values, or name of a measure
+    of: Callable[[Outcome, Any], Values | None] | str
     heading: str = ""  # heading of the measure's column in tables; "": no column
     short: str = ""  # short heading for terminals, possibly with line breaks
     about: str = ""  # explanation for users; "": another measure whose heading begins with the same words has it
@@ -49,16 +49,15 @@ class Measure:
     def values(self, outcome: Outcome, context: Any) -> Values | None:
         """Return this measure's value in every world of an outcome, [n].
 
-        ``context`` is the information about the worlds that the measure's set computed (``contexts_of``). The result is
-        None if the measure is a comparison with the baseline, if its set does not apply (context ``Silent``), or if the
-        measure is not defined for this outcome.
+        The result is None if the measure is a comparison with the baseline, if its set does not apply (context
+        ``Silent``), or if the measure is not defined for this outcome.
         """
         if isinstance(self.of, str) or isinstance(context, Silent):
             return None
         return self.of(outcome, context)
 
     def column(self) -> Column:
-        """Return the description of this measure's column in a table: heading, name and number format."""
+        """Return this measure's column in a table."""
         shown = {"digits": 1, "scale": 100.0, "unit": " %"} if self.percent else {}
         return Column(self.heading, self.name, short=self.short, **shown)  # type: ignore[arg-type]
 
@@ -72,21 +71,19 @@ class Silent:
 
 @dataclass(frozen=True, slots=True)
 class GroupColumn:
-    """Column of the table that ``ethbrake evaluate`` prints for a group of scenarios. A set of measures adds this
-    column.
-    """
+    """Column that a set of measures adds to the table of ``ethbrake evaluate`` for a group of scenarios."""
 
-    column: Column  # heading and number format of the column
+    column: Column
     measures: Mapping[HarmCount, str]  # count of harm that the agents minimise -> name of the measure to show
     note: str  # sentence below the table; ``{harm}`` in it is replaced by ``first-impact`` or ``total``
 
 
 class MeasureSet:
-    """Base class of a set of measures that are computed from the same information about the worlds.
+    """Base class of a set of measures that need the same information about the worlds, the *context*.
 
-    A subclass must list its measures in ``measures``. A subclass may override ``prepare``, which computes this
-    information (the *context*) once per evaluation; ``row``, which adds fields to JSON results; and ``warnings`` and
-    ``notes``, which add texts to a results table.
+    A subclass must list its measures in ``measures``. It may override ``prepare``, which computes the context once per
+    evaluation; ``row``, which adds fields to JSON results; and ``warnings`` and ``notes``, which add texts to a results
+    table, whose rows are their argument (``SummaryRow``, one per agent).
     """
 
     measures: tuple[Measure, ...] = ()  # measures with a column or a JSON key, in the order of JSON
@@ -106,41 +103,31 @@ class MeasureSet:
     not_in_long_lists: str = ""  # why the set does not apply to more than 100,000 worlds; "": the set applies
 
     def prepare(self, evaluation: Any) -> Any:
-        """Return the context: the information about an ``Evaluation`` that the measures of this set need.
+        """Return the context of an ``Evaluation``, or ``Silent`` with a reason if the set does not apply to it.
 
-        ``Measure.of`` gets the context as its second argument. Return ``Silent`` with a reason if the set does not
-        apply to the evaluation. If a subclass does not override this method, the context is None.
+        ``Measure.of`` gets the context as its second argument. In the base class it is None.
         """
         return None
 
     def row(self, tally: Any, worlds: int, context: Any) -> dict[str, Any]:
         """Return fields that this set adds to an agent's object in the JSON results (in the base class: none).
 
-        The returned dictionary must have the same keys in every evaluation, even if the set does not apply to the
-        evaluation.
+        The returned dictionary must have the same keys in every evaluation, even if the set does not apply.
 
         Args:
             tally: sums of the agent's measures (``AgentTally``).
             worlds: number of worlds in the evaluation.
-            context: the context that ``prepare`` returned (``Silent`` if the set does not apply); None if there are
-                more than 100,000 worlds.
+            context: result of ``prepare``; None if there are more than 100,000 worlds.
 
         """
         return {}
 
     def warnings(self, rows: Sequence[Any]) -> Sequence[str]:
-        """Return warnings about a results table (in the base class: none). A warning is a clause that has no capital
-        letter at the beginning and no full stop at the end.
-
-        ``rows`` are the table's rows (``SummaryRow``, one per agent).
-        """
+        """Return warnings about a results table: clauses without capital and full stop (in the base class: none)."""
         return ()
 
     def notes(self, rows: Sequence[Any]) -> Sequence[str]:
-        """Return notes to print below a results table (in the base class: none). A note is a whole sentence.
-
-        ``rows`` are the table's rows (``SummaryRow``, one per agent).
-        """
+        """Return notes to print below a results table: whole sentences (in the base class: none)."""
         return ()
 
 
@@ -210,12 +197,7 @@ class EpisodeMeasures(MeasureSet):
 
 
 class RegisteredMeasures(MeasureSet):
-    """Measures that the user registered with ``register_measure``.
-
-    Args:
-        columns: names of the columns of these measures, which are the keys of ``Outcome.metrics``.
-
-    """
+    """Measures that the user registered with ``register_measure``; ``columns`` are the keys of ``Outcome.metrics``."""
 
     def __init__(self, columns: Iterable[str] = ()) -> None:
         self.measures = tuple(Measure(COLUMN + name, partial(_registered, name), heading_of(name)) for name in columns)
@@ -232,14 +214,8 @@ def register_measure_set(name: str, measures: MeasureSet) -> None:
     """Add a set of measures to every later evaluation of this process.
 
     Instead of calling this function, a package can declare an entry point of the group ``ethbrake_marl.measure_sets``.
-
-    Args:
-        name: name of the set, its key in ``MEASURE_SETS``.
-        measures: the set.
-
     Raises ``InvalidInput`` if ``measures`` is not a ``MeasureSet``, and ``AlreadyExists`` if another set has the same
     name, or if a measure of another set has the same name as a measure of this set.
-
     """
     if not isinstance(measures, MeasureSet):
         raise InvalidInput(f"set of measures {name!r} = {measures!r:.60}: must be a MeasureSet")
@@ -257,30 +233,24 @@ MEASURE_SETS: Registry[MeasureSet] = Registry("set of measures", "measure_sets",
 
 
 def contexts_of(evaluation: Any, *, long_list: bool = False) -> dict[str, Any]:
-    """Return the context (information about the worlds) of each installed set of measures, by the set's name.
+    """Return the context of each installed set of measures (``MeasureSet.prepare``), by the set's name.
 
-    A context is the result of ``MeasureSet.prepare``, which is called once per evaluation. If a set does not apply to
-    the evaluation, its context is ``Silent``, with the reason.
-
-    Args:
-        evaluation: the evaluation.
-        long_list: whether ``evaluation`` is one chunk of a list of more than 100,000 worlds. Some sets do not apply to
-            more than 100,000 worlds.
-
+    ``long_list`` says whether ``evaluation`` is one chunk of a list of more than 100,000 worlds, to which some sets do
+    not apply. The context of a set that does not apply is ``Silent``.
     """
     silent = silent_in_long_lists() if long_list else {}
     return {name: silent.get(name) or evaluation.once(each.prepare) for name, each in MEASURE_SETS.items()}
 
 
 def silent_in_long_lists() -> dict[str, Silent]:
-    """Return the sets of measures that do not apply to more than 100,000 worlds: name of the set -> ``Silent``."""
+    """Return the sets of measures that do not apply to more than 100,000 worlds, by name."""
     return {name: Silent(why) for name, each in MEASURE_SETS.items() if (why := each.not_in_long_lists)}
 
 
 def silent_because(contexts: Mapping[str, Any]) -> dict[str, str | None]:
     """Return a dictionary: ``because_key`` of a set of measures -> why the set does not apply (None: it applies).
 
-    ``contexts`` is the result of ``contexts_of``. Sets whose ``because_key`` is None are omitted.
+    ``contexts`` is the result of ``contexts_of``. Sets without a ``because_key`` are omitted.
     """
     by_key = {key: contexts[name] for name, each in MEASURE_SETS.items() if (key := each.because_key) is not None}
     return {key: context.because if isinstance(context, Silent) else None for key, context in by_key.items()}
@@ -289,8 +259,7 @@ def silent_because(contexts: Mapping[str, Any]) -> dict[str, str | None]:
 def every_set(columns: Iterable[str] = ()) -> Iterator[tuple[str, MeasureSet]]:
     """Yield the name and the object of every set of measures, in the order of JSON results.
 
-    The sets ``EpisodeMeasures`` and ``RegisteredMeasures`` have the name "". ``columns`` lists the columns of the
-    measures that the user registered (the keys of ``Outcome.metrics``).
+    The sets ``EpisodeMeasures`` and ``RegisteredMeasures(columns)`` have the name "".
     """
     yield "", EPISODE
     yield "", RegisteredMeasures(columns)
@@ -298,8 +267,5 @@ def every_set(columns: Iterable[str] = ()) -> Iterator[tuple[str, MeasureSet]]:
 
 
 def measures(columns: Iterable[str] = ()) -> tuple[Measure, ...]:
-    """Return the measures of all sets, in the order of JSON results.
-
-    ``columns`` lists the columns of the measures that the user registered (the keys of ``Outcome.metrics``).
-    """
+    """Return the measures of all sets (``every_set``), in the order of JSON results."""
     return tuple(measure for _, each in every_set(columns) for measure in each.measures)

@@ -1,4 +1,7 @@
-"""Exact motion of whole episodes as cubic polynomials of time, from which the state at any time is computed."""
+"""Exact motion of whole episodes as cubic polynomials of time, from which the state at any time is computed.
+
+In this file a *piece* is a stretch of time in which all jerks are constant.
+"""
 
 from __future__ import annotations
 
@@ -27,9 +30,8 @@ class EpisodeMotion:
     """Exact motion of one world from the alert to the end of its episode, with its impacts and harm."""
 
     world: Worlds  # the world at the alert, n = 1
-    # Motion as k pieces in order of time, [k, 1 + 4 N]. A piece is a stretch of time in which all jerks are constant.
-    # Its row is the state at its beginning: time (s), position of Vehicle 1 (m), gaps (N - 1, m), speeds (N, m/s),
-    # accelerations (N, m/s2) and jerks (N, m/s3). ``state_at`` returns the state at any time within a piece.
+    # Motion as k pieces in order of time, [k, 1 + 4 N]. The row of a piece is the state at its beginning: time (s),
+    # position of Vehicle 1 (m), gaps (N - 1, m), speeds (N, m/s), accelerations (N, m/s2) and jerks (N, m/s3).
     pieces: Floats
     end_s: float  # time since the alert at which the episode ends (s)
     impacts: ImpactRows  # all impacts in order of time; column ``world`` is 0
@@ -46,17 +48,9 @@ class EpisodeMotion:
 
 
 def follow_episodes(worlds: Worlds, agent: Driver, scenario: Scenario) -> list[EpisodeMotion]:
-    """Let an agent drive every world as in ``evaluate``, and return the motion of each world, in the order of
-    ``worlds``.
-
-    Args:
-        worlds: worlds at the alert.
-        agent: an agent, of which each learner gets a copy, or a team. The object that you pass does not change.
-        scenario: scenario of the worlds. The agent drives the learners of the scenario, and the scripts of the scenario
-            drive the other vehicles.
+    """Let an agent or team drive the learners of every world as in ``evaluate``, and return each world's motion.
 
     Raises ``PhysicsError``, which lists the worlds whose simulation failed.
-
     """
     team = Team.of(agent, scenario.learners)
     engine = episode_engine(worlds, team, scenario)
@@ -68,12 +62,7 @@ def follow_episodes(worlds: Worlds, agent: Driver, scenario: Scenario) -> list[E
 class _Follower(Tape):
     """Recorder of every time step of episodes, and of the decisions at which a shield replaced the policy's action.
 
-    Args:
-        worlds: the worlds at the alert.
-        team: agents of the controlled vehicles.
-        engine: simulator that runs the episodes; its attribute ``ruling`` says what the shield decided in the current
-            step.
-
+    ``engine.ruling`` says what the shield decided in the current step.
     """
 
     def __init__(self, worlds: Worlds, team: Team, engine: Engine) -> None:
@@ -84,14 +73,7 @@ class _Follower(Tape):
         self._engine, self._ruling = engine, engine.ruling
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Record one time step.
-
-        Args:
-            before: the worlds at the beginning of the step.
-            command_mps2: commanded accelerations during the step (m/s2), [n, N].
-            until_s: time since the alert at which the step ends (s), [n].
-
-        """
+        """Record one time step (``Tape.see``)."""
         super().see(before, command_mps2, until_s)
         ruling = self._engine.ruling
         if ruling is not None and ruling is not self._ruling:  # ``see`` may be called several times in a step
@@ -100,9 +82,7 @@ class _Follower(Tape):
             self._ruling = ruling
 
     def motions(self, episodes: Episodes) -> list[EpisodeMotion]:
-        """Return the recorded motion of each world. ``episodes`` contains the harm, the final states and the agents'
-        memories of all worlds.
-        """
+        """Return the recorded motion of each world, with the harm and the final state from ``episodes``."""
         n, N = self.worlds.n, self.worlds.N
         impacts, pieces = self.episodes(), self._pieces()
         motions = []
@@ -127,11 +107,7 @@ class _Follower(Tape):
         return motions
 
     def _pieces(self) -> list[Floats]:
-        """Return the motion of each world: one row per stretch of time with constant jerks, [k, 1 + 4 N].
-
-        A row contains the same numbers as a row of ``EpisodeMotion.pieces``: time and state at the beginning of the
-        stretch. If an episode ends at the alert, its array has a single row.
-        """
+        """Return the pieces of each world (``EpisodeMotion.pieces``); one row if its episode ends at the alert."""
         parts: list[list[Floats]] = [[] for _ in range(self.worlds.n)]
         way_m = np.zeros(self.worlds.n)
         for before, command, until_s in self.steps:
@@ -150,15 +126,10 @@ class _Follower(Tape):
 
 
 def join_pieces(pieces: Floats, vehicles: int) -> Floats:
-    """Return the same motion with fewer pieces; a piece is a stretch of time in which all jerks are constant.
+    """Return the same motion (``EpisodeMotion.pieces``) of N = ``vehicles`` vehicles with fewer pieces.
 
     A piece is dropped if the previous piece, continued to the beginning of this piece, leads to the same state up to
-    rounding. If several pieces begin within the same 0.1 ms, only the last of these pieces is kept.
-
-    Args:
-        pieces: motion to simplify: time and state at the beginning of each piece, [k, 1 + 4 N].
-        vehicles: number of vehicles, N.
-
+    rounding. If several pieces begin within the same 0.1 ms, only the last of them is kept.
     """
     last_of_many = np.append(np.diff(np.floor(pieces[:, 0] / _SHORT_S)) > 0.0, True)
     last_of_many[0] = True
@@ -170,15 +141,10 @@ def join_pieces(pieces: Floats, vehicles: int) -> Floats:
 
 
 def state_at(piece: Floats, time_s: float, vehicles: int) -> Floats:
-    """Return the state [4 N] at one time within a piece (a stretch of time in which all jerks are constant).
+    """Return the state [4 N] at ``time_s`` (since the alert) within ``piece``, a row of ``EpisodeMotion.pieces``.
 
-    The state is the position of Vehicle 1 (m), gaps (m), speeds (m/s), accelerations (m/s2) and jerks (m/s3).
-
-    Args:
-        piece: time and state at the beginning of the piece, [1 + 4 N], a row of ``EpisodeMotion.pieces``.
-        time_s: time of the returned state, counted from the alert (s).
-        vehicles: number of vehicles, N.
-
+    The state is the position of Vehicle 1 (m), gaps (m), speeds (m/s), accelerations (m/s2) and jerks (m/s3) of N =
+    ``vehicles`` vehicles.
     """
     t, N = time_s - piece[0], vehicles
     speeds, rates, jerks = (piece[1 + part * N : 1 + (part + 1) * N] for part in (1, 2, 3))

@@ -18,7 +18,7 @@ SEES_THROUGH = "† "  # mark of an omniscient agent, which reads values that no
 
 
 def notes_of(rows: Sequence[SummaryRow]) -> list[Note]:
-    """Return the notes to print below a results table, in the order of printing."""
+    """Return the notes to print below a results table."""
     if not rows:
         return []
     notes: list[Note] = [
@@ -49,7 +49,7 @@ def identity_line(rows: Sequence[SummaryRow]) -> str:
 
 
 def _sets_in(rows: Sequence[SummaryRow]) -> list[MeasureSet]:
-    """Return the registered sets of measures that added fields to the rows of a table (``SummaryRow.more``)."""
+    """Return the registered sets of measures that added fields to the rows (``SummaryRow.more``)."""
     return [each for name, each in MEASURE_SETS.items() if rows and name in rows[0].more]
 
 
@@ -99,10 +99,7 @@ def _no_impact(rows: Sequence[SummaryRow]) -> str:
 
 
 def _knowledge(rows: Sequence[SummaryRow]) -> str:
-    """Return the note that says what the V2X channel hides, and which hidden values agents know nevertheless.
-
-    The note is empty if the V2X channel hides nothing in the evaluated worlds.
-    """
+    """Return the note about what the V2X channel hides, and which agents know it anyway; "" if it hides nothing."""
     hidden = rows[0].hidden_share
     if not hidden:
         return ""

@@ -43,7 +43,7 @@ class Outcome:
     ledger: Ledger  # harm of all impacts in each world, by pair and vehicle
     final: Worlds  # each world at the end of its episode
     at_rest: Bools  # [n] whether the line came to rest before the horizon
-    predicted_harm: Floats | None  # [n] harm that the agent predicted at the alert (m2/s2); None if it predicts none
+    predicted_harm: Floats | None  # [n] harm that the agent predicted at the alert (m2/s2); None: no prediction
     # [n] whether the policy behind a shield drove the whole episode: episode mode chose the policy at the alert, or
     # step mode replaced none of its actions. None without a shield.
     chosen_policy: Bools | None
@@ -70,9 +70,9 @@ class Outcome:
 
     @classmethod
     def join(cls, parts: Sequence[Outcome]) -> Outcome:
-        """Join the outcomes of one agent in consecutive chunks of worlds into one outcome.
+        """Join the outcomes of one agent in consecutive chunks of worlds.
 
-        If a field is None in one of ``parts``, this field is None in the result.
+        A field that is None in one of ``parts`` is None in the result.
         """
         first, columns = parts[0], dict[str, Any]()
         for name in _COLUMNS:
@@ -94,10 +94,7 @@ class Outcome:
         return self.ledger.impacts
 
     def world_harm(self, harm_count: HarmCount) -> Floats:
-        """Return the harm of the whole line in each world, [n] m2/s2.
-
-        ``harm_count`` says which impacts count: each pair's first impact (``first``) or all impacts (``total``).
-        """
+        """Return the harm (``first``-impact or ``total``) of the whole line in each world, [n] m2/s2."""
         return self.ledger.world_harm(harm_count)
 
     @property
@@ -111,10 +108,7 @@ class Outcome:
         return self.ledger.world_harm("total")
 
     def vehicle_harm(self, harm_count: HarmCount) -> Floats:
-        """Return the harm that each vehicle bears in each world, [n, N] m2/s2.
-
-        ``harm_count`` says which impacts count: each pair's first impact (``first``) or all impacts (``total``).
-        """
+        """Return the harm (``first``-impact or ``total``) that each vehicle bears in each world, [n, N] m2/s2."""
         return self.ledger.vehicle_harm(harm_count)
 
     @property
@@ -125,9 +119,9 @@ class Outcome:
     def borne(self, objectives: Sequence[Declared] = ()) -> dict[str, Floats]:
         """Return, for each vehicle, the harm that it bears and the value of each of ``objectives`` (m2/s2).
 
-        The result is a dictionary: name of a column -> its values in the n worlds. For instance, the columns of Vehicle
-        2 are ``first_impact_harm_2``, ``total_harm_2`` and, with ``objectives=["social:45"]``, ``social:45_first_2``
-        and ``social:45_total_2``.
+        The result maps the name of a column to its values [n]. For instance, the columns of Vehicle 2 are
+        ``first_impact_harm_2``, ``total_harm_2`` and, with ``objectives=["social:45"]``, ``social:45_first_2`` and
+        ``social:45_total_2``.
         """
         by_vehicle = {"first_impact_harm": self.vehicle_harm("first"), "total_harm": self.vehicle_harm("total")}
         for objective in objectives:
@@ -137,7 +131,7 @@ class Outcome:
         return {f"{name}_{i + 1}": each[:, i] for name, each in by_vehicle.items() for i in range(each.shape[1])}
 
     def columns(self) -> dict[str, Values | None]:
-        """Return the columns of a table with one row per world: name of a column -> values [n] (None: not measured)."""
+        """Return a table with one row per world: name of a column -> values [n] (None: not measured)."""
         final, obstacle = self.final, {}
         if (ahead := final.obstacle_ahead).any():
             obstacle = {
@@ -165,14 +159,14 @@ class Outcome:
 
 
 def none_for_nan(column: Values) -> list[Any]:
-    """Return the values of ``column`` [n] as a list, with None instead of NaN."""
+    """Return ``column`` as a list, with None instead of NaN."""
     return [None if value != value else value for value in column.tolist()]
 
 
 class LeftOut(NamedTuple):
     """A world that is missing in the results of all agents, because its simulation with one agent failed."""
 
-    world: int  # number of the world in its evaluation list, from 0
+    world: int  # number in its evaluation list, from 0
     seed: int | None  # seed of the evaluation list; None for worlds that the caller passed
     agent: str  # name of the first agent with which the simulation failed
     reason: str  # message of the error
@@ -183,12 +177,9 @@ class LeftOut(NamedTuple):
 
     @staticmethod
     def line(worlds: Sequence[str], whole: int) -> str:
-        """Return a note for the user that some worlds were left out; the note lists at most ten of these worlds.
+        """Return a note for the user that lists at most ten of the left-out ``worlds``.
 
-        Args:
-            worlds: description of each left-out world, with the reason.
-            whole: number of all worlds, including the left-out worlds.
-
+        ``worlds`` are descriptions with the reason; ``whole`` is the number of all worlds, including the left-out ones.
         """
         named = [*worlds[:_NAMED], *(["and so on"] if len(worlds) > _NAMED else [])]
         return (

@@ -17,9 +17,9 @@ def load_measures(names: Iterable[str]) -> None:
     """Load measures by name. All later evaluations of this process report these measures.
 
     A name is ``risk``, ``injury``, the name of a measure of an installed package, or ``FILE:NAME``. For
-    ``my_file.py:measure``, the Python file ``my_file.py`` is run with your permissions. The object ``measure`` in this
-    file must be a function, or a ``Part`` (a function together with settings for ``register_measure``). Raises
-    ``UnknownName`` for an unknown name, and ``InvalidInput`` for a measure that cannot be loaded.
+    ``my_file.py:measure``, the Python file is run with your permissions; ``measure`` must be a function, or a ``Part``
+    (a function together with settings for ``register_measure``). Raises ``UnknownName`` for an unknown name, and
+    ``InvalidInput`` for a measure that cannot be loaded.
     """
     for name in names:
         file, colon, own = name.rpartition(":")
@@ -47,13 +47,9 @@ def registered_measure(column: str) -> NamedMeasure | None:
 def measure_columns(terms: Mapping[str, Any], episodes: EpisodeImpacts | None) -> dict[str, Any]:
     """Return the values of every registered measure: name of a column -> values [n].
 
-    A measure with one value per vehicle has the columns ``NAME_1``, ``NAME_2`` and so on.
-
-    Args:
-        terms: name of a measure that is computed at each step -> its sum over each episode, [n] or [n, N].
-        episodes: impacts of the episodes, from which the measures that are not in ``terms`` are computed; None if all
-            measures are in ``terms``.
-
+    A measure with one value per vehicle has the columns ``NAME_1``, ``NAME_2`` and so on. ``terms`` maps each measure
+    that is computed by step to its sum over each episode, [n] or [n, N]. The other measures, if there are any, are
+    computed from the impacts ``episodes``.
     """
     columns: dict[str, Any] = {}
     for name, measure in REPORTED.items():

@@ -33,19 +33,12 @@ def write_per_world(
 ) -> None:
     """Write a table with one row per agent and world as CSV or Parquet.
 
-    docs/evaluate.md lists the columns of the table. The row of a world that was left out contains only the agent, the
-    world's number and, in the column ``ended``, the reason. If writing fails, no incomplete file remains.
-
-    Args:
-        path: file to write, with the ending ``.csv`` or ``.parquet``.
-        evaluation: outcomes of the agents.
-        objectives: objectives such as ``"social:45"`` (docs/cooperation.md). For each objective the table has further
-            columns, with the value of the objective for each vehicle.
-        force: whether to replace an existing file.
+    docs/evaluate.md lists the columns of the table. Each objective, such as ``"social:45"`` (docs/cooperation.md), adds
+    columns with its value for each vehicle. The row of a world that was left out contains only the agent, the world's
+    number and, in the column ``ended``, the reason. If writing fails, no incomplete file remains.
 
     Raises ``AlreadyExists`` if the file exists and ``force`` is false, ``InvalidInput`` if the folder is missing or
-    ``path`` has another ending, and ``MissingExtra`` for Parquet if pyarrow is not installed.
-
+    ``path`` ends in neither ``.csv`` nor ``.parquet``, and ``MissingExtra`` for Parquet if pyarrow is not installed.
     """
     ending = Path(path).suffix.lower()
     if ending not in (CSV, PARQUET):
@@ -69,17 +62,11 @@ Harms = dict[str, dict[int, tuple[float, ...]]]  # agent -> world -> (first-impa
 
 
 def read_harms(path: Path, data: bytes) -> tuple[Harms, dict[int, str]]:
-    """Read a file that ``write_per_world`` wrote: the harms of each agent in each world, and each world's recording.
+    """Return the harms of each agent in each world, and each world's recording, from a file of ``write_per_world``.
 
-    Returns two dictionaries: agent -> (world -> harms), and world -> recording. The dictionary of recordings is empty
-    if the file has no column ``recording``. Both dictionaries omit the worlds that were left out.
-
-    Args:
-        path: name of the file, whose ending decides the format. The file is not read, because ``data`` is its content.
-        data: content of the file.
-
+    ``data`` is the content of the file ``path``, whose ending decides the format. The second dictionary, world ->
+    recording, is empty if the file has no column ``recording``. Both dictionaries omit the worlds that were left out.
     Raises ``InvalidInput`` if the file lacks a column that is needed here, or has an invalid value.
-
     """
     try:
         if path.suffix.lower() == PARQUET:
@@ -150,16 +137,14 @@ def results_to_json(
     per_world: Path | None = None,
     settings: Mapping[str, str] = USUAL,
 ) -> list[dict[str, Any]]:
-    """Return the content of a JSON results file: one object per agent.
+    """Return the content of a JSON results file: one object per agent, to which the other arguments are added.
 
     Args:
         rows: rows of the results table, one per agent.
-        rescored: mean values of objectives (``Evaluation.rescore``), to be added to each agent's JSON object.
-        groups: name of a group of worlds -> results of the same agents in this group (``summarise_by``), to be added to
-            each agent's JSON object; None: there are no groups.
-        per_world: existing file with one row per agent and world, whose name and hash are added to each agent's JSON
-            object; None: there is no such file.
-        settings: settings that hold for all agents, by the setting's name, such as ``{"harm_count": "first"}``.
+        rescored: mean values of objectives (``Evaluation.rescore``).
+        groups: name of a group of worlds -> results of the same agents in this group (``summarise_by``).
+        per_world: existing file of ``write_per_world``, whose name and hash are added.
+        settings: settings of all agents, such as ``{"harm_count": "first"}``.
 
     """
     objects = [row.to_json() | {"agent_settings": dict(settings)} for row in rows]
@@ -180,32 +165,25 @@ def results_to_json(
 class Result:
     """Content of one JSON results file, after the checks of ``read_result``."""
 
-    path: Path  # the file
+    path: Path
     # Name of an agent -> its JSON object. In results of ``ethbrake shield`` the names have the form ``AGENT (MODE)``.
     rows: Mapping[str, Mapping[str, Any]]
 
     @property
     def about(self) -> Mapping[str, Any]:
-        """JSON object of the file's first agent, to read entries that are equal for all agents, such as the hashes."""
+        """JSON object of the first agent, to read entries that are equal for all agents, such as the hashes."""
         return next(iter(self.rows.values()))
 
     def estimate(self, agent: str, harm: str) -> Estimate:
-        """Return the mean harm of an agent with its interval, m2/s2.
-
-        Args:
-            agent: name of the agent, a key of ``rows``.
-            harm: key of the harm in the JSON object, such as ``first_impact_harm``, ``total_harm`` or ``harm``.
-
-        """
+        """Return the mean harm of an agent with its interval, m2/s2; ``harm`` is a key of its JSON object."""
         row = self.rows[agent]
         mean, interval = row[harm], row.get(f"{harm}_interval")
         return Estimate(float(mean), None if interval is None else (float(interval[0]), float(interval[1])))
 
     def harms(self) -> tuple[Harms, dict[int, str]]:
-        """Read the file of ``--per-world`` that belongs to this results file, and return what ``read_harms`` returns.
+        """Return the result of ``read_harms`` for the file of ``--per-world`` that belongs to this results file.
 
-        Raises ``InvalidInput`` if this results file belongs to no file of ``--per-world``, or if the file of
-        ``--per-world`` is missing or was changed later.
+        Raises ``InvalidInput`` if there is no such file, or if it was changed later.
         """
         beside = self.about.get("per_world")
         if not isinstance(beside, dict) or not isinstance(beside.get("file"), str):
@@ -277,11 +255,7 @@ def read_result(path: Path) -> Result:
 
 
 def recorded_value(row: Mapping[str, Any], key: str) -> str | None:
-    """Return the value of ``key`` in an agent's JSON object ``row`` or, if missing there, in its ``parameters``, as
-    text.
-
-    Return None if neither the object nor its ``parameters`` have the key.
-    """
+    """Return, as text, the value of ``key`` in an agent's JSON object or, if missing there, in its ``parameters``."""
     parameters = row.get("parameters")
     value = row.get(key, parameters.get(key) if isinstance(parameters, dict) else None)
     return None if value is None else str(value)
@@ -290,7 +264,7 @@ def recorded_value(row: Mapping[str, Any], key: str) -> str | None:
 def _is_mean(mean: Any, interval: Any, draws: int) -> bool:
     """Return True if ``mean`` is a valid mean harm and ``interval`` is either None or ``[low, high]`` around it.
 
-    If ``draws``, the number of independent worlds or recordings, is 1, ``interval`` must be None.
+    With one draw (independent world or recording), ``interval`` must be None.
     """
     ends = [mean, mean] if interval is None else interval
     if not isinstance(ends, list) or len(ends) != 2 or (interval is not None and draws == 1):
@@ -301,10 +275,7 @@ def _is_mean(mean: Any, interval: Any, draws: int) -> bool:
 
 
 def _rows_of(path: Path, content: Any) -> list[dict[str, Any]]:
-    """Return the JSON objects of a results file, one for each agent; raise ``InvalidInput`` for other content.
-
-    ``content`` is the parsed JSON of the file ``path``.
-    """
+    """Return the JSON objects of a results file, one for each agent; raise ``InvalidInput`` for other content."""
     several = [content] if isinstance(content, dict) else content
     if not isinstance(several, list) or not several or not all(isinstance(row, dict) for row in several):
         raise InvalidInput(f"{path}: is not a results file; give a file with the output of ethbrake evaluate --json")

@@ -29,8 +29,7 @@ SAMPLE_S = 0.02  # default time between two samples (s)
 
 @dataclass(frozen=True, slots=True)
 class EpisodeRecord:
-    """Motion of one world from the alert to the end of its episode, sampled at k times, the first of which is the
-    alert.
+    """Motion of one world from the alert to the end of its episode, at k times, the first of which is the alert.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -75,11 +74,10 @@ def record_episode(
 
     Args:
         world: the world at the alert, n = 1.
-        agent: agent or team that drives the controlled vehicles. The object that you pass does not change.
+        agent: agent or team. The object that you pass does not change.
         scenario: scenario of the world, whose scripts drive the other vehicles.
         vehicle: the controlled vehicle, by name (``vehicle_2``) or index (0 = front); None: the scenario's learners.
-        sample_s: largest time between two consecutive samples (s). The state at each decision is always one of the
-            samples.
+        sample_s: largest time between two consecutive samples (s). The state at each decision is always sampled.
 
     Raises ``InvalidInput`` if ``world`` does not contain exactly one world, or if ``sample_s`` is not finite and above
     0.
@@ -106,16 +104,10 @@ def record_episode(
 def _samples(segments: Sequence[tuple[Worlds, Floats, Floats]], sample_s: float) -> Iterator[tuple[Floats, ...]]:
     """Yield the samples of each step: time [k], gaps [k, P], speeds [k, N], positions [k, N], commands [k, N].
 
-    Consecutive samples are at most ``sample_s`` seconds apart. The state at the end of a step is returned only once: as
+    ``segments`` are the steps of one episode (``Tape.steps``). The state at the end of a step is returned only once: as
     the first sample of the next step or, for the last step, as the last sample of the episode. A world does not contain
     positions, so Vehicle 1's position is computed from its gap to an obstacle. For this computation, an obstacle is put
     into a world without an obstacle, so far ahead that Vehicle 1 cannot reach it.
-
-    Args:
-        segments: time steps of one episode, each as (world at the beginning of the step, commands [1, N] (m/s2), time
-            of the end of the step [1] (s)).
-        sample_s: largest time between two consecutive samples (s).
-
     """
     front = 0.0  # position of Vehicle 1 at the start of the segment
     for number, (before, command, until_s) in enumerate(segments):

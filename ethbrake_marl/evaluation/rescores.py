@@ -15,13 +15,13 @@ from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 class Rescored:
     """For each vehicle, the mean value of one objective over the worlds of one agent. A smaller mean is better."""
 
-    agent: str  # name of the agent
-    objective: str  # objective as in scenarios: ``total``, ``own``, ``social:45``
-    harm_count: HarmCount  # impacts that count: each pair's first impact (``first``) or all impacts (``total``)
+    agent: str
+    objective: str  # as in scenarios: ``total``, ``own``, ``social:45``
+    harm_count: HarmCount
     each: tuple[Estimate, ...]  # mean value per world (m2/s2) for each vehicle, front to rear
 
     def to_json(self) -> dict[str, Any]:
-        """Return the object for JSON: ``objective``, ``harm_count``, and each vehicle's mean with its interval."""
+        """Return the objective, the count of harm, and each vehicle's mean with its interval, for JSON."""
         each = Estimate.side_by_side({f"vehicle_{i + 1}": estimate for i, estimate in enumerate(self.each)})
         return {"objective": self.objective, "harm_count": self.harm_count, **each}
 
@@ -31,7 +31,7 @@ class Rescores(list[Rescored]):
 
     Args:
         rows: one row for each agent, objective and count of harm.
-        recordings: number of recordings that the worlds come from; 0: all worlds are independent.
+        recordings: number of recordings that the worlds come from, or 0.
 
     """
 
@@ -46,10 +46,7 @@ class Rescores(list[Rescored]):
         return "\n".join(self.sheet(harm_count).html() for harm_count in HARM_COUNTS)
 
     def sheet(self, harm_count: HarmCount) -> Sheet:
-        """Return the table of objectives for one count of harm, first-impact (``first``) or total (``total``).
-
-        The table has one row per agent and objective, and one column per vehicle.
-        """
+        """Return the table for one count of harm, with a row per agent and objective, and a column per vehicle."""
         shown = [row for row in self if row.harm_count == harm_count]
         vehicles = range(len(shown[0].each) if shown else 0)
         columns = [Column(f"Vehicle {i + 1}", interval="below") for i in vehicles]

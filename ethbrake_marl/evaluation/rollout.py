@@ -64,18 +64,16 @@ def evaluate(
 
     Args:
         worlds: worlds at the alert, or a sample from ``scenario.sample``; None: draw ``episodes`` worlds from ``seed``.
-        agents: agents to evaluate: specs as on the command line (``"full_brake,ppo"``, or a list of specs), or a
-            mapping from name to agent or ``Team``. Each controlled vehicle gets a copy of its agent; the objects that
-            you pass do not change. Optimising agents that this function builds from specs (texts such as
-            ``full_brake``) minimise first-impact harm.
+        agents: specs as on the command line (``"full_brake,ppo"``, or a list of specs), or a mapping from name to agent
+            or ``Team``. Each controlled vehicle gets a copy of its agent; the objects that you pass do not change.
+            Optimising agents that are built from specs minimise first-impact harm.
         scenario: scenario of the worlds, or its name or path.
         vehicle: the controlled vehicle, by name (``vehicle_2``) or index (0 = front); None: the scenario's learners.
         episodes: number of worlds to draw; None: 10,000.
         seed: seed from which the worlds are drawn; None: 7. If ``worlds`` is passed, the seed is only recorded in the
             result.
         chunk: number of worlds that are simulated together, which does not affect the results; None: 2,500.
-        on_progress: function that is called after each chunk with an agent's name and the number of worlds that the
-            agent has driven so far.
+        on_progress: called after each chunk with an agent's name and the number of worlds that it has driven so far.
         aftermath: whether to also measure how far Vehicle 1 is shoved, the paper's sampled harm, and measures that the
             user registered. This takes longer.
 
@@ -109,9 +107,7 @@ def evaluate(
 
 
 def chunks_of(sample: Sample, size: int = CHUNK) -> Iterator[tuple[int, Sample]]:
-    """Split a sample into chunks of at most ``size`` worlds; yield pairs (index in the sample of the chunk's first
-    world, chunk).
-    """
+    """Yield chunks of at most ``size`` worlds as pairs (index in the sample of the chunk's first world, chunk)."""
     for first in range(0, sample.worlds.n, size):
         yield first, sample.take(np.arange(first, min(first + size, sample.worlds.n)))
 
@@ -127,18 +123,9 @@ def drive_chunk(
 ) -> Evaluation:
     """Let each agent drive all worlds of one chunk at once, from the alert to the end of their episodes.
 
-    If the simulation of every world fails, the returned ``Evaluation`` contains no world.
-
-    Args:
-        sample: the worlds of the chunk, at the alert.
-        agents: agents or teams by name.
-        scenario: scenario of the worlds.
-        seed: seed of the evaluation list; the result contains this seed.
-        vehicles: indices (0 = front) of the controlled vehicles.
-        first: position of the chunk's first world among all evaluated worlds (from 0), for error messages.
-        aftermath: whether to also measure how far Vehicle 1 is shoved, sampled harm, and measures that the user
-            registered.
-
+    ``vehicles`` are the indices (0 = front) of the controlled vehicles, ``first`` is the position of the chunk's first
+    world among all evaluated worlds (from 0), for error messages. ``seed`` and ``aftermath`` are as in ``evaluate``. If
+    the simulation of every world fails, the returned ``Evaluation`` contains no world.
     """
     n, others = sample.worlds.n, [script.name for script in script_agents(scenario, except_for=vehicles).values()]
     outcomes: dict[str, Outcome] = {}
@@ -163,7 +150,7 @@ def drive_chunk(
 
 
 def _check_request(worlds: object, agents: object, chunk: object) -> None:
-    """Raise ``InvalidInput`` if the argument ``worlds``, ``agents`` or ``chunk`` of ``evaluate`` is invalid."""
+    """Raise ``InvalidInput`` for invalid arguments of ``evaluate``."""
     if not isinstance(worlds, Worlds | Sample):
         raise InvalidInput(
             f"evaluate: worlds = {worlds!r}: must be a Worlds or Sample object, for instance scenario.sample(100,"
@@ -185,9 +172,8 @@ def _check_request(worlds: object, agents: object, chunk: object) -> None:
 def controlled_vehicles(scenario: Scenario, vehicle: int | str | None, agents: Mapping[str, Driver]) -> tuple[int, ...]:
     """Return the indices (0 = front) of the vehicles that the agents are to control.
 
-    The result contains ``vehicle`` (name or index) or, if ``vehicle`` is None, all learners of the scenario. If the
-    scenario has no learners and ``vehicle`` is None, the result is empty if all agents are teams; otherwise
-    ``InvalidInput`` is raised.
+    They are ``vehicle`` (name or index) or, if ``vehicle`` is None, all learners of the scenario. If there are none
+    either, the result is empty if all agents are teams; otherwise ``InvalidInput`` is raised.
     """
     if vehicle is not None or (not scenario.learners and any(not isinstance(a, Team) for a in agents.values())):
         return (controlled_vehicle(scenario, vehicle),)
@@ -226,10 +212,7 @@ def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
 def _roll_out(
     whole: Worlds, agent: Driver, vehicles: tuple[int, ...], scenario: Scenario, aftermath: bool, rows: Ints
 ) -> Outcome:
-    """Let copies of ``agent`` drive some worlds of ``whole``, those with the row numbers ``rows``.
-
-    ``vehicles``, ``scenario`` and ``aftermath`` are the same arguments as in ``drive_chunk``.
-    """
+    """Let copies of ``agent`` drive the worlds of ``whole`` with the row numbers ``rows``."""
     team = Team.of(agent, vehicles)
     worlds = scenario.play_pieces(whole.take(rows), tuple(team.drivers))
     task = Task(scenario, tuple(team.drivers))
@@ -251,8 +234,8 @@ def _roll_out(
 def outcome_of(team: Team, episodes: Episodes) -> Outcome:
     """Return the ``Outcome`` of a team's episodes, without ``shoved_m``, ``sampled_harm`` and ``metrics``.
 
-    The fields ``predicted_harm`` and ``chosen_policy`` are read from the shield's memory or, if the team has a single
-    vehicle and no shield, from the agent's memory.
+    ``predicted_harm`` and ``chosen_policy`` come from the shield's memory or, if the team has a single vehicle and no
+    shield, from the agent's memory.
     """
     memory: Any = next(iter(episodes.memories.values()), None) if len(team.drivers) == 1 else None
     if episodes.guarded is not None:
@@ -272,7 +255,7 @@ def outcome_of(team: Team, episodes: Episodes) -> Outcome:
 
 
 def _read_column(team: Team, memory: Any, what: str, n: int) -> NDArray[np.generic] | None:
-    """Return the entry ``what`` of an agent's memory (one number per world, [n]), or None if there is no such entry."""
+    """Return the entry ``what`` of an agent's memory, [n], or None if there is no such entry."""
     value = memory.get(what) if isinstance(memory, Mapping) else None
     if value is None:
         return None

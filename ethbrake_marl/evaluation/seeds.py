@@ -2,8 +2,14 @@
 say what result to expect from a training run with another seed.
 
 There are usually few training runs, and a single bad run changes their mean a lot. The interquartile mean therefore
-omits the best and the worst quarter of the runs' results. The error of the interquartile mean is estimated with a
-stratified bootstrap: seeds are resampled within each task (scenario), because seeds are random and tasks are not.
+omits the best and the worst quarter of the runs' results. Its error is estimated with a stratified bootstrap: seeds are
+resampled within each task (scenario), because seeds are random and tasks are not.
+
+Arguments that several functions share: ``values``, ``baseline``, ``worst``, ``best`` and each of ``sides`` have one
+result per training run (seed) and world, [seeds, worlds], for the same worlds; the numbers of seeds may differ.
+``clusters`` has the name of each world's cluster (``statistics``), [worlds]; None: all worlds are independent. ``seed``
+is the seed of the bootstrap's random numbers. All these functions raise ``InvalidInput`` if the arrays do not all have
+the same number of worlds, or if a value is not finite.
 """
 
 from __future__ import annotations
@@ -33,17 +39,10 @@ _AT_ONCE = 1 << 20  # number of resampled worlds in memory at once (8 MB)
 def interquartile_mean(tasks: Sequence[ArrayLike], *, resamples: int = RESAMPLES, seed: int = 0) -> Estimate:
     """Return the interquartile mean of the results of training runs, with a stratified bootstrap interval.
 
-    Of all n results, the floor(n / 4) smallest and the floor(n / 4) largest are omitted. The ends of the interval are
-    percentiles of the interquartile means of the bootstrap resamples. The interval is None if every task has the result
-    of only one seed.
-
-    Args:
-        tasks: results of the training runs on each task (scenario), one number per seed.
-        resamples: number of bootstrap resamples.
-        seed: seed of the bootstrap's random numbers.
-
-    Raises ``InvalidInput`` if there are no tasks, if a task has no results, or if a result is not finite.
-
+    ``tasks`` has the results on each task, one number per seed. Of all n results, the floor(n / 4) smallest and the
+    floor(n / 4) largest are omitted. The ends of the interval are percentiles of the interquartile means of the
+    bootstrap resamples. The interval is None if every task has the result of only one seed. Raises ``InvalidInput`` if
+    there are no tasks, if a task has no results, or if a result is not finite.
     """
     from scipy.stats import bootstrap, trim_mean  # imported here because it takes a second to load
 
@@ -82,16 +81,6 @@ def mean_over_seeds(
     only one world or cluster, or if no baseline is given and all values are 0. Without a baseline, the interval of
     true/false values is widened so that it contains Wilson's interval, because bootstrap intervals of nearly constant
     values are too narrow.
-
-    Args:
-        values: result of the training run with each seed in each world, [seeds, worlds].
-        baseline: results to subtract, in the same worlds as ``values``, [seeds, worlds]; the number of seeds may differ
-            from the number in ``values``.
-        clusters: name of the cluster (recording) of each world, [worlds]; None: all worlds are independent.
-        seed: seed of the bootstrap's random numbers.
-
-    Raises ``InvalidInput`` if the arrays do not all have the same number of worlds, or if a value is not finite.
-
     """
     array = np.atleast_2d(np.asarray(values))
     sides = _pair_sides("mean_over_seeds", array, np.zeros((1, array.shape[-1])) if baseline is None else baseline)
@@ -113,21 +102,12 @@ def mean_over_seeds(
 def share_over_seeds(
     values: ArrayLike, worst: ArrayLike, best: ArrayLike, *, clusters: Texts | None = None, seed: int = 0
 ) -> Estimate | None:
-    """Return the share of the possible reduction: 0 if ``values`` has the same mean as ``worst``, 1 if ``values`` has
-    the same mean as ``best``.
+    """Return the share of the possible reduction ``(mean(worst) - mean(values)) / (mean(worst) - mean(best))``.
 
-    The share is ``(mean(worst) - mean(values)) / (mean(worst) - mean(best))``, with a bootstrap interval as in
-    ``mean_over_seeds``. The result is None if ``mean(best) >= mean(worst)``. The result is also None if almost no
-    reduction is possible in 5 % of the bootstrap resamples or more. *Almost no reduction* means that ``mean(worst) -
-    mean(best)`` in the resample is at most 0.1 % of ``mean(worst) - mean(best)`` in the original data.
-
-    Args:
-        values: harms of the training runs to judge, [seeds, worlds] (m2/s2).
-        worst: harms of the agent whose share is 0 by definition, in the same worlds as ``values``, [seeds, worlds].
-        best: harms of the agent whose share is 1 by definition, in the same worlds as ``values``, [seeds, worlds].
-        clusters: name of the cluster (recording) of each world, [worlds]; None: all worlds are independent.
-        seed: seed of the bootstrap's random numbers.
-
+    ``values``, ``worst`` and ``best`` are harms, m2/s2. The bootstrap interval is as in ``mean_over_seeds``. The result
+    is None if ``mean(best) >= mean(worst)``. The result is also None if almost no reduction is possible in 5 % of the
+    bootstrap resamples or more. *Almost no reduction* means that ``mean(worst) - mean(best)`` in the resample is at
+    most 0.1 % of ``mean(worst) - mean(best)`` in the original data.
     """
     sides = _pair_sides("share_over_seeds", values, worst, best)
     reached, high, low = (float(side.mean(axis=0).mean()) for side in sides)
@@ -145,11 +125,7 @@ def share_over_seeds(
 
 
 def _pair_sides(who: str, *sides: ArrayLike) -> tuple[Floats, ...]:
-    """Return each of ``sides`` (the results to compare) as an array [seeds, worlds].
-
-    Raises ``InvalidInput`` if the arrays do not all have the same number of worlds, or if a value is not finite.
-    ``who`` is the name of the calling function, for error messages.
-    """
+    """Return each of ``sides`` as a checked array; ``who`` is the name of the calling function, for error messages."""
     arrays = tuple(np.atleast_2d(np.asarray(side, np.float64)) for side in sides)
     if any(side.ndim != 2 or not side.size or side.shape[1] != arrays[0].shape[-1] for side in arrays):
         shapes = " and ".join(str(side.shape) for side in arrays)
@@ -166,15 +142,8 @@ def _resampled(
 ) -> Estimate:
     """Return ``value`` with a bootstrap interval, or without an interval if there is only one world or cluster.
 
-    Args:
-        value: the estimate, computed from the original data.
-        sides: results to resample: arrays [seeds, worlds], all for the same worlds.
-        of: function that returns a statistic for each resample, [resamples]. Its argument is the mean of each of
-            ``sides`` in each resample, [resamples, number of sides]. The ends of the interval are percentiles of the
-            returned array.
-        clusters: name of the cluster (recording) of each world, [worlds]; None: all worlds are independent.
-        seed: seed of the bootstrap's random numbers.
-
+    ``of`` computes the statistic of each resample, [resamples], from the mean of each of ``sides``, [resamples, number
+    of sides]. The ends of the interval are percentiles of the statistic.
     """
     worlds = sides[0].shape[1]
     cluster = np.arange(worlds) if clusters is None else np.unique(clusters, return_inverse=True)[1]
@@ -189,14 +158,8 @@ def _resample_means(sides: Sequence[Floats], cluster: Ints, resamples: int, seed
     """Return the mean of each of ``sides`` in each bootstrap resample, [resamples, number of sides].
 
     Seeds are resampled separately for each of ``sides``. Clusters of worlds are resampled once for all ``sides``
-    together, and a drawn cluster contributes all its worlds.
-
-    Args:
-        sides: results to resample: arrays [seeds, worlds], all for the same worlds.
-        cluster: number (from 0) of the cluster that each world belongs to, [worlds].
-        resamples: number of bootstrap resamples.
-        seed: seed of the bootstrap's random numbers.
-
+    together, and a drawn cluster contributes all its worlds. ``cluster`` is the number (from 0) of each world's
+    cluster, [worlds].
     """
     worlds, number = len(cluster), int(cluster.max()) + 1
     rng = np.random.default_rng(seed)

@@ -31,21 +31,21 @@ CHUNK = 500  # number of worlds simulated together, to limit memory; does not ch
 
 
 class VehicleRow(NamedTuple):
-    """Results of one vehicle of the line in the worlds that the agent drove with a shield in step mode."""
+    """Results of one vehicle of the line under a shield in step mode."""
 
     vehicle: str  # name of the vehicle, such as ``vehicle_2``
     replaced: float | None  # fraction of the vehicle's decisions that the shield replaced; None: it has no shield
     harm: float  # mean harm per world that the vehicle bears (m2/s2)
-    baseline: float  # mean harm that the vehicle would bear under the shield's baseline plan (m2/s2)
-    above_baseline: float  # fraction of worlds in which the vehicle bears more harm than under the baseline plan
+    baseline: float  # mean harm that it would bear under the shield's baseline plan (m2/s2)
+    above_baseline: float  # fraction of worlds in which it bears more harm than under the baseline plan
 
 
 @dataclass(frozen=True, slots=True)
 class ModeRow:
-    """Results of one agent (or one team) with the shield in one mode."""
+    """Results of one agent or team with the shield in one mode."""
 
-    agent: str  # name of the agent or team, without the shield
-    mode: Mode  # the shield's mode; ``none``: without a shield
+    agent: str  # name without the shield
+    mode: Mode  # ``none``: without a shield
     harm: Estimate  # mean harm per world (m2/s2)
     horizon_ends: int  # number of worlds in which a vehicle still moves at the horizon; no bound covers later harm
     # Harm minus the harm in episode mode, paired by world (m2/s2); None in episode mode itself, and for teams.
@@ -55,12 +55,12 @@ class ModeRow:
     # The fields from ``replaced`` to ``above_bound`` have values in step mode and its variants only.
     replaced: float | None = None  # fraction of all decisions of shielded vehicles that the shield replaced
     bound: Estimate | None = None  # mean over worlds of the shield's bound at the alert (m2/s2)
-    vehicles: tuple[VehicleRow, ...] = ()  # results of each vehicle, front to rear
+    vehicles: tuple[VehicleRow, ...] = ()  # front to rear
     # Fractions of the replaced decisions that were needed (harm would be higher without the replacement), harmless
     # (equal) and costly (lower), in this order; None if the shield replaced no decision.
     verdicts: tuple[float, ...] | None = None
     above_bound: int | None = None  # number of worlds whose harm exceeds the bound at the alert
-    left_out: LeftOutRows = ()  # (row, reason) of each world that is left out because a simulation failed
+    left_out: LeftOutRows = ()  # (row, reason) of each world whose simulation failed
     policy_sha256: Mapping[str, str] = field(default_factory=dict)  # vehicle's name -> SHA-256 of its policy
 
     def to_json(self) -> dict[str, Any]:
@@ -93,10 +93,7 @@ class ShieldModes(list[ModeRow]):
     def to_json(self, sample: Sample, task: Task) -> list[dict[str, Any]]:
         """Return the content of a results file of ``ethbrake shield``: one object per agent and mode.
 
-        Args:
-            sample: the evaluated worlds, which were passed to ``compare_modes``.
-            task: scenario, controlled vehicles and count of harm that were passed to ``compare_modes``.
-
+        ``sample`` and ``task`` are what ``compare_modes`` evaluated.
         """
         left_out = [world for world, _ in self[0].left_out]
         about = result_identity("shield", task.scenario, sample, left_out)
@@ -139,22 +136,19 @@ def compare_modes(
     """Compare every agent in the same worlds: without a shield, and with a shield in episode mode and in step mode.
 
     Two variants of step mode are also compared. In ``step-alert`` the shield simulates the policy's rollout only at the
-    alert. In ``step-cap`` the shield limits each vehicle's harm (``cap="baseline"``). ``step-cap`` is compared for
-    teams only; episode mode is not available for teams. To judge each decision in which step mode replaced the policy's
-    action, the episode is simulated again, and from this decision on the policy drives without a shield. If the
-    simulation of a world fails with one agent, the world is left out for all agents, and every row lists this world in
-    ``left_out``.
+    alert. In ``step-cap`` the shield limits each vehicle's harm (``cap="baseline"``). Teams have ``step-cap`` and no
+    episode mode; single agents have episode mode and no ``step-cap``. To judge each decision in which step mode
+    replaced the policy's action, the episode is simulated again, and from this decision on the policy drives without a
+    shield. If the simulation of a world fails with one agent, the world is left out for all agents.
 
     Args:
         agents: agents or teams by name, without a shield. The objects that you pass do not change.
         worlds: worlds at the alert.
         task: the scenario, the controlled vehicles, and the count of harm that the shield bounds.
-        behind: whether ``agents`` already have shields. If ``behind`` is true, only agents with a shield in episode or
-            step mode are compared: their shields are removed, and their policies are used. If no agent has a shield in
-            one of these modes, the result is empty.
-        clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
-        on_progress: function that is called with an agent's name and the number of worlds that the agent has driven so
-            far.
+        behind: whether ``agents`` already have shields. If so, the policies behind shields in episode or step mode are
+            compared, and other agents are omitted. If no agent has such a shield, the result is empty.
+        clusters: name of each world's recording, [n]; None: all worlds are independent.
+        on_progress: called with an agent's name and the number of worlds that the agent has driven so far.
 
     Raises ``InvalidInput`` if a shield refuses the scenario, and ``PhysicsError`` if every world is left out.
 
@@ -181,13 +175,12 @@ def compare_modes(
 
 
 class _Part(NamedTuple):
-    """Results of an agent in some worlds, without a shield or in one mode of the shield. The fields ``shielded`` and
-    ``verdicts`` are None except in step mode and its variants.
-    """
+    """Results of an agent in some worlds with the shield in one mode."""
 
     harm: Floats  # [n] harm of the line in each world (m2/s2)
     moving: int  # number of worlds in which a vehicle still moves at the horizon
-    shielded: Shielded | None = None  # harm, bound and replaced decisions of each vehicle
+    # The next two fields have values in step mode and its variants only.
+    shielded: Shielded | None = None
     verdicts: Ints | None = None  # [3] numbers of interventions that were needed, harmless and costly
 
 
@@ -198,10 +191,7 @@ def _compare(
     clusters: Texts | None,
     on_progress: Callable[[str, int], None] | None,
 ) -> list[ModeRow]:
-    """Return one row of results for each agent and mode; the arguments are the same as in ``compare_modes``.
-
-    Raises ``PhysicsError``, which lists the worlds whose simulation failed.
-    """
+    """Return the rows of ``compare_modes``; raise ``PhysicsError``, which lists the worlds whose simulation failed."""
     rows = []
     for name, agent in agents.items():
         parts: list[dict[Mode, _Part]] = []
@@ -217,7 +207,7 @@ def _compare(
 
 
 def _measured(worlds: Worlds, agent: Driver, task: Task) -> dict[Mode, _Part]:
-    """Let an agent or team drive ``worlds`` once in every mode of the shield; return a dictionary: mode -> results."""
+    """Let an agent or team drive ``worlds`` once in every mode of the shield."""
     several, parts = len(task.vehicles) > 1, {}
     alone: dict[Mode, Team] = {"none": Team.of(agent, task.vehicles)}
     if not several:
@@ -241,17 +231,9 @@ def _measured(worlds: Worlds, agent: Driver, task: Task) -> dict[Mode, _Part]:
 def _row(
     agent: str, mode: Mode, parts: list[_Part], harm: Mapping[Mode, Floats], task: Task, clusters: Texts | None
 ) -> ModeRow:
-    """Return the result row of one agent with the shield in one mode.
+    """Return the row of one agent and one mode, from the results ``parts`` of each chunk of worlds.
 
-    Args:
-        agent: name of the agent.
-        mode: the shield's mode.
-        parts: results of the agent in ``mode``, one entry for each chunk of worlds.
-        harm: mode of the shield -> harm of the agent in every world (m2/s2), [n]. The returned row also contains two
-            differences: (harm in ``mode``) - (harm in episode mode), and (harm in ``mode``) - (harm without a shield).
-        task: the scenario, the controlled vehicles, and the count of harm that the shield bounds.
-        clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
-
+    ``harm`` maps every mode to the harm of this agent in every world (m2/s2), [n].
     """
 
     def minus(other: Mode) -> Estimate | None:

@@ -8,6 +8,12 @@ Worlds that come from the same recording form a *cluster*, and only clusters are
 have clusters, standard errors are cluster-robust with the factor G / (G - 1) for G clusters, and t has G - 1 degrees of
 freedom (Cameron and Miller 2015, "A practitioner's guide to cluster-robust inference", Journal of Human Resources
 50(2)).
+
+Arguments that several functions share: ``values``, ``baseline`` and ``others`` have one number per world, [n], for the
+same worlds in the same order. ``clusters`` has the name of each world's cluster, [n]; None: all worlds are independent.
+``products`` is the exact sum over all worlds of ``value * other`` or ``value * baseline`` (``exact_sum``). ``mean``,
+``share_of``, ``paired_difference`` and ``relative_decrease`` raise ``InvalidInput`` if an array is empty or not finite,
+or if the arrays have different lengths.
 """
 
 from __future__ import annotations
@@ -29,12 +35,10 @@ Texts = NDArray[np.str_]
 
 
 def exact_sum(values: Floats, others: Floats | None = None) -> Fraction:
-    """Return the exact sum of ``values`` [n], or of the products ``values * others``, without rounding.
+    """Return the exact sum of ``values``, or of the products ``values * others``.
 
     Each float64 is a whole number of at most 53 bits times a power of two. Whole numbers that belong to the same power
-    of two are added as Python integers, which never overflow. The result therefore does not depend on the order of the
-    values, and sums over chunks of worlds can be added without error. Raises ``InvalidInput`` unless all numbers are
-    finite.
+    of two are added as Python integers, which never overflow. Raises ``InvalidInput`` unless all numbers are finite.
     """
     wholes, powers = _in_wholes(values)
     if others is not None:
@@ -47,12 +51,7 @@ def exact_sum(values: Floats, others: Floats | None = None) -> Fraction:
 def cluster_sums(values: Floats, clusters: Texts) -> dict[str, tuple[int, Fraction]]:
     """Return a dictionary: name of a cluster -> number of values in the cluster, and exact sum of these values.
 
-    Args:
-        values: numbers to add, [n].
-        clusters: name of the cluster (recording) of each value, [n].
-
     Raises ``InvalidInput`` if a value is not finite, or if the arrays have different lengths.
-
     """
     wholes, powers = _in_wholes(values)
     if clusters.shape != powers.shape:
@@ -83,8 +82,7 @@ _UPPER = 0.5 + 0.5 * CONFIDENCE  # quantile at the upper end of an interval
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """Number of values, their exact sum, and the exact sum of their squares. The sum of two ``Moments`` describes the
-    values of both together.
+    """Number n, exact sum and exact sum of squares of some values. ``a + b`` describes the values of both.
 
     >>> import numpy as np
     >>> from ethbrake_marl.evaluation.statistics import Moments
@@ -96,23 +94,15 @@ class Moments:
     count: int = 0  # number of values
     total: Fraction = Fraction()  # sum of the values
     squares: Fraction = Fraction()  # sum of the squared values
-    # Number of negative values. If it is 0, intervals do not extend below 0. For differences (``minus``), whose signs
-    # are not known, it is set to the number of all values.
+    # Number of negative values; 0: intervals do not extend below 0. For differences (``minus``), whose signs are not
+    # known, the number of all values.
     negative: int = field(default=0, compare=False)
-    # Name of a cluster -> number and exact sum of its values; empty: all values are independent.
+    # Result of ``cluster_sums``; empty: all values are independent.
     clusters: Mapping[str, tuple[int, Fraction]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, values: Floats, clusters: Texts | None = None) -> Moments:
-        """Return the moments of ``values``: their number, their sum, and the sum of their squares.
-
-        Args:
-            values: numbers, one per world, [n].
-            clusters: name of the cluster (recording) of each value, [n]; None: all values are independent.
-
-        Raises ``InvalidInput`` if a value is not finite.
-
-        """
+        """Return the moments of ``values``; raise ``InvalidInput`` if a value is not finite."""
         negative, sums = int(np.count_nonzero(values < 0.0)), {} if clusters is None else cluster_sums(values, clusters)
         return cls(len(values), exact_sum(values), exact_sum(values, values), negative, sums)
 
@@ -125,13 +115,7 @@ class Moments:
         return Moments(self.count + other.count, total, squares, negative, clusters)
 
     def minus(self, other: Moments, products: Fraction) -> Moments:
-        """Return the moments of the differences ``value - other``, one difference per world.
-
-        Args:
-            other: moments of the values to subtract, in the same worlds as the values of this object.
-            products: exact sum over all worlds of ``value * other`` (``exact_sum``).
-
-        """
+        """Return the moments of the differences ``value - other``, paired by world."""
         clusters = {name: (n, total - other.clusters[name][1]) for name, (n, total) in self.clusters.items()}
         squares = self.squares - 2 * products + other.squares
         return Moments(self.count, self.total - other.total, squares, self.count, clusters)
@@ -143,16 +127,15 @@ class Moments:
 
     @property
     def mean(self) -> float:
-        """Mean of the values, computed exactly and then rounded. Without values, ``ZeroDivisionError`` is raised."""
+        """Mean, computed exactly and then rounded; raises ``ZeroDivisionError`` if there are no values."""
         return float(self.total / self.count)
 
     @property
     def standard_error(self) -> float:
         """Standard error of the mean, ``s / sqrt(n)``, where s is the standard deviation with n - 1 degrees of freedom.
 
-        With G clusters, the standard error is ``sqrt(G / (G - 1) * sum of D_g ** 2) / n``, where n is the number of
-        values, and D_g the sum of the deviations from the mean in cluster g. Raises ``ZeroDivisionError`` for fewer
-        than two values or clusters.
+        With G clusters, the standard error is ``sqrt(G / (G - 1) * sum of D_g ** 2) / n``, where D_g is the sum of the
+        deviations from the mean in cluster g. Raises ``ZeroDivisionError`` for fewer than two values or clusters.
         """
         n = self.count
         if self.clusters:
@@ -162,7 +145,7 @@ class Moments:
 
     @property
     def estimate(self) -> Estimate:
-        """Mean with its t interval (see the function ``mean``). Without values, ``ZeroDivisionError`` is raised."""
+        """Mean with its t interval (function ``mean``); raises ``ZeroDivisionError`` if there are no values."""
         estimate = self._around(self.mean, self.standard_error if self.independent > 1 else 0.0)
         return estimate if self.negative else of_amounts(estimate, nothing=not self.squares)
 
@@ -171,12 +154,11 @@ class Moments:
         """Mean p of values that are all 0 or 1, with Wilson's interval (``rate``).
 
         With G clusters, Wilson's interval is computed as for ``1 + p (1 - p) / error ** 2`` independent draws, which
-        would have the same standard error ``error``; this effective number of draws is limited to the number of values.
-        If all values are equal, this effective number is G. The effective number is multiplied by ``(z / t) ** 2``,
-        where z and t are the quantiles of the normal and the t distribution, because the standard error has G - 1
-        degrees of freedom (Korn and Graubard 1998, "Confidence intervals for proportions with small expected number of
-        positive counts estimated from survey data", Survey Methodology 24). If there is only one cluster, there is no
-        interval.
+        would have the same standard error ``error``. This effective number is at most the number of values, and is G if
+        all values are equal. It is multiplied by ``(z / t) ** 2``, where z and t are the quantiles of the normal and
+        the t distribution, because the standard error has G - 1 degrees of freedom (Korn and Graubard 1998, "Confidence
+        intervals for proportions with small expected number of positive counts estimated from survey data", Survey
+        Methodology 24). With one cluster there is no interval.
         """
         if not self.clusters:
             return rate(int(self.total), self.count)
@@ -189,19 +171,13 @@ class Moments:
         return Estimate(p, wilson(p, draws * float(ndtri(_UPPER) / stdtrit(clusters - 1, _UPPER)) ** 2))
 
     def ratio_error(self, others: Moments, products: Fraction) -> float:
-        """Return the standard error (delta method) of ``r = mean(values) / mean(others)``, with values paired by world.
+        """Return the standard error (delta method) of ``r = mean(values) / mean(others)``, paired by world.
 
         The residuals ``values - r * others`` have mean 0, and so the standard error of r is
         ``std(residuals) / (sqrt(n) * abs(mean(others)))``. The square of this standard error is
-        ``n * (Qxx Sy^2 - 2 Sx Sy Qxy + Sx^2 Qyy) / ((n - 1) * Sy^4)``, where n is the number of values, x are the
-        ``values``, y are the ``others``, Sx and Sy are their sums, and Qxx, Qxy and Qyy are the sums of ``x^2``,
-        ``x y`` and ``y^2``. With clusters, n is the number of clusters, and x and y are the sums of ``values`` and
-        ``others`` in each cluster.
-
-        Args:
-            others: moments of the values in the denominator, which belong to the same worlds as ``values``.
-            products: exact sum over all worlds of the product ``value * other``.
-
+        ``n * (Qxx Sy^2 - 2 Sx Sy Qxy + Sx^2 Qyy) / ((n - 1) * Sy^4)``, where x are the ``values``, y are the
+        ``others``, Sx and Sy are their sums, and Qxx, Qxy and Qyy are the sums of ``x^2``, ``x y`` and ``y^2``. With
+        clusters, n is the number of clusters, and x and y are the sums of ``values`` and ``others`` in each cluster.
         """
         n, x, y, xx, yy = self.independent, self.total, others.total, self.squares, others.squares
         if self.clusters:
@@ -213,23 +189,16 @@ class Moments:
         return root(n * residuals / ((n - 1) * y**4))
 
     def decrease(self, baseline: Moments, products: Fraction) -> Estimate | None:
-        """Return ``1 - mean(values) / mean(baseline)`` with its interval; None if the mean of ``baseline`` is 0.
-
-        Args:
-            baseline: moments of the baseline agent's values, which belong to the same worlds as ``values``.
-            products: exact sum over all worlds of the product ``value * baseline``.
-
-        """
+        """Return ``1 - mean(values) / mean(baseline)``, paired by world; None if the mean of ``baseline`` is 0."""
         if baseline.total == 0:
             return None
         error = self.ratio_error(baseline, products) if self.independent > 1 else 0.0
         return self._around(1.0 - float(self.total / baseline.total), error)
 
     def _around(self, value: float, error: float) -> Estimate:
-        """Return ``value`` with the interval ``value -+ t * error``, or without an interval if there is only one draw.
+        """Return ``value`` with the interval ``value -+ t * error``, where ``error`` is the standard error.
 
-        ``error`` is the standard error of ``value``. The degrees of freedom of t are the number of independent draws
-        minus 1.
+        With n independent draws, t has n - 1 degrees of freedom; with one draw there is no interval.
         """
         if self.independent < 2:
             return Estimate(value, None)
@@ -238,13 +207,10 @@ class Moments:
 
 
 def of_amounts(estimate: Estimate, *, nothing: bool) -> Estimate:
-    """Return the estimate of a mean of non-negative values, with an interval that does not extend below 0.
+    """Return the mean of non-negative values, ``estimate``, with its interval cut off below 0.
 
-    Args:
-        estimate: mean with an interval that may extend below 0.
-        nothing: whether all averaged values are 0. If all averaged values are 0, the result has no interval, because
-            zeros show that larger values are rare, but not how large such values can be.
-
+    ``nothing`` says that all values are 0. The result then has no interval, because zeros show that larger values are
+    rare, but not how large such values can be.
     """
     if nothing or estimate.interval is None:
         return Estimate(estimate.value, None)
@@ -252,7 +218,7 @@ def of_amounts(estimate: Estimate, *, nothing: bool) -> Estimate:
 
 
 def root(number: Fraction) -> float:
-    """Return the square root of ``number`` (at least 0) as a float, even if ``number`` is too large for a float."""
+    """Return the square root of ``number`` (at least 0), even if ``number`` is too large for a float."""
     shift = (number.numerator.bit_length() - number.denominator.bit_length()) // 2
     return math.ldexp(math.sqrt(number / Fraction(4) ** shift), shift)
 
@@ -272,12 +238,9 @@ def rate(successes: int, count: int) -> Estimate:
 
 
 def wilson(p: float, count: float) -> tuple[float, float]:
-    """Return the ends (low, high) of Wilson's 95 % score interval of a share.
+    """Return the ends (low, high) of Wilson's 95 % score interval of the observed share ``p``, 0 to 1.
 
-    Args:
-        p: observed share, 0 to 1. The number of successes, ``p * count``, need not be a whole number.
-        count: number of independent draws, not necessarily a whole number.
-
+    ``count`` is the number of independent draws. Neither ``count`` nor ``p * count`` need be whole numbers.
     """
     z = float(ndtri(_UPPER))
     shrink = 1.0 + z * z / count
@@ -294,39 +257,17 @@ def mean(values: Floats, clusters: Texts | None = None) -> Estimate:
     In the formula, s is the standard deviation, and t the quantile of the t distribution with n - 1 degrees of freedom.
     The interval assumes that the mean is normally distributed, which is nearly true for thousands of worlds. If no
     value is negative, the interval does not extend below 0. If all values are 0, there is no interval.
-
-    Args:
-        values: numbers to average, one per world, [n].
-        clusters: name of the cluster (recording) of each value, [n]; None: all values are independent.
-
-    Raises ``InvalidInput`` if ``values`` is empty or not finite.
-
     """
     return Moments.of(check(values), clusters).estimate
 
 
 def share_of(truths: Bools, clusters: Texts | None = None) -> Estimate:
-    """Return the fraction of values that are true, with Wilson's interval (``Moments.share``).
-
-    Args:
-        truths: true/false values, one per world, [n].
-        clusters: name of the cluster (recording) of each value, [n]; None: all values are independent.
-
-    """
+    """Return the fraction of worlds in which ``truths`` [n] is true, with Wilson's interval (``Moments.share``)."""
     return Moments.of(check(truths), clusters).share
 
 
 def paired_difference(values: Floats, baseline: Floats, clusters: Texts | None = None) -> Estimate:
-    """Return the mean of ``values - baseline`` with its t interval.
-
-    Args:
-        values: numbers from which ``baseline`` is subtracted, one per world, [n].
-        baseline: numbers to subtract, one for each of the same worlds, [n].
-        clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
-
-    Raises ``InvalidInput`` if the arrays have different lengths, or if an array is empty or not finite.
-
-    """
+    """Return the mean of ``values - baseline`` with its t interval."""
     data, reference, products = _check_pair(values, baseline, clusters)
     return data.minus(reference, products).estimate
 
@@ -337,14 +278,7 @@ def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> 
     The standard errors s1 and s2 of the two means are computed from their t intervals: each standard error is half of
     the interval's width, divided by the quantile of the t distribution. The difference has the standard error
     ``s = sqrt(s1^2 + s2^2)``, with ``s^4 / (s1^4 / (n - 1) + s2^4 / (m - 1))`` degrees of freedom. If one of the two
-    means has no interval, the difference has no interval either.
-
-    Args:
-        value: mean from which ``baseline`` is subtracted, with the interval of this mean.
-        n: number of worlds (with clusters: number of clusters) over which ``value`` is the mean.
-        baseline: mean to subtract, with the interval of this mean.
-        m: number of worlds (with clusters: number of clusters) over which ``baseline`` is the mean.
-
+    means has no interval, the difference has no interval either. With clusters, n and m are the numbers of clusters.
     """
     difference = value.value - baseline.value
     if value.interval is None or baseline.interval is None:
@@ -365,29 +299,16 @@ def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> 
 def relative_decrease(values: Floats, baseline: Floats, clusters: Texts | None = None) -> Estimate | None:
     """Return ``1 - mean(values) / mean(baseline)`` with its interval by the delta method (``Moments.ratio_error``).
 
-    Args:
-        values: numbers of the agent to compare with the baseline agent, such as its harms, one per world, [n].
-        baseline: numbers of the baseline agent, one for each of the same worlds, [n].
-        clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
-
-    The result is None if the mean of ``baseline`` is 0. Raises ``InvalidInput`` if the arrays have different lengths,
-    or if an array is empty or not finite.
-
+    The result is None if the mean of ``baseline`` is 0.
     """
     data, reference, products = _check_pair(values, baseline, clusters)
     return data.decrease(reference, products)
 
 
 def check(values: ArrayLike, who: str = "statistics", each: str = "world") -> Floats:
-    """Check that ``values`` are one or more finite numbers, and return them as an array of floats, [n].
+    """Return ``values`` as an array of floats, [n]; raise ``InvalidInput`` unless they are one or more finite numbers.
 
-    Args:
-        values: the numbers to check.
-        who: name of the calling function, for error messages.
-        each: word for what one number belongs to, ``world`` or ``seed``, for error messages.
-
-    Raises ``InvalidInput`` if ``values`` is not one-dimensional, is empty, or contains a number that is not finite.
-
+    The error message names the calling function ``who``, and what each number belongs to (``each``: world or seed).
     """
     data = np.asarray(values, np.float64)
     if data.ndim != 1 or len(data) < 1 or not np.isfinite(data).all():

@@ -49,8 +49,8 @@ class SummaryTable(list[SummaryRow]):
     """List with one row per agent, which ``print`` and notebooks show as a results table.
 
     Args:
-        rows: one row of results for each agent.
-        beside: rows from another source (such as the paper), printed below the rows of the agents; None: no such rows.
+        rows: one row per agent.
+        beside: rows from another source, such as the paper, printed below the rows of the agents.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -88,8 +88,7 @@ class SummaryTable(list[SummaryRow]):
         """Return the explanations of the columns: heading of the column -> text.
 
         Columns whose headings agree up to a comma, such as "Decrease, total" and "Decrease, first-impact", have one
-        common explanation under the heading "Decrease". The explanations of measures that the user registered come
-        last.
+        common explanation under the heading "Decrease". Measures that the user registered come last.
         """
         about = {each.heading.partition(",")[0]: each.about for each in measures() if each.about and each.heading}
         own = [registered_measure(column) for column in self[0].metrics] if self else []
@@ -99,8 +98,7 @@ class SummaryTable(list[SummaryRow]):
         """Return the table with all columns: agent, its knowledge, and every measure that has a heading.
 
         The columns of measures that the user registered come last. Means that are lower bounds of the true means
-        (``SummaryRow.bounds``) are marked ``≥``. Rows from other sources (``beside``) stand below the rows of the
-        agents.
+        (``SummaryRow.bounds``) are marked ``≥``.
         """
         columns = [each.column() for each in measures() if each.heading]
         columns += [Column(heading_of(name), COLUMN + name) for name in (self[0].metrics if self else ())]
@@ -124,10 +122,7 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", ["Agent", "Knows", *columns], lines)
 
     def terminal(self) -> Sheet:
-        """Return the table for a terminal with at least 80 columns.
-
-        The table ends with rows from other sources, and a text about the worlds, the intervals and other notes.
-        """
+        """Return the table for a terminal with at least 80 columns, with the same text below as in ``markdown``."""
         narrow = self._narrow()
         columns = [
             replace(each, wide=each.name not in narrow, interval="below" if each.name in _BELOW else "hidden")
@@ -141,7 +136,7 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", [Column("Agent,\nwhat it knows", text=True), *columns], lines, self._conditions(), gap=1)
 
     def _narrow(self) -> tuple[str, ...]:
-        """Return the names of the measures that the table in a narrow terminal shows."""
+        """Return the names of the measures that a narrow terminal shows."""
         last: tuple[str, ...] = EPISODE.narrow
         for _, each in every_set():
             if self and any(self[0].estimates.get(name) is not None for name in each.narrow):
@@ -170,9 +165,9 @@ class SummaryTable(list[SummaryRow]):
     def to_pandas(self) -> Any:
         """Return a pandas ``DataFrame`` with one row per agent; the index is the agent's name.
 
-        The columns are the measures of the JSON results, with the same names and units. For a measure ``x``, the
-        columns ``x_low`` and ``x_high`` are the ends of its 95 % interval. A missing number is NaN. Raises
-        ``MissingExtra`` if pandas is not installed.
+        The columns are the measures of the JSON results, with the same names and units; ``x_low`` and ``x_high`` are
+        the ends of the 95 % interval of measure ``x``. A missing number is NaN. Raises ``MissingExtra`` if pandas is
+        not installed.
         """
         with naming_extras():
             from pandas import DataFrame, Index
@@ -187,9 +182,9 @@ class SummaryTable(list[SummaryRow]):
         return DataFrame(columns, index=Index([row.agent for row in self], name="agent"), dtype=float)
 
     def notes(self) -> list[Note]:
-        """Return the notes to print below the table: notes about the agents, then notes about rows of other sources.
+        """Return the notes to print below the table: first about the agents, then about the rows ``beside``.
 
-        Each note is a pair: its kind (``note``, or ``quiet`` for a less prominent note) and its text.
+        A note is a pair: its kind (``note``, or ``quiet`` for a less prominent note) and its text.
         """
         return [*notes_of(self), *(self.beside.notes if self and self.beside else ())]
 
@@ -199,8 +194,8 @@ def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTab
 
     Args:
         evaluation: outcomes of the agents, from ``evaluate``.
-        baseline: name of the agent with which the other agents are compared. If the baseline was not evaluated, the
-            table has no comparisons.
+        baseline: name of the agent with which the others are compared. If it was not evaluated, the table has no
+            comparisons.
 
     """
     contexts = contexts_of(evaluation)
@@ -231,16 +226,9 @@ def summarise_sums(
 ) -> SummaryTable:
     """Return the results table, one row per agent, computed from sums of the measures over all worlds.
 
-    Args:
-        tallies: name of an agent -> sums of the agent's measures over all worlds.
-        conditions: scenario, number and quantities of the worlds (``Conditions.of_test``).
-        contexts: name of a set of measures -> information that the set computed once for these worlds
-            (``contexts_of``).
-        knows: name of an agent -> knowledge about the line that the agent declares.
-        policies: name of an agent -> SHA-256 of the policy of each vehicle, by the vehicle's name.
-        baseline: name of the agent with which the other agents are compared.
-        shared: fields of ``SummaryRow`` that are equal in all rows, such as ``worlds_sha256``.
-
+    ``tallies``, ``knows`` and ``policies`` (``SummaryRow.policy_sha256``) are by the agent's name, ``contexts`` by the
+    set of measures (``contexts_of``). ``shared`` are the fields of ``SummaryRow`` that are equal in all rows, such as
+    ``worlds_sha256``.
     """
     worlds = conditions["count"]
     return SummaryTable(

@@ -31,7 +31,7 @@ class SummaryRow:
 
     """
 
-    agent: str  # name of the agent
+    agent: str
     episodes: int  # number of worlds
     estimates: Mapping[str, Estimate | None]  # value and 95 % interval of every measure, by its name in JSON
     collisions: int  # number of worlds with at least one impact
@@ -86,9 +86,7 @@ class SummaryRow:
 
     @property
     def exploits(self) -> Exploits:
-        """The agent's exploits: shoving Vehicle 1, and vehicles that still move at the horizon. Neither exploit adds to
-        the harm.
-        """
+        """The agent's exploits (shoving Vehicle 1, moving at the horizon), which do not add to the harm."""
         shoved = self.estimates["vehicle_1_shoved_m"]
         return Exploits(None if shoved is None else shoved.value, self.horizon_ends / self.episodes)
 

@@ -1,7 +1,4 @@
-"""For each agent, the sums of its measures over some of the worlds.
-
-Sums over different worlds can be added in any order, with the same result.
-"""
+"""For each agent, the sums of its measures over some worlds. Sums can be added in any order, with the same result."""
 
 from __future__ import annotations
 
@@ -24,16 +21,14 @@ Range = tuple[float, float]  # smallest and largest value
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """For each agent, the sums of its measures over some worlds. ``tally + other`` contains the sums over the worlds of
-    both.
-    """
+    """For each agent, the sums of its measures; ``tally + other`` has the sums over the worlds of both."""
 
     worlds: int = 0  # number of worlds, without left-out worlds
     hidden: int = 0  # number of worlds in which the V2X channel hides something from a controlled vehicle
     worlds_hash: int = 0  # ``hash_of_chunks`` of the worlds
     # Key of a quantity -> smallest and largest value for each vehicle or pair, or for the whole world.
     ranges: Mapping[str, tuple[Range, ...]] = field(default_factory=dict)
-    recordings: frozenset[str] = frozenset()  # names of the recordings that the worlds come from (``clusters_of``)
+    recordings: frozenset[str] = frozenset()  # names of the recordings that the worlds come from
     rejected: int = 0  # number of drawn worlds that were rejected because of an early impact
     left_out: tuple[LeftOut, ...] = ()  # worlds that could not be simulated with some agent; no sum contains them
     agents: Mapping[str, AgentTally] = field(default_factory=dict)  # name of an agent -> sums of its measures
@@ -42,15 +37,10 @@ class Tally:
 
     @classmethod
     def of(cls, part: Evaluation, objectives: Sequence[str] | None = None, *, long_list: bool = True) -> Tally:
-        """Return, for each agent, the sums of its measures over the worlds of an evaluation.
+        """Return the sums of an evaluation of consecutive worlds of the evaluation list.
 
-        Args:
-            part: evaluation of the agents in some consecutive worlds of the evaluation list.
-            objectives: objectives such as ``"social:45"`` (docs/cooperation.md). If ``objectives`` is a list, even an
-                empty list, the result also contains two kinds of sums for each vehicle: the sum of the harm that the
-                vehicle bears, and the sum of the value of each objective.
-            long_list: whether to omit the sets of measures that do not apply to more than 100,000 worlds.
-
+        ``objectives`` is as in ``tally_agents``. ``long_list`` says whether to omit the sets of measures that do not
+        apply to more than 100,000 worlds.
         """
         worlds = part.worlds
         if not worlds.n:
@@ -92,10 +82,7 @@ class Tally:
     def rescore(self, objectives: Sequence[str], vehicles: int) -> Rescores:
         """Return the mean value of each objective over the worlds, for every agent, vehicle and count of harm.
 
-        Args:
-            objectives: objectives such as ``social:45``; ``Tally.of`` must have been called with these objectives.
-            vehicles: number of vehicles, N.
-
+        ``Tally.of`` must have been called with these ``objectives``. ``vehicles`` is the number N of vehicles.
         """
         return Rescores(
             [

@@ -33,15 +33,9 @@ def load_runnable(
 ) -> Scenario:
     """Load a scenario, and find errors in its scripts by letting each script decide once in one world.
 
-    Args:
-        name_or_path: name of a scenario, or path of its YAML file.
-        settings: settings ``KEY=VALUE`` that override values of the file.
-        drives: how many learners the scenario must have: ``one`` (exactly one), ``some`` (at least one) or ``nobody``
-            (any number, because no agent is to drive).
-
-    Raises ``InvalidInput`` if a script does not work (the message names file, line, vehicle and script), or if the
-    number of learners does not fit ``drives``.
-
+    ``settings`` override values of the file. ``drives`` says how many learners the scenario must have: ``one`` (exactly
+    one), ``some`` (at least one) or ``nobody`` (any number, because no agent is to drive). Raises ``InvalidInput`` if a
+    script does not work (the message names file, line, vehicle and script), or if the number of learners is wrong.
     """
     scenario = load_scenario(name_or_path)
     if settings:
@@ -133,11 +127,7 @@ def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
 
 
 def _refusals(scenario: Scenario, worlds: Worlds) -> dict[str, str]:
-    """Try agents, shields and the setting ``early_impacts: reject`` on ``worlds``; for each one that refuses the
-    scenario, return the error message.
-
-    The keys of the result are specs of agents, names of shields (written after ``+``), and ``early_impacts: reject``.
-    """
+    """Return what refuses the scenario (agents, shields as ``+NAME``, ``early_impacts: reject``), and the messages."""
 
     def drive_by(spec: str, needs: Mapping[str, Any]) -> None:
         check_agents(

@@ -12,8 +12,8 @@ from ethbrake_marl.scenario.schema import Scenario
 def states_of(worlds: Worlds, scenario: Scenario) -> list[dict[str, float | None]]:
     """Return the initial state of each world by column, such as ``{"gap_1_m": 6.6, "speed_1_mps": 19.0}``.
 
-    The columns are all gaps and speeds, and every other quantity that the scenario does not set to one fixed value. In
-    a world without an obstacle, the distance to the obstacle is None.
+    The columns are all gaps and speeds, and every other quantity that the scenario does not fix. In a world without an
+    obstacle, the distance to the obstacle is None.
     """
     fixed = {
         rule.column_of(i)
@@ -39,10 +39,10 @@ def drawn_alike(worlds: Worlds, scenario: Scenario) -> dict[str, dict[str, Float
     """Return the values of every quantity that differs between worlds.
 
     The vehicles (or pairs) for which the scenario declares the same smallest and largest value form a group. The result
-    maps the key of a quantity to a dictionary: name of a group -> values [n, number of vehicles or pairs]. An example
-    is ``{"gaps_m": {"": values}, "mass_t": {"vehicle_2": values}}``. The name of a group lists its vehicles; it is ""
-    if the group contains all vehicles (or pairs) of the line. Worlds that lack a quantity (for instance the gap to an
-    obstacle) are omitted from its values.
+    maps the key of a quantity to a dictionary: name of a group -> values [n, number of vehicles or pairs], for instance
+    ``{"gaps_m": {"": values}, "mass_t": {"vehicle_2": values}}``. The name of a group lists its vehicles; it is "" if
+    the group contains all vehicles (or pairs). Worlds that lack a quantity, such as the gap to an obstacle, are omitted
+    from its values.
     """
     of_quantities: dict[str, dict[str, Floats]] = {}
     for key, rule in QUANTITY.of(worlds).items():

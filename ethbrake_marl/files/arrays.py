@@ -42,8 +42,8 @@ _HARMLESS_FLAGS = 0x808  # accepted flags of a zip member: the sizes follow the 
 class ArrayHeader(NamedTuple):
     """Type (in the notation of the file format) and shape of an array, as declared in its file."""
 
-    dtype: str  # type of the numbers, such as ``<f8`` (.npy) or ``F32`` (safetensors)
-    shape: tuple[int, ...]  # length of each axis
+    dtype: str  # such as ``<f8`` (.npy) or ``F32`` (safetensors)
+    shape: tuple[int, ...]
 
 
 class ArrayRow(NamedTuple):
@@ -52,22 +52,17 @@ class ArrayRow(NamedTuple):
     A letter in ``shape`` stands for any length; a letter that occurs several times stands for the same length.
     """
 
-    name: str  # name of the array
-    dtype: str  # type of the numbers, in the notation of ``ArrayHeader``
-    shape: tuple[int | str, ...]  # lengths of the axes, such as ``("n", 3)``
+    name: str
+    dtype: str  # in the notation of ``ArrayHeader``
+    shape: tuple[int | str, ...]  # such as ``("n", 3)``
 
 
 def check_arrays(found: Mapping[str, ArrayHeader], wanted: Sequence[ArrayRow], word: str = "array") -> dict[str, int]:
     """Check that arrays have the required names, types and shapes; return the length for each letter in the shapes.
 
     The result is ``{"n": 5}`` if a required shape is ``("n", 3)`` and the array is [5, 3]. Raises ``ValueError`` naming
-    the first array that is missing, not required, or of a wrong type or shape.
-
-    Args:
-        found: headers of the arrays in a file, by name.
-        wanted: required names, types and shapes of the arrays.
-        word: noun that error messages use for an array, such as ``array`` or ``tensor``.
-
+    the first array that is missing, not required, or of a wrong type or shape. ``word`` is the noun for an array in
+    the message, such as ``tensor``.
     """
     names = {row.name for row in wanted}
     for name in sorted(names - found.keys()):
@@ -93,9 +88,9 @@ def check_arrays(found: Mapping[str, ArrayHeader], wanted: Sequence[ArrayRow], w
 
 
 def safetensors_headers(data: bytes) -> dict[str, ArrayHeader]:
-    """Return type and shape of the arrays in a safetensors file, by name, as the header of the file declares them.
+    """Return type and shape of the arrays, by name, from the header of a safetensors file.
 
-    ``data``: bytes of the file. Raises ``ValueError`` for an invalid file.
+    Raises ``ValueError`` for an invalid file.
     """
     length = int.from_bytes(data[:8], "little")
     if not 2 <= length <= min(len(data) - 8, HEADER_LIMIT_BYTES):
@@ -118,12 +113,7 @@ class ArrayArchive:
 
     An archive must be of the kind that ``numpy.savez`` and ``numpy.savez_compressed`` write: a single file without
     comment and encryption, whose arrays are stored or deflated and have different names. Raises ``ValueError`` for any
-    other data.
-
-    Args:
-        data: bytes of the archive.
-        limit_bytes: largest accepted total size of the unpacked arrays.
-
+    other data, and if the unpacked arrays together would be larger than ``limit_bytes``.
     """
 
     def __init__(self, data: bytes, limit_bytes: int) -> None:
@@ -140,10 +130,7 @@ class ArrayArchive:
             self._read_header(member)
 
     def unpack(self, wanted: Sequence[ArrayRow]) -> dict[str, NDArray[Any]]:
-        """Return the arrays by name, read-only, after checking their names, types and shapes against ``wanted``.
-
-        Raises ``ValueError`` in the same cases as ``check_arrays``.
-        """
+        """Return the arrays by name, read-only; raises the errors of ``check_arrays``."""
         check_arrays(self.headers, wanted)
         arrays = {}
         for member in self._members:
@@ -184,7 +171,7 @@ def _name(member: zipfile.ZipInfo) -> str:
 def _npy_header(name: str, beginning: bytes) -> tuple[ArrayHeader, int]:
     """Return type and shape of an array in a ``.npy`` file, and the byte at which its numbers start.
 
-    ``name``: name of the array, for error messages. ``beginning``: first bytes of the file, with the whole header.
+    ``beginning`` are the first bytes of the file, with the whole header.
     """
     length = int.from_bytes(beginning[8:10], "little")
     match = _NPY.fullmatch(beginning[10 : 10 + length])
@@ -201,8 +188,7 @@ def _npy_header(name: str, beginning: bytes) -> tuple[ArrayHeader, int]:
 def _check_directory(data: bytes) -> None:
     """Raise ``ValueError`` unless ``data`` ends with a small zip directory, as a plain ``.npz`` archive does.
 
-    Call this function before opening the archive, because a zip reader creates an object for every entry of the
-    archive's directory.
+    Check this before the archive is opened, because a zip reader creates an object for every entry.
     """
     if len(data) < 22 or data[-22:-18] != b"PK\x05\x06":
         raise ValueError("not a plain .npz archive")

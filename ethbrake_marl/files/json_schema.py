@@ -29,12 +29,9 @@ class FileSchema(GenerateJsonSchema):
 
 
 def schema_lines(kind: str, command: str) -> str:
-    """Return comment lines for a new YAML file; they name its JSON schema and the command that prints this schema.
+    """Return comment lines for a new YAML file that name its JSON schema and the command that prints this schema.
 
-    Args:
-        kind: kind of the file, ``scenario`` or ``recipe``.
-        command: subcommand of ``ethbrake`` that prints the schema, such as ``scenario schema``.
-
+    ``kind`` is ``scenario`` or ``recipe``; ``command`` is a subcommand of ``ethbrake`` such as ``scenario schema``.
     """
     return (
         f"# yaml-language-server: $schema={kind}.schema.json\n"

@@ -55,20 +55,17 @@ UNSHOWN = object()  # passed as a value, means: do not show the value in the err
 
 
 def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
-    """Raise, in a pydantic validator, the error for an invalid value.
+    """Raise, in a pydantic validator, the error for an invalid ``value``.
 
-    Args:
-        at: path of the value (keys and indices) inside the checked field; ``()``: the field itself.
-        value: the invalid value, which the message shows; ``UNSHOWN``: the message shows no value.
-        right: what would be valid, for example ``must be above 0``.
-
+    ``at`` is the path of the value inside the checked field, ``right`` says what would be valid, for example ``must be
+    above 0``.
     """
     shown = "" if value is UNSHOWN else flow_text(value, 60)
     raise PydanticCustomError("refused", "{right}", {"right": right, "value": shown, "at": at})
 
 
 def require(holds: bool, at: YamlPath, value: Any, right: str) -> None:
-    """Raise the error of ``refuse(at, value, right)`` unless ``holds`` is true."""
+    """Call ``refuse`` unless ``holds`` is true."""
     if not holds:
         refuse(at, value, right)
 
@@ -76,22 +73,15 @@ def require(holds: bool, at: YamlPath, value: Any, right: str) -> None:
 class Wording:
     """Texts for error messages about one kind of file.
 
-    A subclass may override ``needed`` (what to write for a missing key), ``instead`` (what to write instead of an
-    unknown key), ``owner`` (the vehicle or pair of a value) and ``right`` (what would be valid instead of a value).
-
-    A *path* is a tuple of the keys and indices that lead to a value, for example ``("mixture", 0, "weight")``.
-
-    Args:
-        model: pydantic model of the file.
-        needed: text that says what must be written for a missing key; it is used for every missing key.
-
+    A subclass may override ``needed``, ``instead``, ``owner`` and ``right``. An empty text means that there is nothing
+    to say. The argument ``needed`` is the text for every missing key.
     """
 
     def __init__(self, model: type[BaseModel], needed: str = "") -> None:
         self.model, self._needed = model, needed
 
     def known(self, path: YamlPath) -> list[str]:
-        """Return the names of all keys that are possible in place of the last key of ``path`` (keys and indices)."""
+        """Return the names of all keys that are possible in place of the last key of ``path``."""
         models = [self.model]
         for key in path[:-1]:
             inside = [model.model_fields[key].annotation for model in models if key in model.model_fields]
@@ -99,25 +89,19 @@ class Wording:
         return list(dict.fromkeys(f.alias or name for model in models for name, f in model.model_fields.items()))
 
     def needed(self, path: YamlPath) -> str:
-        """Return a text that says what must be written for the missing key at ``path`` (keys and indices)."""
+        """Return what must be written for the missing key at ``path``."""
         return self._needed
 
     def instead(self, key: str) -> str:
-        """Return a text that says what to write instead of the unknown ``key``; empty if there is no such advice."""
+        """Return what to write instead of the unknown ``key``."""
         return ""
 
     def owner(self, path: YamlPath) -> str:
-        """Return the vehicle or pair to which the value at ``path`` belongs, for the error message; may be empty.
-
-        ``path``: keys and indices inside the file.
-        """
+        """Return the vehicle or pair to which the value at ``path`` belongs."""
         return ""
 
     def right(self, detail: ErrorDetails) -> str:
-        """Return what would be valid instead of the value in ``detail`` (a mistake, as pydantic reports it).
-
-        If the returned text is empty, the error message uses a general text instead.
-        """
+        """Return what would be valid instead of the value that pydantic reports; empty: a general text is used."""
         return ""
 
 
@@ -126,12 +110,6 @@ def explain(document: Document, error: ValidationError, wording: Wording) -> Inv
 
     The message shows one mistake (an unknown key, if there is one) and counts the others: "(and k more mistakes)". If
     an unknown key is probably the misspelt name of a missing key, the missing key is not counted.
-
-    Args:
-        document: the parsed file, with the line of each value.
-        error: pydantic's error for the content of the file.
-        wording: texts that error messages use for this kind of file.
-
     """
     # A default that depends on an invalid field is not counted as a mistake.
     details = [d for d in error.errors(include_url=False) if d["type"] != "default_factory_not_called"]
@@ -157,14 +135,8 @@ def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
 def read_model(source: str | Path | Document, model: type[Model], wording: Wording, advice: str) -> Model:
     """Read a YAML file or document into ``model``; raise ``InvalidInput`` for the first mistake.
 
-    The error message names file, line, key and value, and says what would be valid.
-
-    Args:
-        source: path of the file, or the parsed document.
-        model: pydantic model of the content.
-        wording: texts that error messages use for this kind of file.
-        advice: end of the error message "must be a mapping ...", which is shown if the file does not contain a mapping.
-
+    The error message names file, line, key and value, and says what would be valid. ``advice`` is the end of the
+    message "must be a mapping ...", for a file that does not contain a mapping.
     """
     document = source if isinstance(source, Document) else read_yaml(source)
     if not isinstance(document.content, dict):
@@ -178,7 +150,7 @@ def read_model(source: str | Path | Document, model: type[Model], wording: Wordi
 def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
     """Parse a JSON file that a program wrote; return its content as plain data, and as an object of class ``model``.
 
-    ``data``: bytes of the file. Raises ``ValueError`` with a one-line reason for invalid content.
+    Raises ``ValueError`` with a one-line reason for invalid content.
     """
     content = parse_strict_json(data)  # refuses repeated keys and NaN
     try:
@@ -188,10 +160,7 @@ def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
 
 
 class Mistake(NamedTuple):
-    """The first mistake that pydantic found in data from a program.
-
-    ``str(mistake)`` is a text that says where the mistake is and what would be valid.
-    """
+    """The first mistake that pydantic found in data from a program; its ``str`` says where it is and what is valid."""
 
     place: str  # place of the mistake, keys joined by dots; empty if the data as a whole are invalid
     given: Any  # the invalid value
@@ -202,17 +171,16 @@ class Mistake(NamedTuple):
 
 
 def first_mistake(error: ValidationError) -> Mistake:
-    """Return the first mistake in pydantic's ``error`` for a file that a program wrote, or for settings in code."""
+    """Return the first mistake of a file that a program wrote, or of settings in code."""
     detail = error.errors(include_url=False)[0]
     right = {"missing": "is missing", "extra_forbidden": "is an unknown key"}.get(detail["type"])
     return Mistake(".".join(str(key) for key in path_of(detail)), detail["input"], right or _right(detail))
 
 
 def path_of(detail: ErrorDetails) -> YamlPath:
-    """Return the path (keys and indices inside the file) of a mistake that pydantic reports.
+    """Return the path, inside the file, of a mistake that pydantic reports.
 
-    The tags of unions are removed from the path that pydantic reports. If ``refuse`` raised the error, the argument
-    ``at`` of ``refuse`` is appended to the path.
+    The tags of unions are removed. If ``refuse`` raised the error, its argument ``at`` is appended.
     """
     keys = tuple(key for key in detail["loc"] if not (isinstance(key, str) and key.startswith("#")))
     return (*keys, *detail.get("ctx", {}).get("at", ()))
@@ -283,8 +251,7 @@ def _right(detail: ErrorDetails) -> str:
 def suggestion(key: str, known: Iterable[str]) -> str:
     """Return a hint for an unknown ``key``: "did you mean ...?" or the key's new name; empty if no key is similar.
 
-    ``known``: the valid keys. The function also recognises a valid key with a wrong or missing unit: ``gaps_km``,
-    ``mass``.
+    A valid key with a wrong or missing unit is also recognised: ``gaps_km``, ``mass``.
     """
     names = sorted(known)
     if new := new_name(key, names):

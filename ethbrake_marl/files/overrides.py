@@ -37,8 +37,7 @@ class Override:
     def parse(texts: Sequence[str]) -> list[Override]:
         """Parse settings ``key.path=value``, whose values are YAML on one line, such as ``{uniform: [1, 2]}``.
 
-        Raises ``InvalidInput`` for a text without ``=``, an empty key, a repeated path, and a value that is not valid
-        YAML.
+        Raises ``InvalidInput`` for a text without ``=``, an empty key, a repeated path, or a value that is not YAML.
         """
         overrides: list[Override] = []
         for text in texts:
@@ -70,8 +69,7 @@ class Override:
 def _placed(part: Any, path: tuple[str, ...], override: Override) -> Any:
     """Return a copy of ``part`` (a mapping, list or other value) in which ``path`` has the value of ``override``.
 
-    ``path``: those last keys of ``override.path`` that lead from ``part`` to the value; if ``path`` is empty, the value
-    replaces ``part``. Mappings that are missing along the path are created.
+    ``path`` is the end of ``override.path``, counted from ``part``. Missing mappings along the path are created.
     """
     if not path:
         return override.value

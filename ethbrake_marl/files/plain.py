@@ -25,16 +25,9 @@ def read_plain(
     refusal: type[EthBrakeError] = InvalidInput,
     follow_links: bool = True,
 ) -> bytes:
-    """Return the content of a plain file of at most ``limit_bytes``; raise ``refusal`` if it cannot be read.
+    """Return the content of a plain file; raise ``refusal`` in the cases that ``open_plain`` lists.
 
     The limit on the size also applies to a file that grows while it is read.
-
-    Args:
-        path: path of the file to open or read.
-        limit_bytes: largest accepted size of the file.
-        refusal: class of the error to raise if the file cannot be read; ``open_plain`` lists the cases.
-        follow_links: whether a symbolic link is accepted.
-
     """
     with open_plain(path, limit_bytes, refusal=refusal, follow_links=follow_links) as stream:
         data = _read(stream.fileno(), limit_bytes + 1)
@@ -55,15 +48,8 @@ def open_plain(
 
     Kind and size of the file are checked before it is opened, so a pipe or device is not opened. Kind and size are
     checked again after opening, in case another process has replaced the file. The function does not wait if the file
-    cannot be opened at once.
-
-    Args:
-        path: path of the file to open or read.
-        limit_bytes: largest accepted size of the file.
-        refusal: class of the error to raise if the file does not exist, is not a plain file, is too large, or cannot be
-            read (also inside the block). The error message contains the path and the reason.
-        follow_links: whether a symbolic link is accepted.
-
+    cannot be opened at once. Raises ``refusal`` with path and reason if the file does not exist, is not a plain file
+    (or is a symbolic link and ``follow_links`` is False), is too large, or cannot be read (also inside the block).
     """
     file = Path(path)
     try:

@@ -27,9 +27,9 @@ _READ: dict[str, set[str]] = {}  # SHA-256 of the other files that Python files 
 def load_from_file(path: str, name: str, reads: str | None = None) -> Any:
     """Run a Python file, once per process, and return the object ``name`` that it defines.
 
-    The code in the file runs without restrictions. ``reads`` is the path of a file that the Python file uses, such as
-    weights; its SHA-256 is recorded if it exists. Raises ``InvalidInput`` if the Python file is missing, raises an
-    error (the message gives the line number), has changed since it ran, or does not define ``name``.
+    The code runs without restrictions. ``reads`` is the path of a file that the Python file uses, such as weights; its
+    SHA-256 is recorded if it exists. Raises ``InvalidInput`` if the Python file is missing, raises an error (the
+    message gives the line number), has changed since it ran, or does not define ``name``.
     """
     _, module = _run_file(Path(path), f"file {path!r}")
     if not hasattr(module, name):
@@ -61,7 +61,7 @@ def files_run() -> dict[str, str]:
 def _run_file(path: Path, what: str) -> tuple[str, ModuleType]:
     """Return SHA-256 and module of a Python file; run the file unless this process has run it already.
 
-    ``what``: how error messages name the file.
+    ``what`` is how error messages name the file.
     """
     if not path.is_file():
         raise InvalidInput(f"{what}: {'is not a plain file' if path.exists() else 'does not exist'}")
@@ -75,17 +75,7 @@ def _run_file(path: Path, what: str) -> tuple[str, ModuleType]:
 
 
 def _run(content: bytes, path: Path, sha256: str, what: str) -> ModuleType:
-    """Run the content of a Python file as a new module, and return the module.
-
-    The module is registered in ``sys.modules`` so that its classes can be pickled.
-
-    Args:
-        content: bytes of the file.
-        path: resolved path of the file.
-        sha256: SHA-256 of the content, which becomes a part of the module's name.
-        what: how error messages name the file.
-
-    """
+    """Run the content of a Python file as a new module, in ``sys.modules`` so that its classes can be pickled."""
     module = ModuleType(f"ethbrake_file_{path.stem}_{sha256[:12]}")
     module.__file__ = str(path)
     if path in _BEING_RUN:

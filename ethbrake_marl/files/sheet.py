@@ -25,36 +25,29 @@ WIDE = 120  # smallest width of a terminal (characters) in which every column is
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """An estimate and its confidence interval; the interval is None if it cannot be computed, as for one world."""
+    """An estimated value and its confidence interval."""
 
-    value: float  # estimated value
-    interval: tuple[float, float] | None  # low and high end of the confidence interval
+    value: float
+    interval: tuple[float, float] | None  # low and high end; None if it cannot be computed, as for one world
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Low and high end of the confidence interval; both equal the value if there is no interval."""
+        """Low and high end of the interval; both equal the value if there is no interval."""
         return self.interval or (self.value, self.value)
 
     def in_words(self, *, digits: int = 2, scale: float = 1.0, unit: str = "") -> str:
-        """Format the estimate and its confidence interval as text: ``24.19 [23.85, 24.53]``.
-
-        Args:
-            digits: number of digits after the decimal point in the text.
-            scale: factor that multiplies all numbers, for example 100 for per cent.
-            unit: text to put directly after the value, such as ``" %"``.
-
-        """
+        """Format estimate and interval as in a ``Column``: ``24.19 [23.85, 24.53]``."""
         return Column("", digits=digits, scale=scale, unit=unit).show(self).in_words
 
     def to_json(self) -> dict[str, Any]:
-        """Return the estimate as plain data for JSON: ``value``, and ``interval`` as ``[low, high]`` or null."""
+        """Return ``value``, and ``interval`` as ``[low, high]`` or null."""
         return {"value": self.value, "interval": None if self.interval is None else list(self.interval)}
 
     @staticmethod
     def side_by_side(estimates: Mapping[str, Estimate | None]) -> dict[str, Any]:
         """Convert estimates to a dictionary for JSON: ``{"x": 1.5, "x_interval": [1.0, 2.0]}``.
 
-        If the estimate ``x`` is None, the values of ``x`` and ``x_interval`` in the dictionary are None.
+        If the estimate ``x`` is None, both values are None.
         """
         cells: dict[str, Any] = {}
         for name, estimate in estimates.items():
@@ -64,14 +57,14 @@ class Estimate:
 
 
 class Shown(NamedTuple):
-    """Text of a table cell: the value, and the confidence interval if the cell is an estimate."""
+    """Text of a table cell: the value, and the interval if the cell is an estimate."""
 
-    value: str  # the number, with its unit, or the text
+    value: str  # the number with its unit, or the text
     interval: str = ""  # ``23.85, 24.53``
 
     @property
     def in_words(self) -> str:
-        """Value and confidence interval in one line: ``24.19 [23.85, 24.53]``."""
+        """Value and interval in one line: ``24.19 [23.85, 24.53]``."""
         return f"{self.value} [{self.interval}]" if self.interval else self.value
 
 
@@ -80,21 +73,17 @@ Cell = Estimate | Shown | float | int | str | None
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column of a table, with the format of its numbers.
-
-    A number is multiplied by ``scale``, rounded to ``digits`` digits and followed by ``unit``. Integers and texts are
-    not changed.
-    """
+    """A column of a table, with the format of its numbers. Integers and texts are not changed."""
 
     heading: str  # heading in documents
     key: str = ""  # name in CSV and JSON; "": the heading
     digits: int = 2  # number of digits after the decimal point
-    scale: float = 1.0  # factor that multiplies the numbers
-    unit: str = ""  # text directly after the number
+    scale: float = 1.0  # factor that multiplies the numbers, such as 100 for per cent
+    unit: str = ""  # text directly after the number, such as " %"
     sign: Literal["z", "+"] = "z"  # format option: "z" never shows -0.00, "+" always shows a sign
     text: bool = False  # whether the cells are left-aligned texts, which a narrow terminal wraps
     short: str = ""  # heading in a terminal; "": the heading
-    wide: bool = False  # whether the column is shown only in terminals of at least ``WIDE`` characters
+    wide: bool = False  # whether only terminals of at least ``WIDE`` characters show the column
     interval: Literal["beside", "below", "hidden"] = "beside"  # where a terminal shows the interval of an estimate
 
     @property
@@ -103,7 +92,7 @@ class Column:
         return self.key or self.heading
 
     def show(self, cell: Cell) -> Shown:
-        """Format a cell of this column (a number, estimate or text) as text; None becomes a dash."""
+        """Format a cell of this column; None becomes a dash."""
         if cell is None or isinstance(cell, Shown):
             return cell or Shown(DASH)
         if isinstance(cell, str | int):
@@ -122,11 +111,7 @@ Row = Sequence[Any] | str  # a row of cells, or the name of a section that begin
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """A table: title, columns, rows of cells, and a note below.
-
-    A string in ``columns`` is the heading of a column of texts. A string in ``rows`` is the name of a section, which
-    consists of the following rows. If a row has fewer cells than the table has columns, the remaining cells are shown
-    empty.
+    """A table. If a row has fewer cells than the table has columns, the remaining cells are shown empty.
 
     >>> from ethbrake_marl.files.sheet import Column, Estimate, Sheet
     >>> sheet = Sheet("Harm", ["Agent", Column("Total", "total_harm")], [("coast", Estimate(1.5, (1.0, 2.0)))])
@@ -140,8 +125,8 @@ class Sheet:
     """
 
     title: str  # title above the table; "": no title
-    columns: Sequence[Column | str]  # columns; a string is the heading of a column of texts
-    rows: Sequence[Row]  # rows of cells; a string is the name of a section that begins there
+    columns: Sequence[Column | str]  # a string is the heading of a column of texts
+    rows: Sequence[Row]
     note: str = ""  # text below the table
     gap: Literal[1, 2, 3] = 3  # spaces between two columns in a terminal
 
@@ -150,7 +135,7 @@ class Sheet:
 
     @property
     def headings(self) -> list[str]:
-        """Headings of the columns."""
+        """Headings in documents."""
         return [column.heading for column in self._columns()]
 
     @property
@@ -159,7 +144,7 @@ class Sheet:
         return [column.name for column in self._columns()]
 
     def shown(self) -> Iterator[str | tuple[Shown, ...]]:
-        """Yield each row as a tuple of formatted cells, one per column, and each section as its name (a string)."""
+        """Yield each row as a tuple of formatted cells, one per column, and each section as its name."""
         columns = self._columns()
         for row in self.rows:
             if isinstance(row, str):
@@ -169,7 +154,7 @@ class Sheet:
                 yield (*cells, *[Shown("")] * (len(columns) - len(cells)))
 
     def only(self, columns: Iterable[int]) -> Sheet:
-        """Return the table reduced to the given ``columns`` (indices from 0)."""
+        """Return the table reduced to these columns (indices from 0)."""
         names = list(columns)
         rows = [row if isinstance(row, str) else [row[k] for k in names if k < len(row)] for row in self.rows]
         return replace(self, columns=[self.columns[k] for k in names], rows=rows)
@@ -184,8 +169,7 @@ class Sheet:
     def rich(self, width: int = WIDE) -> RenderableType:
         """Return the table, with the note below, as an object of ``rich`` for a terminal of ``width`` characters.
 
-        In a cell with several lines of text, all but the first line are dim. Columns whose field ``wide`` is True are
-        omitted if ``width`` is below ``WIDE``.
+        In a cell with several lines of text, all but the first line are dim.
         """
         from rich import box
         from rich.console import Group
@@ -224,8 +208,7 @@ class Sheet:
     def markdown(self) -> str:
         """Return the table as Markdown, without title and note.
 
-        Because Markdown tables have no sections, the name of the section stands at the beginning of each row's first
-        cell: ``Section: cell``.
+        Markdown tables have no sections, so each row's first cell begins with the section: ``Section: cell``.
         """
         columns, section = self._columns(), ""
         lines = [[column.heading for column in columns], ["---" if column.text else "---:" for column in columns]]
@@ -241,8 +224,6 @@ class Sheet:
         """Return the table as HTML for a notebook or a page, with the title above and the note below.
 
         All content is escaped unless it has a method ``__html__``. The first cell of a row is the heading of the row.
-        Confidence intervals are shown in brackets. Long texts in the columns after the first may be broken
-        into several lines.
         """
         columns, label = self._columns(), self.title or f"Table: {self.headings[0]}"
         kinds = [' class="words"' if k and self.rows and column.text else "" for k, column in enumerate(columns)]
@@ -269,8 +250,9 @@ class Sheet:
         return "\n".join([*lines, "</tbody>", "</table></div>", *note])
 
     def json(self) -> list[dict[str, Any]]:
-        """Return one mapping per row: name of a column -> cell; an estimate also has an entry for its confidence
-        interval. Sections are omitted.
+        """Return one mapping per row: name of a column -> cell; an estimate also has an entry for its interval.
+
+        Sections are omitted.
         """
         columns, rows = self._columns(), []
         for row in self.rows:
@@ -283,18 +265,14 @@ class Sheet:
         return rows
 
     def csv(self) -> str:
-        """Return the table as CSV text, one line per row.
-
-        The interval of a column ``x`` becomes the columns ``x_low`` and ``x_high``. Missing values are written as empty
-        cells.
-        """
+        """Return the table as CSV text (``csv_text``), one line per row."""
         return csv_text(self.json())
 
 
 def terminal_text(*shown: RenderableType, whole_rows: bool = False) -> str:
     """Return tables and texts as they look when printed in this terminal.
 
-    ``whole_rows``: True: do not wrap the cells of tables; the text may then be wider than the terminal.
+    With ``whole_rows``, the cells of tables are not wrapped, and the text may be wider than the terminal.
     """
     from rich.console import Console
     from rich.measure import measure_renderables
@@ -313,12 +291,8 @@ def csv_text(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = 
     """Return rows as CSV text with a header line.
 
     A column ``x_interval`` of pairs (low, high) is written as two columns, ``x_low`` and ``x_high``. None and missing
-    values are written as empty cells.
-
-    Args:
-        rows: rows of the table, each a mapping from column names to values.
-        columns: names of the columns to write, in order, such as ``x_low``; None: all, in order of appearance.
-
+    values are written as empty cells. ``columns`` are the columns to write, in order, such as ``x_low``; None: all, in
+    order of appearance.
     """
     flat: list[dict[str, Any]] = []
     for row in rows:
@@ -345,15 +319,9 @@ def parquet_file(
     """Context manager: yield a function ``add(columns)`` that appends rows to a new Parquet file.
 
     ``columns`` maps column names to arrays of equal length. With ``add(columns, together=True)`` the appended rows form
-    one row group. The file is created only if the block ends without error. Raises ``MissingExtra`` if pyarrow is not
-    installed.
-
-    Args:
-        path: path of the new Parquet file.
-        told: function that is called at the end of the ``with`` block and returns metadata (key -> text) for the
-            Parquet file; None: no metadata.
-        **options: options of ``pyarrow.parquet.ParquetWriter``.
-
+    one row group. The file is created only if the block ends without error. ``told`` is called at the end of the block
+    and returns the file's metadata (key -> text). ``options`` are options of ``pyarrow.parquet.ParquetWriter``. Raises
+    ``MissingExtra`` if pyarrow is not installed.
     """
     with naming_extras():
         import pyarrow

@@ -55,11 +55,10 @@ def check_writable(folder: Path) -> None:
 
 
 def check_target(path: str | Path, *, force: bool = False) -> Path:
-    """Check that a file can be written to ``path``; return ``path`` as a ``Path``.
+    """Check, before a long computation, that a file can be written to ``path``; return ``path`` as a ``Path``.
 
-    Call this function before a long computation, so that the result can be written afterwards. Raises ``AlreadyExists``
-    if the file exists and ``force`` is False. Raises ``InvalidInput`` if the file cannot be written, or if ``path`` is
-    a folder, device, pipe or symbolic link, which ``force`` does not replace.
+    Raises ``AlreadyExists`` if the file exists and ``force`` is False. Raises ``InvalidInput`` if the file cannot be
+    written, or if ``path`` is a folder, device, pipe or symbolic link, which ``force`` does not replace.
     """
     target = Path(path)
     try:
@@ -106,10 +105,7 @@ def check_folder(path: Path, files: Collection[str] = (), *, force: bool = False
 
 
 def write_output(path: str | Path, data: bytes, *, force: bool = False) -> None:
-    """Write ``data`` to ``path``; ``force`` allows replacing an existing file.
-
-    Raises ``AlreadyExists`` or ``InvalidInput`` in the same cases as ``check_target``.
-    """
+    """Write ``data`` to ``path``; raises the errors of ``check_target``."""
     write_file(check_target(path, force=force), data)
 
 
@@ -153,9 +149,7 @@ def remove_folder(path: Path) -> None:
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Delete temporary files that killed processes left in ``folder``; no other process may be writing there
-    meanwhile.
-    """
+    """Delete temporary files that killed processes left in ``folder``; no other process may be writing there."""
     for left in folder.glob(f"{_HIDDEN}*{_UNFINISHED}"):
         if left.is_dir() and not left.is_symlink():
             shutil.rmtree(left)
@@ -167,8 +161,8 @@ def remove_unfinished(folder: Path) -> None:
 def hold_lock(lock: Path, other: str) -> Iterator[None]:
     """Context manager: hold the lock file ``lock`` while the block runs. The lock is also released if the process ends.
 
-    Raises ``InvalidInput`` if another process holds the lock, or if the file cannot be used as a lock. ``other``: error
-    message for a lock that another process holds.
+    Raises ``InvalidInput`` if another process holds the lock (with the message ``other``), or if the file cannot be
+    used as a lock.
     """
     held = FileLock(lock, blocking=False, mode=0o666)
     try:
@@ -199,7 +193,7 @@ def _folder_to_disk(path: Path) -> None:
 
 
 def _umask() -> int:
-    """Return the umask: the permission bits that this process removes from new files."""
+    """Return the permission bits that this process removes from new files."""
     mask = os.umask(0)
     os.umask(mask)
     return mask

@@ -32,8 +32,8 @@ _RESERVED = {"null", "true", "false"}
 def flow_text(value: Any, longest: int | None = None) -> str:
     """Return ``value`` as text in YAML's flow style; reading the text gives an equal value.
 
-    ``value`` may consist of printable texts, lists, mappings with text keys, numbers, true, false and null.
-    ``longest``: number of characters after which the text is cut off, for error messages; None: do not cut it off.
+    ``value`` may consist of printable texts, lists, mappings with text keys, numbers, true, false and null. For error
+    messages, the text is cut off after ``longest`` characters.
     """
     text = _flow(value)
     return text if longest is None or len(text) <= longest else f"{text[: longest - 3]}..."
@@ -67,6 +67,7 @@ SIZE_LIMIT = 64 * 1024  # largest accepted size of a file (bytes)
 
 DEPTH_LIMIT = 16  # largest accepted depth of nested mappings and lists
 
+# Keys and indices that lead to a value, such as ("roles", "vehicle_2"); () leads to the whole content.
 YamlPath = tuple[str | int, ...]
 
 _PLAIN_VALUES: dict[str, bool | None] = {
@@ -86,21 +87,16 @@ _LARGEST_INTEGER = 2**63
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """Content of a YAML file, and the line number of each value.
-
-    A *path* is a tuple of the keys and indices that lead to a value, such as ``("roles", "vehicle_2")``; ``()`` leads
-    to the whole content.
-    """
+    """Content of a YAML file, and the line number of each value."""
 
     file: str  # path or name of the file, for error messages
-    content: Any  # content as plain data: dict, list, str, int, float, bool or None, nested
-    lines: Mapping[YamlPath, int]  # line number (from 1) of each value, by path
+    content: Any  # dict, list, str, int, float, bool or None, nested
+    lines: Mapping[YamlPath, int]  # line number (from 1) of each value
 
     def line_of(self, path: YamlPath) -> int | None:
         """Return the line number (from 1) of the value at ``path``; None if no line is known.
 
-        ``path``: keys and indices that lead to the value. If the value does not exist, return the line of the innermost
-        mapping or list around the path.
+        If the value does not exist, return the line of the innermost mapping or list around the path.
         """
         for length in range(len(path), -1, -1):
             if path[:length] in self.lines:
@@ -108,16 +104,13 @@ class Document:
         return None
 
     def where(self, path: YamlPath) -> str:
-        """Return file and line number of the value at ``path`` (keys and indices), such as ``my.yaml, line 7``."""
+        """Return file and line number of the value at ``path``, such as ``my.yaml, line 7``."""
         line = self.line_of(path)
         return self.file if line is None else f"{self.file}, line {line}"
 
     @contextmanager
     def refusing_at(self, path: YamlPath) -> Iterator[None]:
-        """Context manager: if the block raises ``InvalidInput``, put file and line number in front of its message.
-
-        ``path``: keys and indices that lead to the value; the line number of this value is put in front of the message.
-        """
+        """Context manager: if the block raises ``InvalidInput``, put ``where(path)`` in front of its message."""
         try:
             yield
         except InvalidInput as error:
@@ -133,15 +126,9 @@ def read_yaml(path: str | Path, limit: int = SIZE_LIMIT) -> Document:
 
 
 def parse_yaml(text: str | bytes, file: str = "<text>", limit: int = SIZE_LIMIT) -> Document:
-    """Parse one YAML document.
-
-    Args:
-        text: the document, as text or as UTF-8 bytes.
-        file: name of the document in error messages.
-        limit: largest accepted size in bytes.
+    """Parse one YAML document (text or UTF-8 bytes) of at most ``limit`` bytes; ``file`` names it in error messages.
 
     Raises ``InvalidInput`` with file, line, column and reason if the document is not valid.
-
     """
     data = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
     if len(data) > limit:
@@ -210,7 +197,7 @@ class _Reader:
         _fail(self.file, self.at, reason)
 
     def _value(self, event: Any, path: YamlPath) -> Any:
-        """Return the value at ``path`` (keys and indices), reading from its first YAML event ``event``."""
+        """Return the value at ``path``, whose first YAML event is ``event``."""
         self._check_plain(event)
         self.lines.setdefault(path, self.at[0] + 1)
         if isinstance(event, yaml.ScalarEvent):
