@@ -157,8 +157,8 @@ def force_ranges(force: float, rate: float, speed: float, limit: float) -> tuple
     """Return the acceleration by a vehicle's own brakes or engine, forward and backward, and the rates of change.
 
     The result is ``(forward, backward, rate of forward, rate of backward)``: two accelerations in m/s2 and their rates
-    in m/s3. ``forward`` and ``backward`` differ if the force depends on the direction of motion: the brakes of a
-    vehicle at rest act against motion in either direction (see ``motion.force_range``).
+    in m/s3. ``forward`` and ``backward`` differ if the force depends on the direction of motion. For example, the
+    brakes of a vehicle at rest act against motion in either direction (see ``motion.force_range``).
 
     Args:
         force: present acceleration by brakes or engine, m/s2.

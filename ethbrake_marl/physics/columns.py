@@ -190,7 +190,7 @@ class Packed(NamedTuple):
         """Return harm and number of impacts since the episode began: three arrays of the pairs, three of the obstacle.
 
         The arrays of the pairs, [n, P], are first-impact harm (m2/s2), total harm (m2/s2) and number of impacts. The
-        arrays of the obstacle, [n], are the same for impacts of Vehicle 1 with it.
+        arrays of the obstacle, [n], contain the same for the impacts of Vehicle 1 with the obstacle.
         """
         state, column, pairs = self.state, self.column, self.column.vehicles - 1
         first, total, count = (state[:, at : at + pairs].copy() for at in range(column.harm, column.obstacle, pairs))

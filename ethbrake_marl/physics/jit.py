@@ -87,8 +87,8 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
     """A compiled function, like the result of numba's ``njit``, that uses the cache of this module and compiles faster.
 
     If one compiled function calls another, numba generates machine code and two wrappers for the called function,
-    although the caller already contains its code. Numba also compiles a function again for each integer literal that is
-    passed as an argument. This class avoids both.
+    although the caller already contains the code of the called function. Numba also compiles a function again for each
+    integer literal that is passed as an argument. This class avoids both.
     """
 
     def __init__(self, *given: Any, **options: Any) -> None:
@@ -127,8 +127,8 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Return the template with which numba determines the types when another kernel calls this kernel.
 
-        Part of numba's protocol for dispatchers. ``args`` and ``kws`` are the numba types of the positional and keyword
-        arguments of the call.
+        This method is part of numba's protocol for dispatchers. ``args`` and ``kws`` are the numba types of the
+        positional and keyword arguments of the call.
         """
         if not _KNOWN:
             return super().get_call_template(args, kws)
@@ -289,7 +289,7 @@ def _alone(name: str) -> Iterator[None]:
 def digest_of_sources(source: Path) -> str:
     """Return a hash of all files that determine the kernels in the file ``source``; empty if there is no valid hash.
 
-    There is no valid hash for code that is not in a file, such as code typed in an interactive shell, and if one of the
+    There is no valid hash if the code is not in a file (for example, typed in an interactive shell), or if one of the
     files was edited after this process started, because the process may have imported the older version. A file with a
     date in the future is treated as edited, and the function warns.
     """
@@ -317,8 +317,8 @@ def kernel_sources(source: Path) -> list[Path]:
     """Return ``source`` and all other files of this package whose code its kernels may contain, sorted by name.
 
     A file with kernels is in the result if ``source`` imports it, directly or through other files with kernels. A file
-    without kernels is in the result if a constant (a name in capitals) is imported from it by ``source``, or by a file
-    with kernels that is in the result.
+    without kernels is in the result if ``source``, or a file with kernels in the result, imports a constant (a name in
+    capitals) from it.
     """
     sources, follow = {source}, [source]
     while follow:

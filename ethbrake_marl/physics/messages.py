@@ -11,8 +11,7 @@ The state of the messages is stored in the following columns of a world's parame
 (``physics.columns.Columns``). The columns change during an episode. If the period is 0, the world has no periodic
 messages, and vehicles know the present state.
 
-head    period (s), delay from sending to use (s), p, r, key (a whole number below 2^53), number of samples taken, place
-        of the obstacle ahead (m; infinite: none)
+head    the columns of ``_Channel``: p, r and other settings, number of samples taken, place of the obstacle ahead
 place   N, present place of each vehicle (m; 0 is the front of Vehicle 1 at the alert, vehicle lengths not counted)
 links   N * N times the columns of ``_Link``, ordered by receiver, then sender
 ring    the newest samples in a ring buffer, RING_HEAD + 3 N columns each: time, whether Vehicle 1 has hit the obstacle,
@@ -32,7 +31,7 @@ Arguments that several functions share:
 - ``messages``: the message columns of one world; returned column numbers are counted from the first of them
 - ``state`` [S], ``params``: one world in the layout of ``physics.columns``; ``column``: first column of each group
 - ``wanted``: commands of the vehicles chosen at the last decision, [N] m/s2
-- ``pieces``: starts (s) and commands (m/s2) of braking profiles, [N, 2 K], the same for all worlds
+- ``pieces``: starts (s) and commands (m/s2) of braking profiles, [N, 2 K], as in ``Vehicles.pieces``, for all worlds
 - ``vehicles``: N; ``vehicle``, ``receiver``, ``sender``: indices from 0
 - ``time``, ``end`` and arguments that end in ``_s``: s
 """

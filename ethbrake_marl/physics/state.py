@@ -10,8 +10,7 @@ L    learners
 F    features of an observation
 ===  =========================================================
 
-An argument ``rows`` selects worlds by their indices or by a mask [n]. A *braking profile* is a fixed sequence of
-commands that one vehicle follows (``Vehicles.pieces``).
+A *braking profile* is a fixed sequence of commands that one vehicle follows (``Vehicles.pieces``).
 
 Worlds store gaps and not absolute positions, because positions would lose precision as the line moves on.
 """
@@ -81,7 +80,7 @@ class Vehicles:
         return f"Vehicles({count_of(n, 'world')} of {N}, masses {_span(self.mass_t)} t)"
 
     def take(self, rows: ArrayLike) -> Vehicles:
-        """Return a copy of the parameters of the worlds ``rows``."""
+        """Return a copy of the parameters of the worlds that ``rows`` selects, as in ``Worlds.take``."""
         index = np.asarray(rows)
         return _combined(lambda column: np.ascontiguousarray(column[index]), self)
 
@@ -172,7 +171,7 @@ class Vehicles:
 
     @property
     def _is_view(self) -> bool:
-        """Whether ``own_latency_s`` and ``known_from_s`` share the memory of ``latency_s``, as ``at_once`` makes them."""
+        """Whether ``own_latency_s`` and ``known_from_s`` share the memory of ``latency_s`` (see ``at_once``)."""
         latency, news = self.latency_s, self.known_from_s
         return self.own_latency_s is latency and news.base is latency and news.strides[1:] == (latency.itemsize, 0)
 
@@ -324,11 +323,11 @@ class Worlds:
         return value
 
     def play_pieces(self, pieces: Mapping[int, Sequence[tuple[float, float]]]) -> Worlds:
-        """Return these worlds with braking profiles for the vehicles in ``pieces``.
+        """Return these worlds with braking profiles (fixed sequences of commands) for the vehicles in ``pieces``.
 
-        ``pieces`` maps a vehicle (index from 0) to a sequence of pairs (start, deceleration), one for each command: the
-        start in s after the vehicle's latency, the first 0, and the deceleration in m/s2. A vehicle whose sequence has
-        a single pair gets no profile.
+        ``pieces`` maps a vehicle (index from 0) to a sequence of pairs (start, deceleration), one for each command. The
+        start is in s after the vehicle's latency, and the first start is 0. The deceleration is in m/s2. A vehicle
+        whose sequence has a single pair gets no profile.
         """
         several = {i: np.array(each, np.float64) for i, each in pieces.items() if len(each) > 1}
         if not several and not self.vehicles.pieces.shape[2]:
@@ -342,7 +341,8 @@ class Worlds:
     def refuse_build_up(self, who: str) -> None:
         """Raise ``InvalidInput`` if any vehicle has a finite brake or release rate, or a braking profile.
 
-        For functions whose results would not be exact then. ``who`` is the name of the function in the error message.
+        A function whose result would not be exact in these cases calls this check. ``who`` is its name in the error
+        message.
         """
         slow = self.vehicles.build_up
         if self.vehicles.in_pieces.any():
@@ -359,8 +359,8 @@ class Worlds:
     def first_decision_s(self, deciders: Sequence[int]) -> Floats:
         """Return the time of the first decision, [n] s: the least latency of ``deciders``, but at least ``time_s``.
 
-        ``deciders`` are the indices (from 0) of the vehicles that choose their commands. Without any, the result is
-        ``time_s``.
+        ``deciders`` are the indices (from 0) of the vehicles that choose their commands. If ``deciders`` is empty, the
+        result is ``time_s``.
         """
         if len(deciders) == 0:
             return self.time_s.copy()

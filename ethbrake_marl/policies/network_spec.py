@@ -101,7 +101,7 @@ class NetworkSpec(FileModel):
 
     @property
     def actions(self) -> Float32s:
-        """Fixed actions to which the actor gives scores if ``output`` is ``choice``, [choices], from -1 to 1."""
+        """Fixed actions that output ``choice`` scores, [choices], from -1 to 1."""
         levels: Float32s = np.linspace(-1.0, 1.0, self.choices or 0).astype(np.float32)
         return levels
 
@@ -133,7 +133,7 @@ class NetworkSpec(FileModel):
 
     @property
     def _outputs(self) -> int:
-        """Number of outputs of each actor: number of scores if ``output`` is ``choice``, else size of an action."""
+        """Number of outputs of each actor."""
         return self.action_size if self.choices is None else len(self.among) + self.choices
 
     def _network(self, name: str, hidden: tuple[int, ...], outputs: int) -> list[TensorRow]:
