@@ -63,8 +63,8 @@ def exchange(
 ) -> tuple[float, float]:
     """Return the speeds (m/s) of the front and the rear vehicle of a pair after its impact, by the paper's eq. (13).
 
-    With the closing speed w = v_{i+1} - v_i: ``v_i+ = v_i + m_{i+1} (1 + e) w / (m_i + m_{i+1})`` and ``v_{i+1}+ =
-    v_{i+1} - m_i (1 + e) w / (m_i + m_{i+1})``.
+    With the closing speed w = v_{i+1} - v_i: ``v_i+ = v_i + m_{i+1} (1 + e) w / (m_i + m_{i+1})`` and
+    ``v_{i+1}+ = v_{i+1} - m_i (1 + e) w / (m_i + m_{i+1})``.
 
     Args:
         front_mps: speed v_i of the front vehicle, m/s.
