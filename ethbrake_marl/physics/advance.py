@@ -39,14 +39,13 @@ def advance_worlds(
     """Advance every world to ``until``, in place; return the number of impacts, and whether the input is valid.
 
     A world in which a check of the physics fails keeps its state; the other worlds are advanced. The second result is
-    True if all entries of ``until`` and ``command`` are valid, otherwise False. Arguments that are not listed are
-    fields of ``Worlds`` and ``Vehicles`` under short names, for example ``gaps`` for ``gaps_m``.
+    True if all entries of ``until`` and ``command`` are valid. Arguments that are not listed are fields of ``Worlds``
+    and ``Vehicles`` under short names, for example ``gaps`` for ``gaps_m``.
 
-    - ``in_force``: accelerations in force at the start, [n, N] m/s2. This array and the other arrays from ``gaps`` to
-      ``ahead_hit`` are the state and are updated.
+    - ``in_force``: accelerations in force at the start, [n, N] m/s2. All arrays from ``gaps`` to ``ahead_hit`` are the
+      state and are updated.
     - ``ahead``: gap between Vehicle 1 and the obstacle ahead, [n] m.
-    - ``first_harm``: first-impact harm, [n, P] m2/s2. This array and the other arrays up to ``ahead_count`` are
-      results.
+    - ``first_harm``: first-impact harm, [n, P] m2/s2. All arrays from here to ``ahead_count`` are results.
     - ``command``: commands, [n, N] m/s2.
     - ``until``: time at which each world's segment ends, [n] s.
     - ``failed``: result, the status of each world, [n]: ``FLAG.DONE``, or the code of the check that failed.
@@ -122,8 +121,8 @@ def advance(
 
     Args:
         worlds: n worlds of N vehicles; they are not changed.
-        command_mps2: commanded accelerations within the vehicles' capacities, [n, N] m/s2; negative values brake. A
-            command has no effect before the vehicle's latency has elapsed.
+        command_mps2: commanded accelerations within the vehicles' capacities, [n, N] m/s2; negative brakes. A command
+            has no effect before the vehicle's latency has elapsed.
         duration_s: length of the segment, one number or [n], s. Pass either ``duration_s`` or ``until_s``.
         until_s: absolute time at which the segment ends, one number or [n], s; at least the present time of each world.
         record: whether to return each single impact in ``Impacts.rows``.
@@ -176,12 +175,8 @@ class _Part(NamedTuple):
 def _advance_part(arrays: tuple[NDArray[Any], ...], at: int, capacity: int, part: slice) -> _Part:
     """Advance the worlds of the slice ``part`` in place; return their impacts and whether the input is valid.
 
-    Args:
-        arrays: the array arguments of ``advance_worlds`` for all worlds, in the order of its signature.
-        at: 1 if at least one world has an obstacle ahead, otherwise 0.
-        capacity: largest number of impacts to record.
-        part: slice of the world indices to advance.
-
+    ``arrays`` are the array arguments of ``advance_worlds`` for all worlds, in the order of its signature. ``capacity``
+    is the largest number of impacts to record.
     """
     rows, kernel = np.empty((capacity, LISTED.WIDTH)), cast("Any", advance_worlds)
     whole = part.stop - part.start == len(arrays[0])
@@ -202,12 +197,7 @@ def shaped(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
 def refuse_bad(worlds: Worlds, command: Floats, until: Floats, in_time: Bools) -> None:
     """Raise ``InvalidInput`` for the first world with an invalid end time or a command beyond a vehicle's capacity.
 
-    Args:
-        worlds: n worlds.
-        command: commanded accelerations, [n, N] m/s2.
-        until: end times, [n] s, for the error message.
-        in_time: whether each end time is valid, [n].
-
+    ``in_time`` says whether each end time is valid, [n]; ``until`` [n] is for the error message.
     """
     low, high = -worlds.vehicles.braking_capacity_mps2, worlds.vehicles.driving_capacity_mps2
     in_range = (command >= low) & (command <= high)

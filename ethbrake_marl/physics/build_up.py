@@ -1,7 +1,7 @@
 """Motion with brakes that build up: the force approaches the command at a constant rate, so gaps are cubic in time.
 
-The kernels advance one world in a ``table`` with the layout of ``physics.rows``: a row per quantity, a column per
-vehicle or pair.
+The argument ``table`` is one world in the layout of ``physics.rows``: a row per quantity, a column per vehicle or
+pair.
 
 The *force* of a vehicle (row FORCE) is the acceleration that its brakes or engine alone would cause at the moment. The
 force falls at the rate BRAKE_RATE or rises at the rate RELEASE_RATE until it equals the command. Until the vehicle's
@@ -11,6 +11,8 @@ A *body* is a vehicle, or several touching vehicles that move together. Between 
 Two kinds of events occur in this module but not in ``physics.constant_motion``. In an event of the first kind, a force
 reaches the command or passes 0. In an event of the second kind, touching vehicles separate, or a body that its brakes
 held at rest starts to move.
+
+*Closing* speed, acceleration and jerk of a pair are the value of the rear vehicle minus the value of the front vehicle.
 """
 
 from __future__ import annotations
@@ -34,9 +36,8 @@ _PARTS_LATE_MPS2 = 1e-12  # smallest difference of accelerations at a separation
 def built_up(table: Floats) -> bool:
     """Return whether every vehicle's force equals its command, so that no force changes until a latency elapses.
 
-    The force of a vehicle is the acceleration by its brakes or engine. If a vehicle follows a fixed sequence of
-    commands, the result is True only after the last of these commands has begun. If the result is True,
-    ``constant_motion.move`` is exact. ``table``: one world in the layout of ``physics.rows``.
+    If a vehicle follows a fixed sequence of commands, the result is True only after the last of these commands has
+    begun. If the result is True, ``constant_motion.move`` is exact.
     """
     built = True
     for i in range(table.shape[1]):
@@ -71,14 +72,11 @@ def first_return(value: float, rate: float, jerk: float) -> float:
 def gap_after(gap: float, closing: float, pressing: float, jerk: float, time: float) -> float:
     """Return the gap (m) of a pair after the time t at constant closing jerk: ``g - (w + (b + j t / 3) t / 2) t``.
 
-    Closing speed, closing acceleration and closing jerk are the value of the rear vehicle minus the value of the front
-    vehicle.
-
     Args:
         gap: present gap g, m.
         closing: present closing speed w, m/s.
         pressing: present closing acceleration b, m/s2.
-        jerk: closing jerk j, the rate of the closing acceleration, m/s3.
+        jerk: closing jerk j, m/s3.
         time: time t, s.
 
     """
@@ -87,21 +85,12 @@ def gap_after(gap: float, closing: float, pressing: float, jerk: float, time: fl
 
 @compiled
 def contact_within(gap: float, closing: float, pressing: float, jerk: float, end: float) -> tuple[float, float]:
-    """Return time (s) and closing speed (m/s) of a pair's first contact before ``end``; ``(inf, 0)`` if there is none.
+    """Return time (s) and closing speed (m/s) of a pair's first contact before ``end`` (s); ``(inf, 0)`` if none.
 
-    The closing jerk is constant; ``motion.contact`` is the function for a constant closing acceleration. The closing
-    speed ``w + b t + j t^2 / 2`` has at most two roots, and the gap is monotone between one root and the next. The
-    contact lies in the first of these monotone intervals that ends with a gap of at most 0. Newton's method finds the
-    time of the contact in this interval. If a step of Newton's method leaves the interval, a bisection step replaces
-    it.
-
-    Args:
-        gap: present gap of the pair, m.
-        closing: present closing speed w (rear minus front), m/s.
-        pressing: present closing acceleration b, m/s2.
-        jerk: closing jerk j, the rate of the closing acceleration, m/s3.
-        end: length of the time interval to search, s.
-
+    The arguments are as in ``gap_after``; ``motion.contact`` is the function for a constant closing acceleration. The
+    closing speed ``w + b t + j t^2 / 2`` has at most two roots, and the gap is monotone between one root and the next.
+    The contact lies in the first of these monotone intervals that ends with a gap of at most 0. Newton's method finds
+    the time of the contact in this interval; a bisection step replaces a step that leaves the interval.
     """
     if jerk == 0.0:
         return contact(gap, closing, pressing)
@@ -145,9 +134,9 @@ def contact_within(gap: float, closing: float, pressing: float, jerk: float, end
 def plan_force(table: Floats, i: int, wanted: float) -> None:
     """Write into the table how the force of vehicle ``i`` changes next: its rate, its goal and the time until the goal.
 
-    The force is the acceleration by brakes or engine. The goal is the command ``wanted`` (m/s2), or 0 if the force
-    changes its sign on the way to this command. The function writes the rows FORCE, FORCE_RATE, FORCE_TIME and
-    FORCE_VALUE. If the force already equals the command, the time until the goal (FORCE_TIME) is infinite.
+    The goal is the command ``wanted`` (m/s2), or 0 if the force changes its sign on the way to this command. The
+    function writes the rows FORCE, FORCE_RATE, FORCE_TIME and FORCE_VALUE. If the force already equals the command,
+    FORCE_TIME is infinite.
     """
     force = table[ROW.FORCE, i]
     force = force_now(force, wanted, table[ROW.BRAKE_RATE, i], table[ROW.RELEASE_RATE, i])
@@ -168,8 +157,8 @@ def force_ranges(force: float, rate: float, speed: float, limit: float) -> tuple
     """Return the acceleration by a vehicle's own brakes or engine, forward and backward, and the rates of change.
 
     The result is ``(forward, backward, rate of forward, rate of backward)``: two accelerations in m/s2 and their rates
-    in m/s3. The accelerations ``forward`` and ``backward`` differ if the force depends on the direction of motion. For
-    example, the brakes of a vehicle at rest act against motion in either direction (see ``motion.force_range``).
+    in m/s3. ``forward`` and ``backward`` differ if the force depends on the direction of motion. For example, the
+    brakes of a vehicle at rest act against motion in either direction (see ``motion.force_range``).
 
     Args:
         force: present acceleration by brakes or engine, m/s2.
@@ -194,11 +183,11 @@ def force_ranges(force: float, rate: float, speed: float, limit: float) -> tuple
 
 @compiled
 def settle_moving(low: float, high: float, low_jerk: float, high_jerk: float) -> tuple[float, float]:
-    """Return the acceleration (m/s2) and jerk (m/s3) of a body (a vehicle, or several vehicles that move as one).
+    """Return the acceleration (m/s2) and jerk (m/s3) of a body.
 
-    The body's own forces allow every acceleration in the range ``[low, high]`` (m/s2). The lower end of the range
-    changes at the rate ``low_jerk``, the upper end at the rate ``high_jerk`` (m/s3). The body's acceleration is the
-    value in ``[low, high]`` that is nearest to 0, as in ``motion.settle``.
+    The body's own forces allow every acceleration in the range ``[low, high]`` (m/s2), whose ends change at the rates
+    ``low_jerk`` and ``high_jerk`` (m/s3). The body's acceleration is the value in ``[low, high]`` that is nearest to 0,
+    as in ``motion.settle``.
     """
     if low > 0.0 or (low == 0.0 and low_jerk > 0.0):
         return low, low_jerk
@@ -212,9 +201,9 @@ def pool_moving(table: Floats, first: int, last: int) -> float:
     """Set the accelerations and jerks of touching vehicles; return the time (s) until two of these vehicles separate.
 
     The vehicles are the columns ``first..last`` of ``table`` and have the same speed. If the acceleration of a vehicle
-    is at least the acceleration of the vehicle in front, up to rounding, both vehicles move as one body with a common
-    acceleration and jerk. If the vehicles' own jerks differ, the body may separate later. If no vehicles of
-    ``first..last`` separate, the result is infinite. The function writes the rows ACCELERATION, JERK and JOINED.
+    is at least the acceleration of the vehicle in front, up to rounding, both vehicles move as one body. If the
+    vehicles' own jerks differ, the body may separate later. If no vehicles of ``first..last`` separate, the result is
+    infinite. The function writes the rows ACCELERATION, JERK and JOINED.
     """
     count = 0
     for i in range(first, last + 1):
@@ -251,11 +240,9 @@ def pool_moving(table: Floats, first: int, last: int) -> float:
 
 @compiled(bare=True)
 def settle_block(table: Floats, block: int, out: int) -> None:
-    """Write the common acceleration and jerk of a block into column ``out`` of the table.
+    """Write the common acceleration and jerk of the body in column ``block`` of the BLOCK rows into column ``out``.
 
-    A block consists of touching vehicles that move as one body. ``block`` is the block's column in the rows whose names
-    begin with BLOCK. The rows whose names begin with BLOCK contain the mass of the block and the sums of mass times
-    force and of mass times jerk.
+    The BLOCK rows contain the mass of the body and the sums of mass times force and of mass times jerk.
     """
     mass = table[ROW.BLOCK_MASS, block]
     table[ROW.ACCELERATION, out], table[ROW.JERK, out] = settle_moving(
@@ -270,14 +257,7 @@ def parting_s(table: Floats, head: int, tail: int, value: float, jerk: float) ->
 
     A moving body splits when its front vehicles alone would accelerate more than the whole body. A body that its brakes
     hold at rest starts to move when its front vehicles drive away or when its rear vehicles would move backward.
-
-    Args:
-        table: one world in the layout of ``physics.rows``.
-        head: column of the body's front vehicle.
-        tail: column of the body's rear vehicle.
-        value: acceleration of the body, m/s2.
-        jerk: jerk of the body, m/s3.
-
+    ``value`` is the acceleration of the body, m/s2, and ``jerk`` its jerk, m/s3.
     """
     soonest = math.inf
     held = value == 0.0 and jerk == 0.0
@@ -320,8 +300,8 @@ def accelerate_moving(table: Floats) -> float:
     """Set the acceleration and jerk of every vehicle; return the time (s) until touching vehicles separate.
 
     If no touching vehicles separate, the result is infinite. The function also sets how each vehicle's force changes
-    next and marks the pairs that move as one body (row JOINED). ``table`` is one world in the layout of
-    ``physics.rows``. For brakes that act at once, ``constant_motion.accelerate`` replaces this function.
+    next and marks the pairs that move as one body (row JOINED). For brakes that act at once,
+    ``constant_motion.accelerate`` replaces this function.
     """
     vehicles = table.shape[1]
     for i in range(vehicles):
@@ -360,7 +340,7 @@ def next_moving_event(table: Floats, now: float, end: float, parting: float) -> 
     act at once, ``constant_motion.next_event`` replaces this function.
 
     Args:
-        table: one world in the layout of ``physics.rows``, to which ``accelerate_moving`` has been applied.
+        table: one world to which ``accelerate_moving`` has been applied.
         now: present time, counted from the start of the segment, s.
         end: end of the segment, s.
         parting: time until touching vehicles separate (the result of ``accelerate_moving``), s.
@@ -411,8 +391,7 @@ def next_moving_event(table: Floats, now: float, end: float, parting: float) -> 
 def move_on_cubics(table: Floats, duration: float) -> bool:
     """Move gaps, speeds and forces to the next event, ``duration`` (s) later; return False if a contact was missed.
 
-    ``table`` is one world in the layout of ``physics.rows``. For brakes that act at once, ``constant_motion.move``
-    replaces this function.
+    For brakes that act at once, ``constant_motion.move`` replaces this function.
     """
     vehicles, sound = table.shape[1], True
     for p in range(vehicles - 1):
@@ -458,8 +437,8 @@ def move_apart_on_cubics(table: Floats, duration: float) -> bool:
     """Move all vehicles for ``duration`` (s) and return True, or return False if two vehicles may touch.
 
     If the result is False, speeds and gaps are unchanged. Two neighbours cannot touch if their gap exceeds ``duration``
-    times their largest possible closing speed. ``table`` is one world in the layout of ``physics.rows``. For brakes
-    that act at once, ``segment.move_apart`` replaces this function.
+    times their largest possible closing speed. For brakes that act at once, ``segment.move_apart`` replaces this
+    function.
     """
     vehicles = table.shape[1]
     slowest_in_front = math.inf
@@ -500,17 +479,11 @@ def move_apart_on_cubics(table: Floats, duration: float) -> bool:
 
 @compiled(bare=True)
 def move_alone(table: Floats, i: int, wanted: float, duration: float) -> tuple[float, float]:
-    """Move vehicle ``i`` as if it were alone, under a constant command; return its lowest and highest speed (m/s).
+    """Move vehicle ``i`` as if it were alone for ``duration`` (s); return its lowest and highest speed (m/s).
 
-    When the function is called, row SPEED_VALUE must contain the vehicle's present speed. The function updates the rows
-    SPEED_VALUE and FORCE, and adds the distance that the vehicle travels to row WAY.
-
-    Args:
-        table: one world in the layout of ``physics.rows``.
-        i: column of the vehicle.
-        wanted: command of the vehicle, m/s2; negative brakes.
-        duration: length of the motion, s.
-
+    The command ``wanted`` (m/s2, negative brakes) is constant. When the function is called, row SPEED_VALUE must
+    contain the vehicle's present speed. The function updates the rows SPEED_VALUE and FORCE, and adds the distance that
+    the vehicle travels to row WAY.
     """
     speed = table[ROW.SPEED_VALUE, i]
     force = force_now(table[ROW.FORCE, i], wanted, table[ROW.BRAKE_RATE, i], table[ROW.RELEASE_RATE, i])
@@ -536,10 +509,7 @@ def move_alone(table: Floats, i: int, wanted: float, duration: float) -> tuple[f
 
 @compiled(apart=True, bare=True)
 def move_alone_by_events(table: Floats, i: int, wanted: float, duration: float) -> tuple[float, float]:
-    """Do the work of ``move_alone`` for a vehicle that may come to rest or reach its speed limit, event by event.
-
-    Arguments, result and updated rows are the same as in ``move_alone``.
-    """
+    """Do the work of ``move_alone`` for a vehicle that may come to rest or reach its speed limit, event by event."""
     speed, limit, now = table[ROW.SPEED_VALUE, i], table[ROW.LIMIT, i], 0.0
     slowest, fastest = speed, speed
     while now < duration:

@@ -70,7 +70,7 @@ _compiled_columns = compiled(_columns_of)
 
 @compiled
 def columns(state: Floats) -> Columns:
-    """Return the first column of each group of quantities, for worlds with the packed ``state`` [n, S]."""
+    """Return ``Columns`` for worlds with the packed ``state`` [n, S]."""
     return _compiled_columns((state.shape[1] + 4) // 8)
 
 
@@ -86,8 +86,7 @@ class Packed(NamedTuple):
     def of(cls, worlds: Worlds) -> Packed:
         """Pack ``worlds`` as at the start of an episode, with harm 0.
 
-        The columns of an obstacle and the columns *news by link* (see ``Columns``) exist only if at least one world
-        needs them.
+        The columns of an obstacle and *news by link* exist only if at least one world needs them.
         """
         v, (n, N) = worlds.vehicles, worlds.speeds_mps.shape
         none = np.zeros((n, 3 * (N - 1)))
@@ -107,7 +106,7 @@ class Packed(NamedTuple):
 
     @property
     def column(self) -> Columns:
-        """First column of each group of quantities in the rows of the two arrays."""
+        """First column of each group of quantities."""
         return _known_columns((self.state.shape[1] + 4) // 8)
 
     @property
@@ -117,7 +116,7 @@ class Packed(NamedTuple):
 
     @property
     def has_news(self) -> bool:
-        """Whether the rows have the columns *news by link*: times from which vehicles may act on news of each other."""
+        """Whether the rows have the columns *news by link*."""
         return bool(self.params.shape[1] > self.column.own_latency)
 
     @property
@@ -132,15 +131,10 @@ class Packed(NamedTuple):
         return bool(np.isfinite(self.params[:, column.brake_rate : column.harm_weight]).any())
 
     def widened(self, obstacle: bool, news: bool) -> Packed:
-        """Return these worlds, with the requested columns added if they are missing.
+        """Return these worlds, with the columns of an ``obstacle`` and *news by link* added if requested and missing.
 
-        Added obstacle columns contain the values of a world without an obstacle. Added columns *news by link* contain
-        the values of a world in which each vehicle knows everything once its own latency has elapsed.
-
-        Args:
-            obstacle: whether to add the columns of an obstacle.
-            news: whether to add the columns *news by link* (see ``Columns``).
-
+        Added columns contain the values of a world without an obstacle, in which each vehicle knows everything once its
+        own latency has elapsed.
         """
         (state, params), column = self, self.column
         if obstacle and not self.has_obstacle:
@@ -154,7 +148,7 @@ class Packed(NamedTuple):
     def worlds(self, vehicles: Vehicles | None = None) -> Worlds:
         """Unpack the two arrays into ``Worlds`` with new arrays.
 
-        ``vehicles``: parameters of the returned worlds; if None, the parameters are also unpacked from the arrays.
+        ``vehicles`` are the parameters of the result; None: unpack them from the arrays.
         """
         (state, params), column, far = self, self.column, not self.has_obstacle
         return Worlds(
@@ -193,11 +187,10 @@ class Packed(NamedTuple):
         return self.params[:, column.news : column.messages].copy().reshape(-1, column.vehicles, column.vehicles)
 
     def ledger(self) -> tuple[Floats, Floats, Ints, Floats, Floats, Ints]:
-        """Return six arrays: harm and number of impacts since the episode began, for the pairs and for the obstacle.
+        """Return harm and number of impacts since the episode began: three arrays of the pairs, three of the obstacle.
 
-        The first three arrays, [n, P], are first-impact harm (m2/s2), total harm (m2/s2) and number of impacts of each
-        pair. The last three arrays, [n], are first-impact harm, total harm and number of impacts of Vehicle 1 with the
-        obstacle.
+        The arrays of the pairs, [n, P], are first-impact harm (m2/s2), total harm (m2/s2) and number of impacts. The
+        arrays of the obstacle, [n], contain the same for the impacts of Vehicle 1 with the obstacle.
         """
         state, column, pairs = self.state, self.column, self.column.vehicles - 1
         first, total, count = (state[:, at : at + pairs].copy() for at in range(column.harm, column.obstacle, pairs))

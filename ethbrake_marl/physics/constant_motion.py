@@ -1,6 +1,6 @@
 """Compiled motion of one world from event to event, with constant accelerations between two events.
 
-The functions work on a ``table`` in the layout of ``physics.rows``: a row per quantity, a column per vehicle or pair.
+The argument ``table`` is one world in the layout of ``physics.rows``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ethbrake_marl.physics.state import Floats
 def accelerate(table: Floats) -> None:
     """Set the acceleration of every vehicle, and mark the pairs of touching vehicles that move as one body.
 
-    The function uses the speeds, commands and gaps in ``table``. The function writes the rows ACCELERATION and JOINED.
+    The function writes the rows ACCELERATION and JOINED.
     """
     vehicles = table.shape[1]
     for i in range(vehicles):
@@ -49,13 +49,8 @@ def next_event(table: Floats, now: float, end: float) -> float:
 
     There is an event when a pair comes into contact, a vehicle comes to rest or reaches its speed limit, or a command
     takes effect. The function also writes into the table when each vehicle next comes to rest or reaches its speed
-    limit, and when each pair next comes into contact.
-
-    Args:
-        table: one world in the layout of ``physics.rows``, to which ``accelerate`` has been applied.
-        now: present time, counted from the start of the segment, s.
-        end: end of the segment, s.
-
+    limit, and when each pair next comes into contact. ``accelerate`` must have been applied to ``table``. The times
+    ``now`` and ``end`` (of the segment) are counted from the start of the segment.
     """
     vehicles = table.shape[1]
     soonest = end - now

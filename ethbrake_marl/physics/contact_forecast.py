@@ -1,7 +1,6 @@
 """Forecast of contacts: time and closing speed of the next impact of each pair under constant commands.
 
-The forecast simulates the same physics as ``advance``, but returns no motion. The caller describes the world in a table
-in the layout of ``physics.rows``.
+The forecast simulates the same physics as ``advance``, but returns no motion.
 """
 
 from __future__ import annotations
@@ -36,12 +35,10 @@ def forecast_contacts(table: Floats, restitution: float, duration: float, contac
     pair had an impact before the forecast; this next impact adds no first-impact harm.
 
     Args:
-        table: the world in the layout of ``physics.rows``: a row per quantity, a column per vehicle or pair. The
-            function overwrites the rows of motion and harm.
+        table: the world in the layout of ``physics.rows``; the rows of motion and harm are overwritten.
         restitution: coefficient of restitution of every impact, in [0, 1].
         duration: length of the forecast, s.
-        contacts: result, [CONTACT.WIDTH, N]; column p is pair p, and the last column is not used. Row ``CONTACT.TIME``
-            is the time to the impact (s; infinite: none), and row ``CONTACT.CLOSING`` is its closing speed (m/s).
+        contacts: result, [CONTACT.WIDTH, N], see ``CONTACT``; the last column is not used.
 
     """
     for p in range(table.shape[1] - 1):

@@ -100,8 +100,8 @@ def power_of_two(k: int) -> float:
 def exp_rest(x: float, k: int) -> float:
     """Return ``e^x / 2^k`` for the whole number k nearest to ``x / ln 2``.
 
-    The result is the Taylor series of ``e^y`` up to the power ``y^13``, with ``y = x - k ln 2``. The absolute value of
-    y is at most ``ln(2) / 2``. The relative error of ending the series after ``y^13`` is 5e-18.
+    The result is the Taylor series of ``e^y`` up to ``y^13``, with ``y = x - k ln 2``, so ``|y| <= ln(2) / 2``. The
+    relative error of ending the series there is 5e-18.
     """
     return _polynomial(_EXP, (x - k * _LN2_HIGH) - k * _LN2_LOW)
 
@@ -154,8 +154,7 @@ def normal_quantile(p: float) -> float:
     """Return the number x below which a standard normal variable lies with probability p, within 1.5 ulp.
 
     p is clipped to [1e-22, 1 - 1e-22]. For p outside [1/4, 3/4], let q be the smaller of p and 1 - p. The function
-    represents ``r = sqrt(-2 ln q)`` as the sum of two numbers. The first of these two numbers has 24 bits, so its
-    square is exact.
+    represents ``r = sqrt(-2 ln q)`` as the sum of two numbers; the first has 24 bits, so its square is exact.
     """
     q = p - 0.5
     if abs(q) <= 0.25:
@@ -204,7 +203,7 @@ def normal_probability(x: float) -> float:
 
 @compiled
 def exp_each(values: Floats) -> Floats:
-    """Return ``e^x`` of each entry x of ``values`` [n], as ``exp`` computes it, [n]."""
+    """Return ``exp`` of each entry of ``values`` [n]."""
     result = np.empty(len(values))
     for i in range(len(values)):
         result[i] = exp(values[i])
@@ -213,7 +212,7 @@ def exp_each(values: Floats) -> Floats:
 
 @compiled
 def normal_quantile_each(values: Floats) -> Floats:
-    """Return the standard normal quantile of each probability in ``values`` [n], by ``normal_quantile``, [n]."""
+    """Return ``normal_quantile`` of each probability in ``values`` [n]."""
     result = np.empty(len(values))
     for i in range(len(values)):
         result[i] = normal_quantile(values[i])

@@ -1,14 +1,13 @@
 """Compiled rules of one step of an episode: when commands take effect, motion, harm, rest, and decision times.
 
-Searches and shields copy one world at a time into a table in the layout of ``physics.rows``, and advance this world
-with ``step_episode``. The engine stores all its worlds in the rows of two arrays and advances them in its own loop. The
-engine's loop uses the same rules (``step_end_s``, ``onset_s``, ``force_at``, ``stands``) and the same function
-``advance_table`` as ``step_episode``. Therefore engine, searches and shields compute results that are equal to the last
-bit (decision 0025).
+Searches and shields copy one world at a time into a table and advance this world with ``step_episode``. The engine
+stores all its worlds in the rows of two arrays and advances them in its own loop, with the same rules (``step_end_s``,
+``onset_s``, ``force_at``, ``stands``) and the same function ``advance_table``. Therefore engine, searches and shields
+compute results that are equal to the last bit (decision 0025).
 
-A *profile* is a sequence of constant commands of the controlled vehicles. A *phase* is the time interval of one of
-these commands. Phases begin and end at decisions, so an agent can carry out a profile. This module uses the following
-shape letters in addition to those of ``physics.state``:
+A *profile* here is a sequence of constant commands of the controlled vehicles; a *phase* is the time interval of one
+command. Phases begin and end at decisions, so an agent can carry out a profile. This module uses the following shape
+letters in addition to those of ``physics.state``:
 
 ===  ===========================================================
 C    controlled vehicles
@@ -16,6 +15,14 @@ K    phases, in order of time; phase k ends at the end of step ``ends[k]``, and 
 S    columns of a saved state: speeds N, gaps P, hit flags P, first-impact harm P, total harm P, forces N (unused if no
      brakes build up)
 ===  ===========================================================
+
+Arguments that several functions share:
+
+- ``table``: one world in the layout of ``physics.rows``, with at least ``ROW.OF_EPISODE`` rows
+- ``restitution``: coefficient of restitution of every impact
+- ``clock``: decision times and settings of the episode, [CLOCK.WIDTH]
+- ``no_rows``: ``table[:0]`` or another empty array, so that no single impact is recorded
+- ``step``, ``end``: numbers of decisions, from 0
 """
 
 from __future__ import annotations
@@ -69,10 +76,7 @@ class Grid(NamedTuple):
 
 
 class Episode(NamedTuple):
-    """One world, prepared for simulating *profiles*: sequences of constant commands for the controlled vehicles.
-
-    A phase is the time interval of one of these commands.
-    """
+    """One world, prepared for simulating profiles."""
 
     # [rows_for(2 K), N] table in the layout of ``physics.rows``, for K pieces of braking per vehicle; filled with
     # latencies, masses, limits and other vehicles' commands
@@ -88,22 +92,22 @@ class Decisions(NamedTuple):
     time_step_s: Floats | float  # time between two decisions (s)
 
     def before(self, time_s: Floats | float) -> Floats:
-        """Return the number of decisions before ``time_s``, for example before the horizon."""
+        """Return the number of decisions before ``time_s``."""
         return np.ceil((time_s - self.first_s) / self.time_step_s - _ROUNDING)
 
     def latest(self, time_s: Floats) -> Ints:
-        """Return the number (from 0) of the latest decision at or before each time (s); negative before decision 0."""
+        """Return the number of the latest decision at or before each time (s); negative before decision 0."""
         number: Floats = np.floor((time_s - self.first_s) / self.time_step_s + _ON_GRID)
         return number.astype(np.int64)
 
     def at(self, step: Floats | Ints | float) -> Floats:
-        """Return the time (s) of decision number ``step``, counted from 0."""
+        """Return the time (s) of decision number ``step``."""
         return self.first_s + step * self.time_step_s
 
 
 @compiled
 def grid_of(clock: Floats) -> Grid:
-    """Return the decision times of an episode from its array ``clock`` [CLOCK.WIDTH]."""
+    """Return the decision times of an episode from its ``clock``."""
     return Grid(clock[CLOCK.START], clock[CLOCK.TIME_STEP], clock[CLOCK.LAST_STEP], clock[CLOCK.HORIZON])
 
 
@@ -111,20 +115,14 @@ def grid_of(clock: Floats) -> Grid:
 def step_end_s(step: float, last_step: float, first_s: float, time_step_s: float, horizon_s: float) -> float:
     """Return the time (s) at which step number ``step`` (from 1) ends; the last step ends at the horizon.
 
-    Args:
-        step: number of the step; a step is the time between two decisions.
-        last_step: number of the last step of the episode.
-        first_s: time of the first decision, s.
-        time_step_s: time between two decisions, s.
-        horizon_s: end of the last step, s.
-
+    A step is the time between two decisions. The other arguments are the fields of ``Grid``.
     """
     return horizon_s if step >= last_step else first_s + step * time_step_s
 
 
 @compiled
 def time_of(grid: Grid, step: int) -> float:
-    """Return the time (s) of decision number ``step`` (from 0), or the horizon if there is no such decision."""
+    """Return the time (s) of decision number ``step``, or the horizon if there is no such decision."""
     return step_end_s(step, grid.last_step, grid.first_s, grid.time_step_s, grid.horizon_s)
 
 
@@ -132,7 +130,7 @@ def time_of(grid: Grid, step: int) -> float:
 def onset_s(latency_s: float, time_s: float) -> float:
     """Return the time (s) from ``time_s`` until a vehicle's command takes effect; 0 or less if it acts at once.
 
-    ``latency_s`` and ``time_s`` are in seconds from the alert. Commands take effect from the time ``latency_s`` on.
+    ``latency_s`` and ``time_s`` are in seconds from the alert.
     """
     return latency_s - time_s
 
@@ -145,10 +143,7 @@ def stands(speed_mps: float, command_mps2: float) -> bool:
 
 @compiled(within=True)
 def at_rest(table: Floats) -> bool:
-    """Return whether all vehicles of ``table`` are at rest and no vehicle's command or force would move it.
-
-    If the result is True, the episode has ended. ``table``: one world in the layout of ``physics.rows``.
-    """
+    """Return whether all vehicles are at rest and no command or force would move one, so that the episode has ended."""
     for i in range(table.shape[1]):  # numba does not compile all()
         command = table[ROW.COMMAND, i]
         if not stands(table[ROW.SPEED, i], max(command, table[ROW.FORCE, i]) if builds_up(table) else command):
@@ -160,21 +155,12 @@ def at_rest(table: Floats) -> bool:
 def step_episode(
     table: Floats, restitution: float, time: float, until: float, horizon_s: float, no_rows: Floats
 ) -> int:
-    """Advance one world from ``time`` to ``until`` under its commands, and add the harm of this step to the table.
+    """Advance one world from ``time`` to ``until`` (s) under its commands, and add the harm of this step to the table.
 
     Returns AT_REST (``at_rest`` is True), AT_HORIZON (``at_rest`` is False at the horizon), GOES_ON (neither of the
     two), or minus the status code of ``FLAG`` if a check of the physics failed. After a failure the table is invalid.
     The last bits of the result depend on the times at which steps end. To get the same bits as the engine, call the
     function once for each step from one decision to the next.
-
-    Args:
-        table: the world in the layout of ``physics.rows``, with at least ``ROW.OF_EPISODE`` rows; updated.
-        restitution: coefficient of restitution of every impact.
-        time: present time, s.
-        until: end of the step, s.
-        horizon_s: end of the episode, s.
-        no_rows: ``table[:0]`` or another empty array, so that no single impact is recorded.
-
     """
     status = advance_table(table, restitution, until - time, time, 0, no_rows, 0)[1]
     if status != FLAG.DONE:
@@ -193,15 +179,6 @@ def step_again(table: Floats, restitution: float, grid: Grid, step: int, end: in
 
     Apart from the commands, the table must contain what the previous step or ``restore`` wrote into it. For each
     vehicle, the function computes anew the time until the vehicle's command takes effect.
-
-    Args:
-        table: the world in the layout of ``physics.rows``, with at least ``ROW.OF_EPISODE`` rows; updated.
-        restitution: coefficient of restitution of every impact.
-        grid: decision times of the episode.
-        step: number of the decision to start at, from 0.
-        end: number of the decision to stop at.
-        no_rows: ``table[:0]`` or another empty array, so that no single impact is recorded.
-
     """
     time = time_of(grid, step)
     for i in range(table.shape[1]):
@@ -213,10 +190,7 @@ def step_again(table: Floats, restitution: float, grid: Grid, step: int, end: in
 def harm_so_far(table: Floats, total: float) -> float:
     """Return the harm (m2/s2) of all pairs since the episode began, summed from front to rear.
 
-    Args:
-        table: one world in the layout of ``physics.rows``, with at least ``ROW.OF_EPISODE`` rows.
-        total: 1 for total harm, 0 for first-impact harm.
-
+    ``total`` is 1 for total harm, 0 for first-impact harm.
     """
     value, row = 0.0, ROW.SUM_TOTAL_HARM if total == 1.0 else ROW.SUM_FIRST_HARM
     for p in range(table.shape[1] - 1):
@@ -228,18 +202,9 @@ def harm_so_far(table: Floats, total: float) -> float:
 def value_of(table: Floats, clock: Floats, other_weight: float = OTHER_WEIGHT) -> float:
     """Return the harm of the episode so far (m2/s2), as a search minimises it; this harm never decreases in an episode.
 
-    The result is one of three harms: the harm of the line, the weighted sum of the vehicles' harms, or the largest
-    weighted harm of a vehicle. Each of these harms can be computed as first-impact harm or as total harm. To break
-    ties, the function adds ``other_weight`` times the line's harm in the other count (total harm if the result is
-    first-impact harm, and vice versa).
-
-    Args:
-        table: one world in the layout of ``physics.rows``, with at least ``ROW.OF_EPISODE`` rows.
-        clock: settings of the episode, [CLOCK.WIDTH]: the entry ``HARM_IS_TOTAL`` chooses the count of harm, and the
-            entry ``AIM`` chooses one of the three harms named above.
-        other_weight: weight of the line's harm in the count of harm that the search does not minimise, a number without
-            unit.
-
+    The entry ``AIM`` of ``clock`` chooses one of three harms: the harm of the line, the weighted sum of the vehicles'
+    harms, or the largest weighted harm of a vehicle. The entry ``HARM_IS_TOTAL`` chooses the count of harm. To break
+    ties, the function adds ``other_weight`` times the line's harm in the other count.
     """
     total, aim = clock[CLOCK.HARM_IS_TOTAL], clock[CLOCK.AIM]
     other = other_weight * harm_so_far(table, 1.0 - total)
@@ -258,10 +223,7 @@ def value_of(table: Floats, clock: Floats, other_weight: float = OTHER_WEIGHT) -
 
 @compiled
 def save(table: Floats, state: Floats) -> None:
-    """Save the state of a world, and its harm so far, from its ``table`` into the array ``state`` [S].
-
-    The columns of ``state`` are listed in the docstring of this module, under the letter S.
-    """
+    """Save the state of a world, and its harm so far, from its ``table`` into the array ``state`` [S]."""
     vehicles = table.shape[1]
     pairs = vehicles - 1
     for i in range(vehicles):
@@ -293,10 +255,7 @@ def restore(table: Floats, state: Floats) -> None:
 
 @compiled(apart=True)
 def follow_whole(world: Episode, ends: Ints, commands: Floats, states: Floats, bound: float) -> tuple[float, int]:
-    """Simulate a whole profile (a sequence of constant commands), from its first command on.
-
-    Arguments and result are the same as in ``follow``, which this function calls with ``phase`` 0.
-    """
+    """Simulate a whole profile: ``follow`` with ``phase`` 0."""
     phase = min(0, ends.shape[0])  # 0, but not as a literal: numba would compile everything again for it
     return follow(world, ends, commands, states, phase, bound)
 
@@ -305,16 +264,15 @@ def follow_whole(world: Episode, ends: Ints, commands: Floats, states: Floats, b
 def follow(world: Episode, ends: Ints, commands: Floats, states: Floats, phase: int, bound: float) -> tuple[float, int]:
     """Simulate a profile from ``phase`` on; return its harm (m2/s2) and the number of phases until the simulation ends.
 
-    A profile is a sequence of constant commands; a phase is the time interval of one command. The returned harm is the
-    harm that a search minimises (``value_of``). The number of phases is -1 if a check of the physics failed. If
+    The harm is computed by ``value_of``. The number of phases is -1 if a check of the physics failed. If
     ``world.clock[CLOCK.STEPWISE]`` is 1, the simulation moves from decision to decision, and the result has the same
     bits as in the engine. If ``STEPWISE`` is 0, the simulation moves from phase to phase, which is several times
     faster, and the result differs from the engine's by rounding errors.
 
     Args:
-        world: the world, with its decision times; the table of the world is overwritten.
+        world: the world, with its decision times; its table is overwritten.
         ends: for each phase, the number of the decision at which it ends, [K].
-        commands: for each phase, the commands of the C controlled vehicles, [K, C] m/s2.
+        commands: for each phase, the commands of the controlled vehicles, [K, C] m/s2.
         states: states as ``save`` writes them, [K + 1, S]. The simulation starts from ``states[phase]`` and writes the
             state at the end of phase k to ``states[k + 1]``.
         phase: number of the first phase to simulate, from 0.

@@ -27,18 +27,16 @@ def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> 
 
     If the observer has received the state of a vehicle, the function extrapolates the newest received place and speed
     to the present, under the received command and without contact. If the received states of both vehicles of a pair
-    are from the present time, the estimated gap is the true gap. The observer knows whether its own pairs have had an
-    impact, but not whether other pairs have had an impact. If the observer has received nothing about a vehicle, the
-    function puts this vehicle at rest at the place of the next vehicle towards the observer. If messages do not contain
-    a quantity, the function replaces the quantity in the same way: a place by the place of the next vehicle towards the
-    observer, a speed or a command by 0.
+    are from the present time, the estimated gap is the true gap. The observer knows only of its own pairs whether they
+    have had an impact. If the observer has received nothing about a vehicle, the function puts this vehicle at rest at
+    the place of the next vehicle towards the observer. If messages do not contain a quantity, the function replaces the
+    quantity in the same way: a place by the place of the next vehicle towards the observer, a speed or a command by 0.
 
     Args:
         state: true states of the worlds, [n, S], one row per world in the layout of ``physics.columns``.
         params: parameters of the worlds, one row per world, with message columns.
         observer: index of the observing vehicle, from 0.
-        out: result, the estimated states, [n, S], in the layout of ``state``; in a world without periodic messages, the
-            estimate is the true state.
+        out: result, the estimated states, [n, S]; in a world without periodic messages, the true state.
 
     """
     column = columns(state)
@@ -90,14 +88,9 @@ def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> 
 def moved_on(speed: float, command: float, limit: float, duration: float) -> tuple[float, float]:
     """Return a vehicle's speed (m/s) after ``duration`` (s) without contact, and the distance (m) that it travels.
 
-    A vehicle that moves backward brakes until it is at rest, whatever the sign of its command.
-
-    Args:
-        speed: present speed, m/s; may be negative.
-        command: acceleration in force, m/s2; negative brakes.
-        limit: speed up to which the vehicle drives, m/s.
-        duration: length of the motion, s.
-
+    A vehicle that moves backward brakes until it is at rest, whatever the sign of its command. ``speed`` (m/s) may be
+    negative; ``command`` is the acceleration in force, m/s2; ``limit`` is the speed up to which the vehicle drives,
+    m/s.
     """
     if speed >= 0.0:
         after, way, _ = solo_motion(speed, command, 0.0, limit, duration)
@@ -109,16 +102,7 @@ def moved_on(speed: float, command: float, limit: float, duration: float) -> tup
 
 @compiled
 def move_on(speed: Floats, command: Floats, onset: Floats, limit: Floats, duration: Floats) -> tuple[Floats, Floats]:
-    """Return vehicles' speeds (m/s) after ``duration`` without contact, and the distances travelled (m), [n, N] each.
-
-    Args:
-        speed: present speeds, [n, N] m/s, at least 0.
-        command: commands, [n, N] m/s2; negative brakes.
-        onset: time from now until the command takes effect, [n, N] s.
-        limit: speed up to which each vehicle drives, [n, N] m/s.
-        duration: length of the motion, [n, N] s.
-
-    """
+    """Return final speeds (m/s) and distances travelled (m): ``solo_motion`` of each vehicle, all arrays [n, N]."""
     after, way = np.empty(speed.shape), np.empty(speed.shape)
     for k in range(speed.shape[0]):
         for i in range(speed.shape[1]):

@@ -1,6 +1,6 @@
 """Forecast of harm under constant commands, for many candidate commands of one vehicle.
 
-The forecast uses the physics of ``advance``. The forecast is fast because it returns only the harm, not the motion.
+The forecast uses the physics of ``advance``. It is fast because it returns only the harm, not the motion.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ def forecast(
 ) -> tuple[Floats, Floats]:
     """Return the first-impact harm and the total harm up to ``until_s`` for each candidate command of ``vehicle``.
 
-    The first-impact harm and the total harm are [n, K] in m2/s2. The harm is summed over all pairs; if there is an
-    obstacle ahead, the harm of impacts with it is included. If the present time of a world is ``until_s`` or later, the
-    harm of this world is 0. A pair that has already had an impact adds no first-impact harm.
+    Both harms are [n, K] in m2/s2. The harm is summed over all pairs, including impacts with an obstacle ahead. If the
+    present time of a world is ``until_s`` or later, the harm of this world is 0. A pair that has already had an impact
+    adds no first-impact harm.
 
     Args:
         worlds: n worlds of N vehicles.
@@ -32,8 +32,8 @@ def forecast(
         candidates_mps2: K candidate commands for the vehicle in each world, [n, K] m/s2.
         until_s: end of the forecast, s since the alert.
 
-        Raises ``InvalidInput`` for arrays of wrong shape or a candidate command beyond the vehicle's capacity. Raises
-        ``PhysicsError``, which lists the failed worlds, if a check of the physics fails.
+    Raises ``InvalidInput`` for arrays of wrong shape or a candidate command beyond the vehicle's capacity. Raises
+    ``PhysicsError``, which lists the failed worlds, if a check of the physics fails.
 
     """
     n, N = worlds.speeds_mps.shape
@@ -76,14 +76,10 @@ def forecast_worlds(
     """Simulate every world with each candidate command; add the harm (m2/s2) to ``first`` and ``total`` [n, K].
 
     ``first`` is first-impact harm and ``total`` total harm; all entries must be 0 when the function is called.
-    Arguments that are not listed are fields of ``Worlds`` and ``Vehicles`` under short names, for example ``gaps`` for
-    ``gaps_m``.
+    ``vehicle``, ``command``, ``candidates`` and ``until_s`` are as in ``forecast``. Arguments that are not listed are
+    fields of ``Worlds`` and ``Vehicles`` under short names, for example ``gaps`` for ``gaps_m``.
 
     - ``ahead``: gap to an obstacle, [n] m, ``FAR_AWAY_M`` in a world without one; empty if no world has one.
-    - ``command``: commands of all vehicles, [n, N] m/s2; the column of ``vehicle`` is ignored.
-    - ``vehicle``: index of the vehicle that tries the candidate commands, from 0.
-    - ``candidates``: K candidate commands for this vehicle in each world, [n, K] m/s2.
-    - ``until_s``: end of the forecast, s since the alert.
     - ``in_force``: accelerations in force at the start, [n, N] m/s2.
     - ``failed``: result, [n]; set to True for a world in which a check of the physics failed.
     """

@@ -12,9 +12,9 @@ rear. With the speeds v- before and v+ after the impact, and the restitution e:
 
 After the impact, no vehicle of a cluster is faster than the vehicle in front of it.
 
-The functions work on one array per world, ``table[row, vehicle or pair]``, with the rows of ``physics.rows``. Passing
-one array from function to function takes little time; passing twenty small arrays would take more time than the
-physics.
+The argument ``table`` is one world in the layout of ``physics.rows``; ``first`` and ``last`` are the columns of the
+front and the rear vehicle of a cluster; ``restitution``, in [0, 1], holds for every impact. Passing one array from
+function to function takes little time; passing twenty small arrays would take more time than the physics.
 """
 
 from __future__ import annotations
@@ -36,15 +36,8 @@ def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) ->
     value than the vehicle in front of it. The function writes the vehicles' new values to row ``out``, and the blocks
     to the rows whose names begin with BLOCK. A vehicle of infinite mass (the obstacle) and its block get the value 0.
 
-    Args:
-        table: one world in the layout of ``physics.rows``.
-        low: number of the table row that contains a lower bound of each vehicle's own value (m/s or m/s2).
-        high: number of the table row that contains an upper bound of each vehicle's own value; the same as ``low`` if
-            the value is known exactly.
-        first: column of the first of the touching vehicles, from the front.
-        last: column of the last of the touching vehicles.
-        out: number of the table row into which the results are written.
-
+    The rows ``low`` and ``high`` contain a lower and an upper bound of each vehicle's own value (m/s or m/s2). They are
+    the same row if the value is known exactly.
     """
     count = 0
     for i in range(first, last + 1):
@@ -83,15 +76,8 @@ def resolve_cluster(table: Floats, restitution: float, first: int, last: int) ->
     for any masses. The speed of a vehicle that is not struck stays the same to the last bit.
 
     Rounding can make a corrected speed larger than the speed of the vehicle in front. In a plastic impact, the function
-    therefore limits each speed to the speed of the vehicle in front. Without this limit, two blocks could exchange a
-    rounding error forever.
-
-    Args:
-        table: one world in the layout of ``physics.rows``.
-        restitution: coefficient of restitution of every impact.
-        first: column of the first of the touching vehicles, from the front.
-        last: column of the last of the touching vehicles.
-
+    therefore limits each speed to the speed of the vehicle in front. Otherwise two blocks could exchange a rounding
+    error forever.
     """
     largest = 0.0
     for p in range(first, last):
@@ -118,9 +104,8 @@ def resolve_cluster(table: Floats, restitution: float, first: int, last: int) ->
 def resolve_impacts(table: Floats, restitution: float) -> bool:
     """Resolve once every cluster in which a pair has a closing speed above 0; return False if there is no such cluster.
 
-    A cluster is a sequence of touching vehicles. ``table``: one world in the layout of ``physics.rows``;
-    ``restitution``: coefficient of restitution in [0, 1]. If the result is True, the function has updated row SPEED,
-    written the rows CLOSING, BEFORE and STRUCK, and set row CONTACT_SPEED to 0.
+    If the result is True, the function has updated row SPEED, written the rows CLOSING, BEFORE and STRUCK, and set row
+    CONTACT_SPEED to 0.
     """
     pairs = table.shape[1] - 1
     approaching = False
@@ -159,7 +144,7 @@ def record_impacts(table: Floats, time_s: float, world: int, rows: Floats, recor
     Returns ``recorded`` plus the number of these impacts.
 
     Args:
-        table: one world in the layout of ``physics.rows``, to which ``resolve_impacts`` has been applied.
+        table: one world to which ``resolve_impacts`` has been applied.
         time_s: time of the impacts, s.
         world: number of this world, written into ``rows``.
         rows: array to which the impacts are written, [capacity, LISTED.WIDTH]; if the array is full, further impacts

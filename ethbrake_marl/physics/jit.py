@@ -1,15 +1,17 @@
 """The decorator ``compiled``, which compiles functions with strict floating point and caches the machine code on disk.
 
-A compiled function is called a *kernel*. Numba's own cache has two problems. First, numba's cache checks only the file
-that contains the kernel. If a kernel calls a function of another file and this file is edited, numba still uses the old
+A compiled function is called a *kernel*. Numba's own cache has two problems. First, it checks only the file that
+contains the kernel: if a kernel calls a function of another file and this file is edited, numba still uses the old
 machine code. Second, each process reads numba's index file, changes it and writes it back, which is not safe if several
 processes share a folder.
 
 The cache of this module has one file for each kernel and signature. The name of the file is a hash of everything that
-determines the machine code: sources, versions, signature and processor. The name of the file does not depend on the
-folder of the package. After an edit, only the kernels that may use the edited code are compiled again. A second Python
-environment, or a copy of the package in another folder, reuses the existing files. A file is written under a temporary
-name and renamed when it is complete, so any number of processes may share a folder.
+determines the machine code: sources, versions, signature and processor, but not the folder of the package. After an
+edit, only the kernels that may use the edited code are compiled again. A second Python environment, or a copy of the
+package in another folder, reuses the existing files. A file is written under a temporary name and renamed when it is
+complete, so any number of processes may share a folder.
+
+An argument ``way`` is ``"entry"`` for a kernel called from Python, ``"linked"`` for a kernel called from other kernels.
 """
 
 from __future__ import annotations
@@ -86,7 +88,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
 
     If one compiled function calls another, numba generates machine code and two wrappers for the called function,
     although the caller already contains the code of the called function. Numba also compiles a function again for each
-    integer literal that is passed as an argument. This class avoids both kinds of unnecessary compilation.
+    integer literal that is passed as an argument. This class avoids both.
     """
 
     def __init__(self, *given: Any, **options: Any) -> None:
@@ -170,13 +172,9 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
     def _obtain(self, way: str, kinds: tuple[Any, ...], make: Callable[[], Any], load: Callable[..., None]) -> None:
         """Load a kernel from the cache, or compile and cache it while other processes wait for the same kernel.
 
-        Args:
-            way: ``"entry"`` for a kernel called from Python, ``"linked"`` for a kernel called from other kernels.
-            kinds: numba types of the arguments; if ``way`` is ``"entry"``, also the type of the result.
-            make: function that compiles the kernel and returns two values: True if the kernel must not be cached, and
-                the compiled code as objects that can be pickled.
-            load: function that makes a kernel in this process from the compiled code that ``make`` returned.
-
+        ``kinds`` are the numba types of the arguments; for an ``"entry"``, also the type of the result. ``make``
+        compiles the kernel and returns two values: True if the kernel must not be cached, and the compiled code as
+        objects that can be pickled. ``load`` makes a kernel in this process from this code.
         """
         name = self._name(way, kinds)
         stored = load_kernel(name)
@@ -195,8 +193,6 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
 
         A kernel must not be cached if its source files have no valid hash (``digest_of_sources``), or if it is a
         closure.
-
-        ``way`` is ``"entry"`` for a kernel called from Python, ``"linked"`` for a kernel called from other kernels.
         """
         code, source = self.py_func.__code__, Path(self.py_func.__code__.co_filename)
         digest, own = digest_of_sources(source), digest_of_sources(Path(__file__))
@@ -293,9 +289,9 @@ def _alone(name: str) -> Iterator[None]:
 def digest_of_sources(source: Path) -> str:
     """Return a hash of all files that determine the kernels in the file ``source``; empty if there is no valid hash.
 
-    There is no valid hash for code that is not in a file, such as code typed in an interactive shell. There is also no
-    valid hash if one of the files was edited after this process started, because the process may have imported the
-    older version. A file with a date in the future is treated as edited, and the function warns.
+    There is no valid hash if the code is not in a file (for example, typed in an interactive shell), or if one of the
+    files was edited after this process started, because the process may have imported the older version. A file with a
+    date in the future is treated as edited, and the function warns.
     """
     digest = hashlib.sha256()
     for file in kernel_sources(source) if source.is_file() else ():
@@ -321,8 +317,8 @@ def kernel_sources(source: Path) -> list[Path]:
     """Return ``source`` and all other files of this package whose code its kernels may contain, sorted by name.
 
     A file with kernels is in the result if ``source`` imports it, directly or through other files with kernels. A file
-    without kernels is in the result if a constant (a name in capitals) is imported from it by ``source``, or by a file
-    with kernels that is in the result.
+    without kernels is in the result if ``source``, or a file with kernels in the result, imports a constant (a name in
+    capitals) from it.
     """
     sources, follow = {source}, [source]
     while follow:
@@ -372,15 +368,14 @@ def compiled(*, apart: bool = False, within: bool = False, bare: bool = False) -
 def compiled(function: Any = None, *, apart: bool = False, within: bool = False, bare: bool = False) -> Any:
     """Compile a function with numba: no fast-math, no bounds checks, no GIL, cached on disk.
 
-    By default a compiled function (*kernel*) is inlined into its callers (numba's option ``forceinline``). If a call is
-    not inlined, numba counts the references to its arrays with atomic operations. This counting of references takes
-    more than half as long as the physics itself.
+    By default a kernel is inlined into its callers (numba's option ``forceinline``). If a call is not inlined, numba
+    counts the references to its arrays with atomic operations, which takes more than half as long as the physics
+    itself.
 
     Args:
         function: the function to compile; None if the decorator is used with arguments.
         apart: if True, do not inline this kernel. Use this option for a large kernel that many kernels call, but
-            rarely. If such a large kernel were inlined, numba would compile it once per caller, which takes minutes
-            instead of seconds.
+            rarely: inlined, it would be compiled once per caller, which takes minutes instead of seconds.
         within: if True, inline this kernel into the code of its callers before numba compiles them. In contrast to
             ``forceinline``, ``within`` avoids the counting of references in each function that passes an array on.
         bare: if True, compile this kernel without any counting of references. Use this option for kernels that neither
@@ -405,16 +400,9 @@ Result = TypeVar("Result")
 def by_parts(work: Callable[[slice], Result], n: int, threads: int) -> list[Result]:
     """Call ``work`` for contiguous slices of the rows 0 to n - 1; return the results in the order of the slices.
 
-    There is one slice per thread. The calling thread works on the first slice, so ``threads=1`` starts no thread. If
-    ``work`` raises an error for a slice, the function finishes the other slices and then raises this error. If ``work``
-    raises errors for several slices, the function raises the error of the first of these slices. Raises
-    ``InvalidInput`` unless ``threads`` is a whole number of at least 1.
-
-    Args:
-        work: function that is called with each slice of the rows.
-        n: number of rows to divide into slices.
-        threads: largest number of threads.
-
+    There is one slice per thread, at most ``threads``. The calling thread works on the first slice, so ``threads=1``
+    starts no thread. If ``work`` raises errors, the function finishes the other slices and then raises the error of the
+    first slice that has one. Raises ``InvalidInput`` unless ``threads`` is a whole number of at least 1.
     """
     check_whole_number("threads", threads, 1)
     parts = min(int(threads), n)

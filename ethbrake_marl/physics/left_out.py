@@ -1,4 +1,8 @@
-"""Leave out worlds that the physics cannot advance, and report them; the results of the other worlds do not change."""
+"""Leave out worlds that the physics cannot advance, and report them; the results of the other worlds do not change.
+
+Worlds are identified by indices. The arguments ``measure`` and ``work`` are functions of an array of world indices. If
+the physics fails, they must raise a ``PhysicsError`` that lists the failed worlds by their positions in this array.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +23,8 @@ LeftOutRows = tuple[tuple[int, str], ...]  # row of each world that was left out
 def measured_without_failed(measure: Callable[[Ints], Result], n: int) -> tuple[Result, Ints, LeftOutRows]:
     """Call ``measure`` for the worlds that do not fail; return the result, these worlds, and the failed worlds.
 
-    The worlds that do not fail are returned as indices, and the failed worlds as pairs (index of the world, reason), in
-    ascending order. The function works like ``leaving_out_failed``, but raises ``PhysicsError`` if every world fails.
-
-    Args:
-        measure: function of an array of world indices (from 0 to n - 1). If the physics fails, the function must raise
-            a ``PhysicsError`` that lists the failed worlds by their positions in this array of indices.
-        n: number of worlds.
-
+    The worlds are 0 to n - 1. The failed worlds are pairs (index of the world, reason), in ascending order. The
+    function works like ``leaving_out_failed``, but raises ``PhysicsError`` if every world fails.
     """
     result, rows, failed = leaving_out_failed(measure, np.arange(n))
     if result is None:
@@ -37,15 +35,9 @@ def measured_without_failed(measure: Callable[[Ints], Result], n: int) -> tuple[
 def leaving_out_failed(work: Callable[[Ints], Result], rows: Ints) -> tuple[Result | None, Ints, dict[int, str]]:
     """Call ``work`` for the worlds that do not fail; return the result, these worlds, and {failed world: reason}.
 
-    Worlds are returned as indices. ``work`` is repeated without the failed worlds until no world fails. The results of
-    the other worlds stay the same, because the result of a world does not depend on the other worlds. If every world
+    ``work`` is called first with ``rows`` [k], and repeated without the failed worlds until no world fails. The results
+    of the other worlds stay the same, because the result of a world does not depend on the other worlds. If every world
     fails, the returned result is None.
-
-    Args:
-        work: function of an array of world indices. If the physics fails, the function must raise a ``PhysicsError``
-            that lists the failed worlds by their positions in this array of indices.
-        rows: indices of the worlds for the first call of ``work``, [k].
-
     """
     failed: dict[int, str] = {}
     while len(rows):
@@ -73,10 +65,7 @@ class ImpactRows:
 
 @dataclass(frozen=True, slots=True)
 class Impacts:
-    """Harm and number of impacts in a segment (a time interval of constant commands).
-
-    The harm of an impact is its squared closing speed, in m2/s2. Pair p is (vehicle p, vehicle p + 1).
-    """
+    """Harm (m2/s2) and number of impacts in a segment."""
 
     first_impact_harm: Floats  # [n, P] harm of each pair's first impact of the episode, if it is in this segment
     total_harm: Floats  # [n, P] harm of every impact

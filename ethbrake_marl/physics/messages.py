@@ -8,11 +8,10 @@ random number that decides whether a message is lost depends only on the world's
 of the message. A vehicle measures a neighbour in sight, so it knows the neighbour's present state.
 
 The state of the messages is stored in the following columns of a world's parameters, after the group *news by link*
-(``physics.columns.Columns``). The columns contain the state of the channels and what each vehicle has received, so they
-change during an episode. If the period is 0, the world has no periodic messages, and vehicles know the present state.
+(``physics.columns.Columns``). The columns change during an episode. If the period is 0, the world has no periodic
+messages, and vehicles know the present state.
 
-head    period (s), delay from sending to use (s), p, r, key (a whole number below 2^53), number of samples taken, place
-        of the obstacle ahead (m; infinite: none)
+head    the columns of ``_Channel``: p, r and other settings, number of samples taken, place of the obstacle ahead
 place   N, present place of each vehicle (m; 0 is the front of Vehicle 1 at the alert, vehicle lengths not counted)
 links   N * N times the columns of ``_Link``, ordered by receiver, then sender
 ring    the newest samples in a ring buffer, RING_HEAD + 3 N columns each: time, whether Vehicle 1 has hit the obstacle,
@@ -26,6 +25,15 @@ of the N vehicles chosen at the last decision. These worlds have three more grou
 contents    N * CONTENTS: 1 if messages of this vehicle contain this quantity (see ``PIECES``), else 0
 intents     N, present intent of each vehicle (m/s2)
 told        N * N, by receiver, then sender: intent in the newest message received (m/s2)
+
+Arguments that several functions share:
+
+- ``messages``: the message columns of one world; returned column numbers are counted from the first of them
+- ``state`` [S], ``params``: one world in the layout of ``physics.columns``; ``column``: first column of each group
+- ``wanted``: commands of the vehicles chosen at the last decision, [N] m/s2
+- ``pieces``: starts (s) and commands (m/s2) of braking profiles, [N, 2 K], as in ``Vehicles.pieces``, for all worlds
+- ``vehicles``: N; ``vehicle``, ``receiver``, ``sender``: indices from 0
+- ``time``, ``end`` and arguments that end in ``_s``: s
 """
 
 from __future__ import annotations
@@ -61,7 +69,7 @@ CONTENTS = len(PIECES)  # number of columns that say what messages of one vehicl
 
 
 class _Channel(NamedTuple):
-    """Column numbers of the group *head*, which contains the quantities that all links of a world share."""
+    """Column numbers of the group *head*, which all links of a world share."""
 
     PERIOD: int = 0  # time between two messages of a link (s); 0: the world has no periodic messages
     DELAY: int = 1  # time from sending a message to its use (s)
@@ -79,7 +87,7 @@ PLACES_AT = CHANNEL.WIDTH  # first column of the places of the vehicles (m along
 
 
 class _Link(NamedTuple):
-    """Column numbers of a link, which is the connection from one sending vehicle to one receiving vehicle."""
+    """Column numbers of a link from one sending vehicle to one receiving vehicle."""
 
     NEXT_SENT: int = 0  # when the next unprocessed message is sent (s); infinite: no messages on this link
     NUMBER: int = 1  # number of the next unprocessed message; 0 is the first message that arrives
@@ -104,43 +112,31 @@ _ON_GRID = 1e-9
 
 @compiled
 def link_at(receiver: int, sender: int, vehicles: int) -> int:
-    """Return the first column of the link from ``sender`` to ``receiver`` (vehicle numbers from 0).
-
-    Columns are counted from the first column of the messages; ``vehicles`` is N.
-    """
+    """Return the first column of the link from ``sender`` to ``receiver``."""
     return CHANNEL.WIDTH + vehicles + LINK.WIDTH * (receiver * vehicles + sender)
 
 
 @compiled
 def contents_at(vehicles: int) -> int:
-    """Return the first column of the group *contents*, counted from the first column of the messages.
-
-    If the group *contents* does not exist, the result is the first column of the ring buffer.
-    """
+    """Return the first column of the group *contents*; without this group, of the ring buffer."""
     return CHANNEL.WIDTH + vehicles + LINK.WIDTH * vehicles * vehicles
 
 
 @compiled
 def intent_at(vehicles: int) -> int:
-    """Return the first column of the group *intents*, counted from the first column of the messages.
-
-    The group *told* (the intents in the newest messages received) begins N columns after the group *intents*.
-    """
+    """Return the first column of the group *intents*; the group *told* begins N columns later."""
     return contents_at(vehicles) + CONTENTS * vehicles
 
 
 @compiled
 def has_contents(messages: Floats, vehicles: int) -> bool:
-    """Return whether the message columns of a world have the group *contents*, which says what messages contain."""
+    """Return whether the message columns of a world have the group *contents*."""
     return bool(messages.shape[0] > 0 and messages[link_at(0, 0, vehicles) + LINK.NUMBER] == 1.0)
 
 
 @compiled
 def ring_at(messages: Floats, vehicles: int) -> int:
-    """Return the first column of the ring buffer of samples, counted from the first column of the messages.
-
-    ``vehicles`` is N.
-    """
+    """Return the first column of the ring buffer."""
     contents = vehicles * (CONTENTS + 1 + vehicles) if has_contents(messages, vehicles) else 0
     return contents_at(vehicles) + contents
 
@@ -153,13 +149,12 @@ def sample_width(messages: Floats, vehicles: int) -> int:
 
 @compiled
 def knows_piece(messages: Floats, vehicles: int, receiver: int, sender: int, piece: int, time: float) -> bool:
-    """Return whether, at ``time`` (s), ``receiver`` knows the quantity ``PIECES[piece]`` of ``sender``.
+    """Return whether, at ``time``, ``receiver`` knows the quantity ``PIECES[piece]`` of ``sender``.
 
     The function assumes that the sender's first message has arrived by ``time``, or that the sender is in sight.
-    ``messages`` are the message columns of one world; the array may be empty, for a world without message columns. The
-    receiver knows the intent (the command chosen at the last decision) only by a message. The receiver knows every
-    other quantity if the sender's messages contain it. Once the sender is in sight, the receiver also knows the
-    sender's place, speed and acceleration, because it measures them.
+    ``messages`` may be empty, for a world without message columns. The receiver knows the intent only by a message. It
+    knows every other quantity if the sender's messages contain it. Once the sender is in sight, the receiver also knows
+    the sender's place, speed and acceleration, because it measures them.
     """
     if not has_contents(messages, vehicles):
         return piece != INTENT
@@ -211,14 +206,14 @@ class Messages(NamedTuple):
 
     @classmethod
     def of(cls, worlds: Worlds) -> Messages:
-        """Return the messages of ``worlds``; the result shares memory with ``worlds.messages``."""
+        """Return the messages of ``worlds``, in shared memory."""
         return cls(worlds.messages, worlds.N)
 
     @staticmethod
     def ring_length(delay_s: float, time_step_s: float) -> int:
         """Return how many samples the ring buffer must store: the samples of one message delay, and three more.
 
-        ``delay_s``: time from sending a message to its use (s); ``time_step_s``: time between two samples (s).
+        ``delay_s`` is the time from sending a message to its use, ``time_step_s`` the time between two samples.
         """
         return math.ceil(delay_s / time_step_s - _ON_GRID) + 3
 
@@ -280,7 +275,7 @@ class Messages(NamedTuple):
 
     @property
     def says_contents(self) -> bool:
-        """Whether message columns contain the group *contents*; either all worlds of a batch have it, or none has."""
+        """Whether message columns have the group *contents*; either all worlds of a batch have it, or none has."""
         marked: bool = self.columns.shape[1] > 0 and bool((self.links[:, 0, 0, LINK.NUMBER] == 1.0).any())
         return marked
 
@@ -302,15 +297,15 @@ class Messages(NamedTuple):
     def known_pieces(self, vehicle: int, time_s: Floats) -> Bools:
         """Return a mask [n, N, CONTENTS], True at (world, j, c) if ``vehicle`` knows ``PIECES[c]`` of vehicle j.
 
-        The mask describes the time ``time_s`` [n]. The result is valid for a vehicle j whose first message has arrived
-        by ``time_s``, and for a vehicle j in sight.
+        The mask describes the time ``time_s`` [n]. It is valid for a vehicle j whose first message has arrived by then,
+        and for a vehicle j in sight.
         """
         known = np.empty((len(time_s), self.vehicles, CONTENTS), np.bool_)
         _known_pieces(np.ascontiguousarray(self.columns), time_s, self.vehicles, vehicle, known)
         return known
 
     def intents(self, vehicle: int) -> Floats:
-        """Return the newest intents (chosen commands) that ``vehicle`` knows, [n, N] m/s2; 0 for an unknown intent."""
+        """Return the newest intents that ``vehicle`` knows, [n, N] m/s2; 0 for an unknown intent."""
         n, N = len(self.columns), self.vehicles
         if not self.says_contents:
             return np.zeros((n, N))
@@ -321,7 +316,7 @@ class Messages(NamedTuple):
     def with_intents(self, intents_mps2: Floats) -> Floats:
         """Return a copy of the message columns with the present intents ``intents_mps2`` [n, N].
 
-        If the columns have no group *intents*, the function returns the message columns themselves, not a copy.
+        Columns without the group *intents* are returned themselves, not as a copy.
         """
         if not self.says_contents:
             return self.columns
@@ -330,7 +325,7 @@ class Messages(NamedTuple):
         return columns
 
     def newest_told(self, vehicle: int) -> Told:
-        """Return, for every vehicle, the newest state that ``vehicle`` (index from 0) has received.
+        """Return, for every vehicle, the newest state that ``vehicle`` has received.
 
         All worlds must have message columns.
         """
@@ -342,9 +337,9 @@ class Messages(NamedTuple):
     def age_s(self, time_s: Floats) -> Floats:
         """Return the age at ``time_s`` [n] of the newest state that vehicle i received from vehicle j, [n, N, N] s.
 
-        The age is the time since the state was sampled. The age is infinite if vehicle i has received nothing from
-        vehicle j yet. In a world without periodic messages the age is 0, because vehicles know the present state. From
-        the time ``Vehicles.known_from_s`` on, vehicle i may use the received state.
+        The age is the time since the state was sampled. It is infinite if vehicle i has received nothing from vehicle j
+        yet, and 0 in a world without periodic messages, because vehicles know the present state. From the time
+        ``Vehicles.known_from_s`` on, vehicle i may use the received state.
         """
         age, periodic = np.zeros((len(time_s), self.vehicles, self.vehicles)), self.periodic
         if periodic.any():
@@ -366,9 +361,9 @@ def refuse_untold(
 ) -> None:
     """Raise ``InvalidInput`` if messages lack a quantity that the agent ``who`` needs to control ``vehicles``.
 
-    The agent needs messages of every vehicle in ``senders`` (None: of all vehicles), including the controlled vehicles
-    if it controls several. An agent that controls a single vehicle needs no message of this vehicle. ``needs``: the
-    quantities that these messages must contain. ``who``: name of the agent in the error message.
+    The agent needs the quantities ``needs`` in messages of every vehicle in ``senders`` (None: of all vehicles),
+    including the controlled vehicles if it controls several. An agent that controls a single vehicle needs no message
+    of this vehicle.
     """
     messages = Messages.of(worlds)
     for sender in (range(worlds.N) if senders is None else senders) if messages.says_contents else ():
@@ -413,14 +408,13 @@ def hear_rows(
     not keep this sample. If the physics cannot advance a world, the vehicles of this world receive nothing more.
 
     Args:
-        moving: states of the worlds, [n, S], one row per world in the layout of ``physics.columns``; updated.
+        moving: states of the worlds, [n, S], one row per world; updated.
         params: parameters of the worlds, one row per world; the message columns are updated.
         wanted: commands of the vehicles until ``until_s``, [n, N] m/s2.
         until_s: end times, [n] s.
         decision_s: time of the next decision, [n] s.
         time_step_s: time between two decisions, s.
-        pieces: start (s) and command (m/s2) of the K intervals of a fixed sequence of commands, [N, 2 K], the same for
-            all worlds; see ``Vehicles.pieces``.
+        pieces: braking profiles of the vehicles, [N, 2 K].
 
     """
     column = columns(moving)
@@ -451,17 +445,10 @@ def hear_rows(
 
 @compiled
 def _start(state: Floats, params: Floats, column: Columns, wanted: Floats) -> None:
-    """Begin the messages of one world at the alert; the function updates ``state`` and ``params``.
+    """Begin the messages of one world at the alert; update ``state`` and ``params``.
 
     The function sets the place of each vehicle along the road, stores the first sample of all states, and lets each
     vehicle measure the vehicles in sight.
-
-    Args:
-        state: state of the world, [S], in the layout of ``physics.columns``.
-        params: parameters of the world, in the layout of ``physics.columns``.
-        column: first column of each group of quantities in ``state`` and ``params``.
-        wanted: commands of the vehicles, [N] m/s2.
-
     """
     N, obstacle, gap, force = column.vehicles, column.obstacle, column.gap, column.command
     messages, place = params[column.messages :], PLACES_AT
@@ -481,10 +468,10 @@ def _start(state: Floats, params: Floats, column: Columns, wanted: Floats) -> No
 
 @compiled
 def _choose(params: Floats, column: Columns, wanted: Floats, time: float) -> None:
-    """Write the intents of all vehicles at ``time`` (s): the commands ``wanted`` that were chosen at the last decision.
+    """Write the intents of all vehicles at ``time``: the commands ``wanted``.
 
     If the V2X channel extends a vehicle's latency, the vehicle does not know of the emergency until the latency has
-    elapsed. Until the latency has elapsed, the intent of this vehicle is 0.
+    elapsed. Until then its intent is 0.
     """
     messages, N = params[column.messages :], column.vehicles
     if not has_contents(messages, N):
@@ -502,19 +489,9 @@ def _move(
 ) -> bool:  # fmt: skip
     """Advance one world, and the places of its vehicles, to the time ``end``; return whether this succeeded.
 
-    If the physics cannot advance the world, its state and the places of its vehicles are unchanged.
-
-    Args:
-        state: state of the world, [S], in the layout of ``physics.columns``; updated.
-        params: parameters of the world, in the layout of ``physics.columns``; the places of the vehicles are updated.
-        column: first column of each group of quantities in ``state`` and ``params``.
-        wanted: commands of the vehicles, [N] m/s2.
-        end: time to which the world is advanced, s.
-        pieces: start (s) and command (m/s2) of the K intervals of a fixed sequence of commands, [N, 2 K]; see
-            ``Vehicles.pieces``.
-        table: working memory in the layout of ``physics.rows``, with N + 1 columns; overwritten.
-        no_rows: empty array of impacts, [0, LISTED.WIDTH], so that no single impact is recorded.
-
+    If the physics cannot advance the world, ``state`` and ``params`` are unchanged. ``table`` is working memory in the
+    layout of ``physics.rows``, with N + 1 columns. ``no_rows`` [0, LISTED.WIDTH] is empty, so that no single impact is
+    recorded.
     """
     N, time = column.vehicles, state[column.time]
     speed, command, gap, obstacle = column.speed, column.command, column.gap, column.obstacle
@@ -555,11 +532,7 @@ def _move(
 
 @compiled
 def _sample(state: Floats, messages: Floats, column: Columns) -> None:
-    """Store a sample of every vehicle's state in the ring buffer, in place of the oldest sample.
-
-    ``state``: state of one world, [S]; ``messages``: message columns of this world, updated; ``column``: first column
-    of each group of quantities in ``state``.
-    """
+    """Store a sample of every vehicle's state in the ring buffer of ``messages``, in place of the oldest sample."""
     N, obstacle = column.vehicles, column.obstacle
     width, first = sample_width(messages, N), ring_at(messages, N)
     at = first + width * (int(messages[CHANNEL.TAKEN]) % ((messages.shape[0] - first) // width))
@@ -576,10 +549,7 @@ def _sample(state: Floats, messages: Floats, column: Columns) -> None:
 
 @compiled
 def _receive(time: float, messages: Floats, N: int) -> None:
-    """Receive all messages of one world that may be used at ``time`` (s), and measure the vehicles in sight.
-
-    ``messages``: message columns of the world, updated; ``N``: number of vehicles.
-    """
+    """Receive all messages that may be used at ``time``, and measure the vehicles in sight; update ``messages``."""
     for i in range(N):
         for j in range(N):
             link = link_at(i, j, N)
@@ -601,19 +571,11 @@ def _receive(time: float, messages: Floats, N: int) -> None:
 
 @compiled
 def _take(messages: Floats, link: int, sender: int, sent_s: float, N: int) -> int:
-    """Receive one message: copy the sender's state from the ring buffer to the link's columns.
+    """Receive one message: copy the sender's state from the ring buffer to the link with first column ``link``.
 
     The message contains the newest sample taken at ``sent_s`` or earlier. The function copies nothing if the receiver
-    already has a newer sample. The function returns the first column of the message's sample, or 0 if the ring buffer
-    no longer contains this sample.
-
-    Args:
-        messages: message columns of one world; updated.
-        link: first column of the link from the sender to the receiver, see ``link_at``.
-        sender: index of the sending vehicle, from 0.
-        sent_s: time at which the message is sent, s.
-        N: number of vehicles.
-
+    already has a newer sample. It returns the first column of the message's sample, or 0 if the ring buffer no longer
+    contains this sample.
     """
     width, first = sample_width(messages, N), ring_at(messages, N)
     length: int = (messages.shape[0] - first) // width

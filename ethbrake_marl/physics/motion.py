@@ -2,6 +2,16 @@
 
 Between events every gap is a quadratic function of time, so the formulas give the time of the next event exactly, and
 no event is missed. The formulas use only + - * / and sqrt, so a world's results have the same bits in any batch.
+
+Arguments that several functions share:
+
+- ``speed`` v: present speed, m/s; ``limit``: speed up to which the vehicle drives, m/s
+- ``command``: acceleration commanded, m/s2; negative brakes
+- ``duration``: length of the motion, s
+- ``gap`` g: present gap of a pair, m, at least 0
+- ``closing`` w, ``pressing`` b: present closing speed (m/s) and constant closing acceleration (m/s2), rear minus front
+- ``latency_left`` tau: time until the brakes act, s; ``capacity`` a: largest deceleration, m/s2
+- ``rate`` r: rate at which the brakes build up, m/s3; infinite if they act at once
 """
 
 from __future__ import annotations
@@ -33,9 +43,8 @@ ONSET_ROUNDING_S = 1e-9  # a latency that elapses this shortly before the end of
 def has_acted(latency_s: Any, time_s: Any) -> Any:
     """Return whether a command has taken effect before the end of a time interval; accepts numbers and arrays.
 
-    The result is True for a command that takes effect at the start of the interval. The result is False for a command
-    that would take effect exactly at the end of the interval, because the next decision replaces this command before it
-    acts.
+    The result is True for a command that takes effect at the start of the interval, and False for a command that would
+    take effect exactly at the end, because the next decision replaces this command before it acts.
 
     Args:
         latency_s: time from the start of the interval until the command takes effect, s; may be negative.
@@ -52,16 +61,10 @@ command_acts = compiled(has_acted)
 def contact(gap: float, closing: float, pressing: float) -> tuple[float, float]:
     """Return the time (s) and the closing speed (m/s) of a pair's first contact; ``(inf, 0)`` if there is no contact.
 
-    Let g be the gap, w the closing speed, b the closing acceleration, and ``D = w^2 + 2 b g``. If ``w > 0``, there is
+    With the gap g, the closing speed w and the closing acceleration b, let ``D = w^2 + 2 b g``. If ``w > 0``, there is
     no contact for ``D < 0``; otherwise the contact is at ``t = 2 g / (w + sqrt(D))``. If ``w <= 0``, there is a contact
     only for ``b > 0``, at ``t = (sqrt(D) - w) / b``. The closing speed at the contact is computed as ``sqrt(D)``,
     because ``w + b t``, which is mathematically equal, loses digits by cancellation.
-
-    Args:
-        gap: present gap g >= 0, m.
-        closing: present closing speed w (rear minus front), m/s.
-        pressing: constant closing acceleration b (rear minus front), m/s2.
-
     """
     if closing > 0.0:
         squared = closing * closing + 2.0 * pressing * gap
@@ -77,32 +80,17 @@ def contact(gap: float, closing: float, pressing: float) -> tuple[float, float]:
 
 @compiled
 def drift(gap: float, closing: float, pressing: float, duration: float) -> float:
-    """Return the gap (m) of a pair after the time t at a constant closing acceleration: ``g - (w + b t / 2) t``.
-
-    Args:
-        gap: present gap g, m.
-        closing: present closing speed w (rear minus front), m/s.
-        pressing: closing acceleration b (rear minus front), m/s2.
-        duration: time t, s.
-
-    """
+    """Return the gap (m) of a pair after the time t = ``duration``: ``g - (w + b t / 2) t``."""
     return gap - (closing + 0.5 * pressing * duration) * duration
 
 
 @compiled
 def speed_event(speed: float, acceleration: float, command: float, limit: float) -> tuple[float, float]:
-    """Return the time (s) until a vehicle next comes to rest or reaches its speed limit, and its speed at this time
-    (m/s).
+    """Return the time (s) until a vehicle next comes to rest or reaches its speed limit, and its speed (m/s) then.
 
     When the vehicle comes to rest, its brakes hold it there. The speed limit matters only if the command drives the
-    vehicle. If the vehicle neither comes to rest nor reaches the limit, the result is ``(inf, 0)``.
-
-    Args:
-        speed: present speed, m/s.
-        acceleration: constant acceleration, m/s2.
-        command: command in force, m/s2; positive drives.
-        limit: speed up to which the vehicle drives, m/s.
-
+    vehicle. If the vehicle neither comes to rest nor reaches the limit, the result is ``(inf, 0)``. ``acceleration`` is
+    constant, m/s2.
     """
     if acceleration == 0.0:
         return math.inf, 0.0
@@ -122,15 +110,9 @@ def speed_event(speed: float, acceleration: float, command: float, limit: float)
 def force_range(speed: float, command: float, limit: float) -> tuple[float, float]:
     """Return the acceleration (m/s2) by a vehicle's own brakes or engine for motion forward, and for motion backward.
 
-    The acceleration for motion forward and the acceleration for motion backward differ if the vehicle brakes at rest or
-    drives at its speed limit. The brakes of a vehicle at rest act against motion in either direction. A driving vehicle
-    at its speed limit uses only as much force as keeps it at this speed.
-
-    Args:
-        speed: present speed, m/s.
-        command: command in force, m/s2; negative brakes.
-        limit: speed up to which the vehicle drives, m/s.
-
+    The two accelerations differ if the vehicle brakes at rest or drives at its speed limit. The brakes of a vehicle at
+    rest act against motion in either direction. A driving vehicle at its speed limit uses only as much force as keeps
+    it at this speed.
     """
     if command < 0.0:
         if speed > 0.0:
@@ -166,16 +148,9 @@ def solo_motion(
 ) -> tuple[float, float, float]:
     """Move a vehicle without contact; return its final speed (m/s), distance travelled (m) and acceleration (m/s2).
 
-    The vehicle coasts until ``onset``. From ``onset`` on, the vehicle brakes until it is at rest, or drives up to the
-    speed limit. If the acceleration changes during the motion, the returned acceleration is NaN.
-
-    Args:
-        speed: present speed, m/s, at least 0.
-        command: command, m/s2; negative brakes.
-        onset: time from now until the command takes effect, s; 0 or less if it acts at once.
-        limit: speed up to which the vehicle drives, m/s.
-        duration: length of the motion, s.
-
+    The vehicle coasts until ``onset`` (s from now; 0 or less: the command acts at once). From ``onset`` on, the vehicle
+    brakes until it is at rest, or drives up to the speed limit. If the acceleration changes during the motion, the
+    returned acceleration is NaN. ``speed`` is at least 0.
     """
     way = 0.0
     steady = command
@@ -204,12 +179,6 @@ def stopping_distance(speed: float, latency_left: float, capacity: float) -> flo
 
     The vehicle coasts during the remaining latency and then brakes fully. If the vehicle does not move forward, the
     distance is 0.
-
-    Args:
-        speed: present speed v, m/s.
-        latency_left: time tau until the brakes act, s.
-        capacity: largest deceleration a, m/s2.
-
     """
     speed = max(speed, 0.0)
     return speed * latency_left + speed * speed / (2.0 * capacity)
@@ -223,13 +192,6 @@ def ramped_stopping_distance(speed: float, latency_left: float, capacity: float,
     ``v tau + v a / (2 r) - a^3 / (24 r^2) + v^2 / (2 a)``. If ``v < a^2 / (2 r)``, the vehicle stops before its brakes
     reach full force, and the distance is ``v tau + (2 / 3) v sqrt(2 v / r)``. If the vehicle does not move forward, the
     distance is 0.
-
-    Args:
-        speed: present speed v, m/s.
-        latency_left: time tau until the brakes act, s.
-        capacity: largest deceleration a, m/s2.
-        rate: rate r at which the brakes build up, m/s3; infinite if they act at once.
-
     """
     speed = max(speed, 0.0)
     if math.isinf(rate):
@@ -242,17 +204,7 @@ def ramped_stopping_distance(speed: float, latency_left: float, capacity: float,
 
 @compiled
 def stopping_distances(speed: Floats, latency_left: Floats, capacity: Floats, rate: Floats) -> Floats:
-    """Return the distance until each of n vehicles is at rest under full braking, [n] m.
-
-    The distance of each vehicle is computed by ``ramped_stopping_distance``.
-
-    Args:
-        speed: present speeds, [n] m/s.
-        latency_left: time until the brakes act, [n] s.
-        capacity: largest decelerations, [n] m/s2.
-        rate: rates at which brakes build up, [n] m/s3; infinite for brakes that act at once.
-
-    """
+    """Return the ``ramped_stopping_distance`` of each of n vehicles, [n] m."""
     distance = np.empty(len(speed))
     for k in range(len(speed)):
         distance[k] = ramped_stopping_distance(speed[k], latency_left[k], capacity[k], rate[k])

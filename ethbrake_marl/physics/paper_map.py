@@ -8,15 +8,13 @@ With the sampling period h, one step of a vehicle with command u, from sample n 
 where f(n) is the vehicle's speed after the impacts of sample n. If at a sample the gap of a pair is at most 0 and its
 closing speed is above 0, the speeds of the pair change by the paper's eq. (13). In the paper, f3 is the impact of
 Vehicles 2 and 3, and f1 the impact of Vehicles 1 and 2. For Vehicle 2, f is f1 applied after f3: first comes the impact
-with Vehicle 3, then the impact with Vehicle 1, which uses the speed that Vehicle 2 has after the first impact. Each
-impact changes the speeds of both its vehicles.
+with Vehicle 3, then the impact with Vehicle 1, which uses the speed that Vehicle 2 has after the first impact.
 
 The paper leaves some points open. This map resolves these points as follows:
 
 * The impact f1 starts from the speeds that result from the impact f3. The closing speed of the front impact, and its
-  harm (the square of this closing speed), therefore depend on the impact f3. The paper's formula of J_harm uses the
-  speeds before both impacts. The paper's formula and this map lead to different harms only if both pairs have an
-  impact at the same sample.
+  harm, therefore depend on the impact f3. The paper's formula of J_harm uses the speeds before both impacts. The
+  paper's formula and this map lead to different harms only if both pairs have an impact at the same sample.
 * The paper's formulas of f1 and f3 also change the speeds of overlapping vehicles that are separating, and would pull
   these vehicles together again. The paper's text below eq. (13) requires a positive relative velocity (closing speed).
   This map therefore changes speeds and counts harm only if the relative velocity is positive.
@@ -26,12 +24,16 @@ The paper leaves some points open. This map resolves these points as follows:
   a vehicle ends between two samples, its command takes effect at the later of these two samples.
 * In the paper ``0 <= v <= v_max`` is a constraint on u and not part of the map. This map limits the command of every
   vehicle so that the vehicle's speed satisfies the constraint at the next sample. An impact can leave a negative speed.
-  Setting a negative speed to 0 would violate conservation of momentum. The map therefore keeps the negative speed, and
-  the brakes bring it back to 0.
+  Setting it to 0 would violate conservation of momentum. The map therefore keeps the negative speed, and the brakes
+  bring it back to 0.
 
 The paper defines the map for N = 3. For any N, this map resolves each pair once per sample, from the rear pair to the
 front pair. A gap is negative while the vehicles of the pair overlap; nothing pushes the vehicles apart. Source: the
 paper, section "Optimization Problem".
+
+The kernels take fields of ``Worlds`` and ``Vehicles`` under short names, for example ``gaps`` for ``gaps_m``; ``k`` is
+the index of a world in all arrays. ``first_harm``, ``total_harm`` (m2/s2) and ``count`` are first-impact harm, harm and
+number of all impacts of each pair, [n, P]; the kernels add to them.
 """
 
 from __future__ import annotations
@@ -61,14 +63,14 @@ def exchange(
 ) -> tuple[float, float]:
     """Return the speeds (m/s) of the front and the rear vehicle of a pair after its impact, by the paper's eq. (13).
 
-    With the closing speed w = v_{i+1} - v_i: ``v_i+ = v_i + m_{i+1} (1 + e) w / (m_i + m_{i+1})`` and ``v_{i+1}+ =
-    v_{i+1} - m_i (1 + e) w / (m_i + m_{i+1})``.
+    With the closing speed w = v_{i+1} - v_i: ``v_i+ = v_i + m_{i+1} (1 + e) w / (m_i + m_{i+1})`` and
+    ``v_{i+1}+ = v_{i+1} - m_i (1 + e) w / (m_i + m_{i+1})``.
 
     Args:
         front_mps: speed v_i of the front vehicle, m/s.
         rear_mps: speed v_{i+1} of the rear vehicle, m/s.
-        front_t: mass m_i of the front vehicle, in tonnes (t).
-        rear_t: mass m_{i+1} of the rear vehicle, in tonnes (t).
+        front_t: mass m_i of the front vehicle, t.
+        rear_t: mass m_{i+1} of the rear vehicle, t.
         restitution: coefficient of restitution e, in [0, 1].
 
     """
@@ -81,23 +83,10 @@ def exchange_at_sample(
     k: int, gaps: Floats, speeds: Floats, mass: Floats, restitution: float, hit: Bools, first_harm: Floats,
     total_harm: Floats, count: Ints,
 ) -> None:  # fmt: skip
-    """Apply the impacts of world ``k`` at a sample, from the rear pair to the front pair; add the harm of these
-    impacts.
+    """Apply the impacts of world ``k`` at a sample, from the rear pair to the front pair, and add their harm.
 
-    As in ``advance``, the harm of an impact is the squared closing speed just before the impact. Contact with a closing
-    speed of at most ``TOUCH_SPEED_MPS`` is a touch, which does no harm.
-
-    Args:
-        k: index of the world in all arrays.
-        gaps: gaps of all pairs, [n, P] m.
-        speeds: speeds of all vehicles, [n, N] m/s; updated.
-        mass: masses of all vehicles, [n, N] tonnes (t).
-        restitution: coefficient of restitution of this world.
-        hit: whether each pair has had an impact, [n, P]; updated.
-        first_harm: first-impact harm, [n, P] m2/s2; updated.
-        total_harm: harm of all impacts, [n, P] m2/s2; updated.
-        count: number of impacts, [n, P]; updated.
-
+    As in ``advance``, contact with a closing speed of at most ``TOUCH_SPEED_MPS`` is a touch, which does no harm.
+    ``speeds`` and ``hit`` are updated.
     """
     for p in range(gaps.shape[1] - 1, -1, -1):
         closing = speeds[k, p + 1] - speeds[k, p]
@@ -121,13 +110,12 @@ def held_motion(speed: float, command: float, limit: float, step: float) -> tupl
     """Return speed (m/s) and distance (m) after a step of constant command: ``v + h u`` and ``h v + h^2 u / 2``.
 
     The command u is first limited so that the speed does not go beyond 0 or the speed limit within the step. The
-    distance is computed as h times the mean of the speeds at the start and the end of the step. For constant u this
-    distance is equal to ``h v + h^2 u / 2``. Brakes act against the motion, so they also bring a negative speed back to
-    0.
+    distance is computed as h times the mean of the speeds at the start and the end of the step, which for constant u is
+    equal to ``h v + h^2 u / 2``. Brakes act against the motion, so they also bring a negative speed back to 0.
 
     Args:
         speed: speed v at the start, m/s; may be negative after an impact.
-        command: command, m/s2; negative brakes.
+        command: command u, m/s2; negative brakes.
         limit: speed up to which the vehicle drives, m/s.
         step: length h of the step, s.
 
@@ -142,10 +130,7 @@ def held_motion(speed: float, command: float, limit: float, step: float) -> tupl
 
 @compiled
 def held_speeds(speeds: Floats, command: Floats, limit: Floats, step: float) -> Floats:
-    """Return the speeds after a step of constant command, [n, N] m/s; see ``held_motion``.
-
-    Speeds (m/s), commands (m/s2) and limits (m/s) are [n, N]; ``step`` is the length of the step in s.
-    """
+    """Return the speeds after a step of constant command, [n, N] m/s: ``held_motion`` of each vehicle."""
     after = np.empty(speeds.shape)
     for k in range(speeds.shape[0]):
         for i in range(speeds.shape[1]):
@@ -157,18 +142,9 @@ def held_speeds(speeds: Floats, command: Floats, limit: Floats, step: float) -> 
 def move_to_grid(
     k: int, duration: float, time: float, gaps: Floats, speeds: Floats, command: Floats, latency: Floats, limit: Floats
 ) -> None:
-    """Move world ``k`` exactly and without impacts, at a time before its first sample.
+    """Move world ``k`` exactly and without impacts for ``duration`` (s) from ``time`` (s), before its first sample.
 
-    Args:
-        k: index of the world in all arrays.
-        duration: length of the motion, s.
-        time: present time, s.
-        gaps: gaps of all pairs, [n, P] m; updated.
-        speeds: speeds of all vehicles, [n, N] m/s; updated.
-        command: commands of all vehicles, [n, N] m/s2.
-        latency: time before which commands have no effect, [n, N] s.
-        limit: speed up to which each vehicle drives, [n, N] m/s.
-
+    ``gaps`` and ``speeds`` are updated.
     """
     way_in_front = 0.0
     for i in range(speeds.shape[1]):
@@ -187,18 +163,14 @@ def sample_worlds(
 ) -> None:  # fmt: skip
     """Advance every world in place by the paper's fixed-step map, from sample ``first`` to sample ``last``.
 
-    Sample 0 is at the time at which the latency of Vehicle 2 has elapsed. Arguments that are not listed are fields of
-    ``Worlds`` and ``Vehicles`` under short names, for example ``gaps`` for ``gaps_m``. The function updates ``gaps``,
-    ``speeds``, ``time`` and ``hit``.
+    Sample 0 is at the time at which the latency of Vehicle 2 has elapsed. The function updates ``gaps``, ``speeds``,
+    ``time`` and ``hit``.
 
     - ``command``: commands, [n, N] m/s2.
     - ``until``: end times, [n] s; used only for a world whose end time is before sample 0.
     - ``step``: sampling period, s.
     - ``first``: number of the sample at which each world starts, [n]; -1 if it starts before sample 0.
     - ``last``: number of the sample at which each world ends, [n]; -1 if it ends before sample 0.
-    - ``first_harm``: first-impact harm, [n, P] m2/s2; updated.
-    - ``total_harm``: harm of all impacts, [n, P] m2/s2; updated.
-    - ``count``: number of impacts, [n, P]; updated.
     """
     for k in range(speeds.shape[0]):
         start = latency[k, 1]
@@ -230,8 +202,8 @@ def advance_sampled(
     The first sample is at the time at which the latency of Vehicle 2 has elapsed; samples are ``step_s`` apart. A world
     ends at the first of its samples at or after ``until_s``, or at ``until_s`` itself if ``until_s`` is before the
     first sample. The returned state is the paper's s(n), the state before the impacts of the last sample. The next call
-    applies the impacts of the last sample, so the result can be passed to this function again. ``Impacts.rows`` is
-    None. The result of a world does not depend on the other worlds.
+    applies these impacts, so the result can be passed to this function again. ``Impacts.rows`` is None. The result of a
+    world does not depend on the other worlds.
 
     Gaps of the result may be negative. Advance worlds with negative gaps with this function and not with ``advance``.
 
@@ -265,16 +237,10 @@ def advance_sampled(
 
 
 def sample_on(worlds: Worlds, command: Floats, until: Floats, step_s: float) -> Impacts:
-    """Advance ``worlds`` in place by the paper's fixed-step map, without checks, and return the impacts.
+    """Advance ``worlds`` in place as ``advance_sampled`` does, without checks, and return the impacts.
 
-    The function works like ``advance_sampled`` but does not update ``command_mps2`` of the worlds.
-
-    Args:
-        worlds: n worlds of N vehicles; updated.
-        command: commanded accelerations, [n, N] m/s2.
-        until: end times since the alert, [n] s.
-        step_s: sampling period, s.
-
+    The function does not update ``command_mps2`` of the worlds. ``command`` is [n, N] m/s2; ``until`` are end times
+    since the alert, [n] s.
     """
     vehicles = worlds.vehicles
     start = vehicles.latency_s[:, 1]
@@ -291,10 +257,7 @@ def sample_on(worlds: Worlds, command: Floats, until: Floats, step_s: float) -> 
 
 
 def _refuse_unsampled(worlds: Worlds, until: Floats, step_s: float) -> None:
-    """Raise ``InvalidInput`` for a sampling period, an end time or a state that the fixed-step map does not allow.
-
-    ``until``: end times, [n] s; ``step_s``: sampling period, s.
-    """
+    """Raise ``InvalidInput`` for a sampling period, an end time or a state that the fixed-step map does not allow."""
     if not (SHORTEST_STEP_S <= step_s < math.inf):
         raise InvalidInput(f"step_s = {step_s:g}: must be finite and at least {SHORTEST_STEP_S:g} s")
     good = (until >= worlds.time_s) & (until <= worlds.time_s + MOST_STEPS * step_s)

@@ -3,6 +3,8 @@
 The constants of ``ROW`` name the rows: ``table[ROW.SPEED, i]`` is the speed of vehicle i. In a row for pairs, column p
 belongs to the pair (vehicle p, vehicle p + 1). If there is an obstacle ahead, the obstacle is in column 0 and vehicle i
 is in column i + 1.
+
+A vehicle *brakes in pieces* if it follows a fixed sequence of commands (``Vehicles.pieces``).
 """
 
 from __future__ import annotations
@@ -101,13 +103,9 @@ class _Flags(NamedTuple):
     STUCK: int = 3  # failure: more than BOUND.MOST_EVENTS events
 
     def failure(self, status: Ints, from_s: Floats, until_s: Floats) -> PhysicsError:
-        """Return the error that lists every world whose status is not DONE.
+        """Return the error that lists every world whose ``status`` [n] is not DONE.
 
-        Args:
-            status: status code of each world (a constant of ``FLAG``), [n].
-            from_s: start of each world's segment, [n] s, for the error message.
-            until_s: end of each world's segment, [n] s, for the error message.
-
+        ``from_s`` and ``until_s`` [n] are start and end (s) of each world's segment, for the error message.
         """
         reasons = {
             self.PENETRATED: "a contact was missed",
@@ -142,36 +140,31 @@ LISTED = _Listed()
 
 @compiled(bare=True)
 def builds_up(table: Floats) -> bool:
-    """Return whether brakes build up at a finite rate, or a vehicle follows a fixed sequence of commands.
-
-    ``table``: one world in the layout of ``_Rows``.
-    """
+    """Return whether brakes build up at a finite rate, or a vehicle brakes in pieces."""
     return bool(table.shape[0] > ROW.OF_EPISODE and table[ROW.BUILDS_UP, 0] == 1.0)
 
 
 @compiled
 def rows_for(pieces: int) -> int:
-    """Return the number of rows of a table for vehicles that follow K commands, one after the other.
+    """Return the number of rows of a table for vehicles that brake in K pieces; ``pieces`` is 2 K.
 
-    ``pieces`` is 2 K, the number of starts and commands. If ``pieces`` is 0, no vehicle follows a fixed sequence of
-    commands, and the result is ROW.OF_BUILD_UP.
+    If ``pieces`` is 0, the result is ROW.OF_BUILD_UP.
     """
     return ROW.PIECES + pieces if pieces > 0 else ROW.OF_BUILD_UP
 
 
 @compiled(bare=True)
 def place_rates(table: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats) -> None:
-    """Write brake rates, release rates and sequences of commands of one world's vehicles into its table.
+    """Write brake rates, release rates and pieces of one world's vehicles into its table.
 
-    If all rates are infinite and no vehicle follows a fixed sequence of commands, the function sets the entry BUILDS_UP
-    to 0, and the rows of forces are not used. If a rate is finite or a vehicle follows a fixed sequence of commands,
-    the function sets BUILDS_UP to 1.
+    The function sets the entry BUILDS_UP to 1 if a rate is finite or a vehicle brakes in pieces. Otherwise it sets
+    BUILDS_UP to 0, and the rows of forces are not used.
 
     Args:
         table: table to fill, [rows_for(2 K), N or N + 1]; with N + 1 columns, column 0 is an obstacle.
-        brake_rate: rate at which each vehicle's force falls, [N] m/s3; infinite if the force falls at once.
-        release_rate: rate at which each vehicle's force rises, [N] m/s3; infinite if the force rises at once.
-        pieces: starts (s) and commands (m/s2) of each vehicle's K commands, [N, 2 K], as in ``Vehicles.pieces``.
+        brake_rate: rate at which each vehicle's force falls, [N] m/s3; infinite: at once.
+        release_rate: rate at which each vehicle's force rises, [N] m/s3; infinite: at once.
+        pieces: starts (s) and commands (m/s2), [N, 2 K], as in ``Vehicles.pieces``.
 
     """
     at, least = table.shape[1] - brake_rate.shape[0], math.inf
@@ -192,10 +185,10 @@ def place_rates(table: Floats, brake_rate: Floats, release_rate: Floats, pieces:
 def place_forces(
     table: Floats, force: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats
 ) -> None:  # fmt: skip
-    """Write brake and release rates, sequences of commands and present forces of one world's vehicles into its table.
+    """Write brake and release rates, pieces and present forces of one world's vehicles into its table.
 
-    ``force``: present acceleration by brakes or engine, [N] m/s2. The other arguments are the same as in
-    ``place_rates``. If ``place_rates`` sets the entry BUILDS_UP to 0, the function writes no forces.
+    ``force`` is [N] m/s2; the other arguments are as in ``place_rates``. If ``place_rates`` sets the entry BUILDS_UP to
+    0, the function writes no forces.
     """
     place_rates(table, brake_rate, release_rate, pieces)
     if table[ROW.BUILDS_UP, 0] == 1.0:
@@ -207,11 +200,7 @@ def place_forces(
 def place_obstacle(table: Floats, gap: float, hit: float) -> None:
     """Write an obstacle into column 0 of a new table; speed and command of the obstacle stay 0.
 
-    Args:
-        table: table of one world to fill, in the layout of ``physics.rows``.
-        gap: gap from the obstacle to Vehicle 1, m.
-        hit: 1 if Vehicle 1 has already had an impact with the obstacle, else 0.
-
+    ``gap`` is the gap to Vehicle 1, m. ``hit`` is 1 if Vehicle 1 has already had an impact with the obstacle, else 0.
     """
     table[ROW.MASS, 0] = math.inf
     table[ROW.GAP, 0] = gap

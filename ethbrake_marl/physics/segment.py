@@ -1,4 +1,13 @@
-"""Compiled motion of one world through a segment (an interval of constant commands), from event to event."""
+"""Compiled motion of one world through a segment (an interval of constant commands), from event to event.
+
+Arguments that several functions share:
+
+- ``table``: the world in the layout of ``physics.rows``; it is advanced
+- ``restitution``: coefficient of restitution of every impact
+- ``duration``: length of the segment, s
+- ``now``: present time, counted from the start of the segment, s
+- ``building``: result of ``builds_up``: whether brakes build up or a vehicle follows a fixed sequence of commands
+"""
 
 from __future__ import annotations
 
@@ -27,18 +36,9 @@ def advance_table(
     """Advance one world through a segment; return the number of recorded impacts and a status (DONE if successful).
 
     The function writes the harm of the segment to the rows FIRST_HARM and TOTAL_HARM, and the number of impacts to row
-    COUNT.
-
-    Args:
-        table: the world in the layout of ``physics.rows``; it is advanced.
-        restitution: coefficient of restitution of every impact.
-        duration: length of the segment, s.
-        start_s: absolute time at the start of the segment, s; used to write the times of impacts into ``rows``.
-        world: index of the world, written into ``rows``.
-        rows: array to which the impacts are written, [capacity, LISTED.WIDTH]; if the array is full, further impacts
-            are counted but not written.
-        recorded: number of impacts that were recorded before this segment.
-
+    COUNT. It writes single impacts into ``rows`` like ``impact.record_impacts``; ``start_s`` is the absolute time at
+    the start of the segment, s, ``world`` the index of the world, and ``recorded`` the number of impacts before this
+    segment.
     """
     if builds_up(table):
         return advance_on_cubics(table, restitution, duration, start_s, world, rows, recorded)
@@ -49,10 +49,7 @@ def advance_table(
 def advance_on_cubics(
     table: Floats, restitution: float, duration: float, start_s: float, world: int, rows: Floats, recorded: int
 ) -> tuple[int, int]:
-    """Do the work of ``advance_table`` if brakes build up or a vehicle follows a fixed sequence of commands.
-
-    The arguments and the result are the same as in ``advance_table``.
-    """
+    """Do the work of ``advance_table`` if brakes build up or a vehicle follows a fixed sequence of commands."""
     for i in range(table.shape[1]):
         if not command_acts(table[ROW.ONSET, i], duration):
             table[ROW.ONSET, i] = max(table[ROW.ONSET, i], duration)
@@ -64,11 +61,7 @@ def _advance(
     table: Floats, restitution: float, duration: float, start_s: float, world: int, rows: Floats, recorded: int,
     building: bool,
 ) -> tuple[int, int]:  # fmt: skip
-    """Do the work of ``advance_table`` for brakes that act at once or build up, with the same arguments and result.
-
-    The argument ``building`` says whether brakes build up. Callers pass a constant, so numba compiles only the code for
-    the value that they pass.
-    """
+    """Do the work of ``advance_table``; callers pass a constant ``building``, so numba compiles only that case."""
     for p in range(table.shape[1] - 1):
         table[ROW.FIRST_HARM, p] = 0.0
         table[ROW.TOTAL_HARM, p] = 0.0
@@ -93,12 +86,6 @@ def move_apart(table: Floats, duration: float, building: bool) -> bool:
     their contact is computed exactly. If the acceleration of one of the vehicles changes, the function uses an upper
     bound of the decrease of the gap. Without contact, the speed of a vehicle only rises or only falls within a segment
     of length T. A gap therefore shrinks by at most ``(max rear speed - min front speed) T``.
-
-    Args:
-        table: the world in the layout of ``physics.rows``.
-        duration: length T of the segment, s.
-        building: result of ``builds_up``: whether brakes build up or a vehicle follows a fixed sequence of commands.
-
     """
     if building:
         return move_apart_on_cubics(table, duration)
@@ -131,13 +118,7 @@ def move_apart(table: Floats, duration: float, building: bool) -> bool:
 
 @compiled(bare=True)
 def start_events(table: Floats, building: bool) -> None:
-    """Prepare a world for ``to_next_impact`` at the start of a segment: mark the commands that are already in effect.
-
-    Args:
-        table: the world in the layout of ``physics.rows``.
-        building: result of ``builds_up``: whether brakes build up or a vehicle follows a fixed sequence of commands.
-
-    """
+    """Prepare a world for ``to_next_impact`` at the start of a segment: mark the commands that are in effect."""
     for i in range(table.shape[1]):
         table[ROW.ACTIVE, i] = 1.0 if table[ROW.ONSET, i] <= 0.0 else 0.0
         table[ROW.CONTACT_SPEED, i] = 0.0
@@ -151,14 +132,6 @@ def to_next_impact(table: Floats, restitution: float, now: float, duration: floa
 
     Returns a status code of ``FLAG`` and the time reached (s, from the start of the segment). The status is IMPACT if
     impacts were resolved (then call the function again), DONE at the end of the segment, or the code of a failure.
-
-    Args:
-        table: the world in the layout of ``physics.rows``; it is advanced.
-        restitution: coefficient of restitution of every impact.
-        now: present time, counted from the start of the segment, s.
-        duration: length of the segment, s.
-        building: result of ``builds_up``: whether brakes build up or a vehicle follows a fixed sequence of commands.
-
     """
     for _ in range(BOUND.MOST_EVENTS):
         if resolve_impacts(table, restitution):
@@ -177,13 +150,6 @@ def to_next_event(table: Floats, now: float, duration: float, building: bool) ->
 
     The first result is False if a gap became negative, which means that a contact was missed. The time is counted from
     the start of the segment.
-
-    Args:
-        table: the world in the layout of ``physics.rows``; it is advanced.
-        now: present time, counted from the start of the segment, s.
-        duration: length of the segment, s.
-        building: result of ``builds_up``: whether brakes build up or a vehicle follows a fixed sequence of commands.
-
     """
     if building and not built_up(table):
         passed = next_moving_event(table, now, duration, accelerate_moving(table))
@@ -200,17 +166,9 @@ def to_next_event(table: Floats, now: float, duration: float, building: bool) ->
 
 @compiled(bare=True)
 def begin_commands(table: Floats, now: float, passed: float, building: bool) -> None:
-    """Put into effect the commands that begin between ``now`` and ``now + passed``.
+    """Put into effect the commands that begin between ``now`` and ``now + passed`` (s).
 
-    For a vehicle that follows a fixed sequence of commands, the function also starts the next command of the sequence
-    if this command begins in the interval.
-
-    Args:
-        table: the world in the layout of ``physics.rows``.
-        now: start of the interval, counted from the start of the segment, s.
-        passed: length of the interval, s.
-        building: result of ``builds_up``: whether brakes build up or a vehicle follows a fixed sequence of commands.
-
+    This includes the next command of a vehicle that follows a fixed sequence of commands.
     """
     for i in range(table.shape[1]):
         if table[ROW.ONSET, i] - now <= passed:

@@ -10,6 +10,8 @@ L    learners
 F    features of an observation
 ===  =========================================================
 
+A *braking profile* is a fixed sequence of commands that one vehicle follows (``Vehicles.pieces``).
+
 Worlds store gaps and not absolute positions, because positions would lose precision as the line moves on.
 """
 
@@ -43,8 +45,8 @@ _ON_ROADS = ("braking_capacity_mps2", "driving_capacity_mps2")  # limited by fri
 def as_road_allows(quantities: Mapping[str, Floats], friction: Floats) -> dict[str, Floats]:
     """Return a copy of ``quantities`` with braking and driving capacities limited to ``friction * GRAVITY_MPS2``.
 
-    ``quantities`` maps field names such as ``braking_capacity_mps2`` to arrays; ``friction`` is broadcast to the shape
-    of these arrays. Entries other than capacities are unchanged.
+    ``quantities`` maps field names such as ``braking_capacity_mps2`` to arrays; ``friction`` is broadcast to their
+    shape.
     """
     most = friction * GRAVITY_MPS2
     return {key: np.minimum(value, most) if key in _ON_ROADS else value for key, value in quantities.items()}
@@ -52,7 +54,7 @@ def as_road_allows(quantities: Mapping[str, Floats], friction: Floats) -> dict[s
 
 @dataclass(frozen=True, slots=True)
 class Vehicles:
-    """Parameters of the vehicles of ``n`` worlds; the parameters do not change during an episode."""
+    """Parameters of the vehicles of ``n`` worlds, constant during an episode."""
 
     braking_capacity_mps2: Floats  # [n, N] largest deceleration, > 0
     driving_capacity_mps2: Floats  # [n, N] largest forward acceleration, >= 0
@@ -78,7 +80,7 @@ class Vehicles:
         return f"Vehicles({count_of(n, 'world')} of {N}, masses {_span(self.mass_t)} t)"
 
     def take(self, rows: ArrayLike) -> Vehicles:
-        """Return a copy of the parameters of the worlds that ``rows`` selects (indices, or a mask [n])."""
+        """Return a copy of the parameters of the worlds that ``rows`` selects, as in ``Worlds.take``."""
         index = np.asarray(rows)
         return _combined(lambda column: np.ascontiguousarray(column[index]), self)
 
@@ -99,8 +101,7 @@ class Vehicles:
         """Return parameters of vehicles without a V2X channel: each knows everything once its latency has elapsed.
 
         Shapes and units are as in the fields of this class. If a rate is None, the acceleration reaches a new command
-        at once. If ``pieces`` is None, no vehicle follows a fixed sequence of commands. If ``harm_weight`` is None,
-        every weight of harm is 1.
+        at once. If ``pieces`` is None, no vehicle has a braking profile. If ``harm_weight`` is None, every weight is 1.
         """
         known = cls.known_at_once(latency_s)
         at_once = np.full(mass_t.shape, np.inf)
@@ -116,8 +117,8 @@ class Vehicles:
     def known_at_once(latency_s: Floats) -> Floats:
         """Return the field ``known_from_s`` [n, N, N] of vehicles without a V2X channel, from their latencies [n, N] s.
 
-        Without a channel vehicle i acts on news of every vehicle once the latency of vehicle i has elapsed. The result
-        is a read-only view of ``latency_s``; the last axis has stride 0, so the result takes no memory of its own.
+        Without a channel vehicle i acts on news of every vehicle once its own latency has elapsed. The result is a
+        read-only view of ``latency_s``; the last axis has stride 0, so the result takes no memory of its own.
         """
         latency = np.ascontiguousarray(latency_s, np.float64)
         (n, N), size = latency.shape, latency.itemsize
@@ -127,24 +128,19 @@ class Vehicles:
 
     @property
     def build_up(self) -> Bools:
-        """For each world, whether any vehicle has a finite brake or release rate, or follows a braking profile, [n]."""
+        """For each world, whether any vehicle has a finite brake or release rate, or a braking profile, [n]."""
         rates = np.minimum(self.brake_rate_mps3, self.release_rate_mps3)
         return np.asarray(np.isfinite(rates).any(axis=1) | self.in_pieces)
 
     @property
     def in_pieces(self) -> Bools:
-        """For each world, whether any vehicle follows a braking profile (a fixed sequence of commands), [n]."""
+        """For each world, whether any vehicle has a braking profile, [n]."""
         return np.asarray(np.isfinite(self.pieces).any(axis=(1, 2)))
 
     def piece_commands(self, command_mps2: Floats, time_s: Floats) -> Floats:
-        """Return the commands of all vehicles at ``time_s``, [n, N] m/s2, including commands from braking profiles.
+        """Return the commands of all vehicles at the absolute time ``time_s`` [n], [n, N] m/s2.
 
-        A vehicle with a braking profile (a fixed sequence of commands) has the command of its profile at ``time_s``.
-
-        Args:
-            command_mps2: commands of all vehicles, [n, N] m/s2; used for vehicles without a braking profile.
-            time_s: absolute time in each world, [n] s.
-
+        The commands are those of the braking profiles, and ``command_mps2`` for vehicles without a braking profile.
         """
         command, count = command_mps2, self.pieces.shape[2] // 2
         for piece in range(count):
@@ -156,10 +152,9 @@ class Vehicles:
     def hide_from(self, vehicle: int) -> Bools:
         """Return for each world whether a V2X channel hides information from ``vehicle`` at its first decision, [n].
 
-        ``vehicle`` is an index from 0. The channel hides information if news of another vehicle has not arrived by the
-        first decision of ``vehicle``. The channel also hides information if it extends the latency of another vehicle,
-        because messages report the latency of that vehicle without the extension. If there is no channel, the result is
-        False.
+        The channel hides information if news of another vehicle has not arrived by the first decision of ``vehicle``,
+        or if the channel extends the latency of another vehicle, because messages report that latency without the
+        extension.
         """
         late = self.latency_s > self.own_latency_s
         hidden = (self.known_from_s[:, vehicle] > self.latency_s[:, [vehicle]]) | late
@@ -176,10 +171,7 @@ class Vehicles:
 
     @property
     def _is_view(self) -> bool:
-        """Whether ``own_latency_s`` and ``known_from_s`` share the memory of ``latency_s``.
-
-        In the result of ``at_once`` these fields share memory.
-        """
+        """Whether ``own_latency_s`` and ``known_from_s`` share the memory of ``latency_s`` (see ``at_once``)."""
         latency, news = self.latency_s, self.known_from_s
         return self.own_latency_s is latency and news.base is latency and news.strides[1:] == (latency.itemsize, 0)
 
@@ -233,15 +225,14 @@ class Worlds:
     def _each(self, change: Callable[..., NDArray[Any]], *others: Worlds) -> Worlds:
         """Return new worlds with ``change`` applied to each field: ``change(field of self, field of others[0], ...)``.
 
-        ``change`` is called with one array per batch of worlds. ``change`` returns one array, with selected or joined
-        rows.
+        ``change`` returns one array, with selected or joined rows.
         """
         parts = (self, *others)
         columns = (change(*(getattr(w, name) for w in parts)) for name in _OF_WORLDS)
         return Worlds(_combined(change, *(w.vehicles for w in parts)), *columns)
 
     def copy(self) -> Worlds:
-        """Return a copy of the state in new memory; the copy shares ``vehicles``, which do not change."""
+        """Return a copy of the state in new memory; the copy shares ``vehicles``."""
         return Worlds(self.vehicles, *(getattr(self, name).copy() for name in _OF_WORLDS))
 
     def take(self, rows: ArrayLike) -> Worlds:
@@ -251,7 +242,7 @@ class Worlds:
 
     @staticmethod
     def concatenate(parts: Sequence[Worlds]) -> Worlds:
-        """Join the batches ``parts`` in this order into one batch; all parts must have the same number of vehicles."""
+        """Join ``parts`` in this order into one batch; all parts must have the same number of vehicles."""
         parts = _alike(parts)
         return parts[0]._each(lambda *columns: np.concatenate(columns), *parts[1:])
 
@@ -309,8 +300,8 @@ class Worlds:
     def on_road(self, friction: Floats, dry: Mapping[str, Floats] | None = None) -> Worlds:
         """Return these worlds on a road with this ``friction`` [n]; capacities are at most ``friction * GRAVITY_MPS2``.
 
-        ``dry``: new capacities on a dry road, a dictionary from field name to [n, N] m/s2, for example
-        ``{"braking_capacity_mps2": array}``. Capacities on a dry road that are missing from ``dry`` do not change.
+        ``dry`` maps field names to new capacities on a dry road, [n, N] m/s2, for example
+        ``{"braking_capacity_mps2": array}``. Capacities that are missing from ``dry`` do not change on a dry road.
         """
         on_dry = {name: self.dry(name) for name in _ON_ROADS} | dict(dry or {})
         vehicles = replace(self.vehicles, **as_road_allows(on_dry, friction[:, np.newaxis]))
@@ -332,11 +323,11 @@ class Worlds:
         return value
 
     def play_pieces(self, pieces: Mapping[int, Sequence[tuple[float, float]]]) -> Worlds:
-        """Return these worlds with braking profiles for the vehicles in ``pieces``.
+        """Return these worlds with braking profiles (fixed sequences of commands) for the vehicles in ``pieces``.
 
-        A braking profile is a fixed sequence of commands. ``pieces`` maps a vehicle (index from 0) to a sequence of
-        pairs (start, deceleration), one for each command. The start is in s after the vehicle's latency; the first
-        start is 0. The deceleration is in m/s2. A vehicle whose sequence has a single pair gets no profile.
+        ``pieces`` maps a vehicle (index from 0) to a sequence of pairs (start, deceleration), one for each command. The
+        start is in s after the vehicle's latency, and the first start is 0. The deceleration is in m/s2. A vehicle
+        whose sequence has a single pair gets no profile.
         """
         several = {i: np.array(each, np.float64) for i, each in pieces.items() if len(each) > 1}
         if not several and not self.vehicles.pieces.shape[2]:
@@ -348,10 +339,10 @@ class Worlds:
         return replace(self, vehicles=replace(self.vehicles, pieces=commands.reshape(self.n, self.N, 2 * most)))
 
     def refuse_build_up(self, who: str) -> None:
-        """Raise ``InvalidInput`` if any vehicle has a finite brake or release rate, or follows a braking profile.
+        """Raise ``InvalidInput`` if any vehicle has a finite brake or release rate, or a braking profile.
 
-        A function calls this check if its results are not exact for finite rates or braking profiles. ``who``: name of
-        the calling function in the error message.
+        A function whose result would not be exact in these cases calls this check. ``who`` is its name in the error
+        message.
         """
         slow = self.vehicles.build_up
         if self.vehicles.in_pieces.any():
@@ -421,12 +412,11 @@ class Worlds:
     def with_post_ahead(self, duration_s: Floats) -> Worlds:
         """Return these worlds; a world without an obstacle gets one that no vehicle reaches within ``duration_s`` [n].
 
-        The change of the gap to an added obstacle is the distance that Vehicle 1 travels; worlds do not store this
-        distance. An added obstacle changes no motion, because its gap is larger than ``T sqrt(2 E / m_1)``. The
-        distance ``T sqrt(2 E / m_1)`` is what Vehicle 1, of mass m_1, would travel in the time T if it had all the
-        energy E that the line can have within T. Impacts and brakes only remove energy. A vehicle of mass m that drives
-        at the speed v with the acceleration a adds at most the energy ``m a v`` per second, and only up to the speed
-        limit.
+        The change of the gap to an added obstacle is the distance that Vehicle 1 travels, which worlds do not store. An
+        added obstacle changes no motion, because its gap is larger than ``T sqrt(2 E / m_1)``: the distance that
+        Vehicle 1, of mass m_1, would travel in the time T if it had all the energy E that the line can have within T.
+        Impacts and brakes only remove energy. A vehicle of mass m that drives at the speed v with the acceleration a
+        adds at most the energy ``m a v`` per second, and only up to the speed limit.
         """
         vehicles = self.vehicles
         driving = vehicles.driving_capacity_mps2 * vehicles.speed_limit_mps * duration_s[:, np.newaxis]
@@ -436,10 +426,10 @@ class Worlds:
 
 
 def _alike(parts: Sequence[Worlds]) -> Sequence[Worlds]:
-    """Return the batches ``parts`` with arrays of equal width, so that the batches can be joined.
+    """Return the batches ``parts`` with arrays of equal width, so that they can be joined.
 
-    In all batches, the array ``Vehicles.pieces`` (fixed sequences of commands) gets the width of the widest of these
-    arrays. If some batches model the friction of the road, the other batches get infinite friction.
+    All batches get the width of the widest array ``Vehicles.pieces``. If some batches model the friction of the road,
+    the others get infinite friction.
     """
     most = max(part.vehicles.pieces.shape[2] for part in parts)
     if any(part.vehicles.pieces.shape[2] < most for part in parts):
@@ -452,10 +442,9 @@ def _alike(parts: Sequence[Worlds]) -> Sequence[Worlds]:
 
 
 def _padded(pieces: Floats, most: int) -> Floats:
-    """Return ``pieces`` [n, N, 2 K], extended by infinite entries to the shape [n, N, most].
+    """Return ``pieces`` [n, N, 2 K] as [n, N, most], with infinite starts and commands for the missing pieces.
 
-    A piece is a time interval of constant command; its two entries are its start and its command. Infinite entries
-    stand in the places of pieces that a vehicle does not have. ``most`` is even.
+    ``most`` is even.
     """
     n, N, width = pieces.shape
     halves = pieces.reshape(n, N, 2, width // 2)
@@ -484,9 +473,8 @@ def _span(values: Floats) -> str:
 def _combined(change: Callable[..., NDArray[Any]], *parts: Vehicles) -> Vehicles:
     """Return new vehicles with ``change`` applied to each field: ``change(field of parts[0], field of parts[1], ...)``.
 
-    ``change`` is called with one array per entry of ``parts``. ``change`` returns one array, with selected or joined
-    rows. If no entry of ``parts`` has a V2X channel, ``latency_s``, ``own_latency_s`` and ``known_from_s`` of the
-    result share memory, as in the result of ``at_once``.
+    ``change`` returns one array, with selected or joined rows. If no entry of ``parts`` has a V2X channel,
+    ``latency_s``, ``own_latency_s`` and ``known_from_s`` of the result share memory, as in the result of ``at_once``.
     """
     at_once = all(part._is_view for part in parts)
     columns = [
@@ -509,9 +497,8 @@ def sum_rows(values: Floats) -> Floats:
 def real_numbers(value: ArrayLike) -> Floats:
     """Return ``value`` as float64, without a copy if it is a float64 array already.
 
-    Raises ``ValueError``, with the reason as its text, for a value that is not numeric. The function also refuses some
-    values that numpy would convert: booleans, masked entries, texts, and tensors that need gradients or are on another
-    device.
+    Raises ``ValueError``, with the reason as its text, for a value that is not numeric, and for some values that numpy
+    would convert: booleans, masked entries, texts, and tensors that need gradients or are on another device.
     """
     if type(value) is np.ndarray and value.dtype.kind in "fiu":
         return np.asarray(value, np.float64)
@@ -570,21 +557,20 @@ def make_worlds(
         braking_capacity_mps2: largest deceleration, m/s2, broadcast to [n, N].
         driving_capacity_mps2: largest forward acceleration, m/s2, broadcast to [n, N].
         latency_s: time before which commands have no effect, s, broadcast to [n, N].
-        mass_t: masses of the vehicles in tonnes (t), broadcast to [n, N].
+        mass_t: masses, tonnes, broadcast to [n, N].
         restitution: coefficient of restitution of every impact, in [0, 1], broadcast to [n].
         speed_limit_mps: speed up to which a vehicle drives, m/s, broadcast to [n, N].
-        brake_rate_mps3: rate at which a vehicle's acceleration falls to a lower command, m/s3, broadcast to [n, N];
-            inf: the acceleration falls at once.
-        release_rate_mps3: rate at which a vehicle's acceleration rises to a higher command, m/s3, broadcast to [n, N];
-            inf: the acceleration rises at once.
+        brake_rate_mps3: rate at which the acceleration falls to a lower command, m/s3, broadcast to [n, N]; inf: at
+            once.
+        release_rate_mps3: rate at which the acceleration rises to a higher command, m/s3, broadcast to [n, N]; inf: at
+            once.
         obstacle_gap_m: gap from Vehicle 1 to an obstacle ahead, m, broadcast to [n]; None: no obstacle.
         friction: friction coefficient of the road, broadcast to [n]; braking and driving capacities are at most
             ``friction * GRAVITY_MPS2``. None: no limit.
-        harm_weight: weight of each vehicle's harm in the objective ``preference``, at least 0, broadcast to [n, N]; in
-            each world the weight of one vehicle or more must be at least ``LEAST_WEIGHT``.
+        harm_weight: weight of each vehicle's harm in the objective ``preference``, at least 0, broadcast to [n, N]; at
+            least one vehicle of each world needs a weight of ``LEAST_WEIGHT`` or more.
 
-    Raises ``InvalidInput`` for an invalid value; the error names the field, its first invalid entry and the valid
-    range.
+    Raises ``InvalidInput`` with the field, its first invalid entry and the valid range.
 
     """
     speeds = np.atleast_2d(checked_numbers("speeds_mps", speeds_mps))
@@ -643,17 +629,10 @@ def _full(
     open_low: bool = False,
     finite: bool = True,
 ) -> Floats:
-    """Return a new array with ``value`` broadcast to ``shape``; raise ``InvalidInput`` for an entry out of range.
+    """Return a new array, ``value`` broadcast to ``shape``; raise ``InvalidInput`` for an entry outside [low, high].
 
-    Args:
-        name: name of the field, for the error message.
-        value: number or array to broadcast.
-        shape: shape of the result.
-        low: smallest valid entry.
-        high: largest valid entry.
-        open_low: True if an entry equal to ``low`` is invalid.
-        finite: True if an infinite entry is invalid.
-
+    ``open_low`` makes ``low`` itself invalid, ``finite`` makes infinite entries invalid. ``name`` is the field in the
+    error message.
     """
     numbers = checked_numbers(name, value)
     try:

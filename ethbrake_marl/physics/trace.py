@@ -23,16 +23,9 @@ _CAPACITY = 64
 def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) -> int:
     """Write the state at the start of each interval of constant jerk into ``rows``; return the number of intervals.
 
-    The state consists of time, gaps, speeds, accelerations and jerks. If ``rows`` is full, further intervals are
-    counted but not written. If a contact was missed, the returned number of intervals is negative.
-
-    Args:
-        table: one world in the layout of ``physics.rows``; updated.
-        restitution: coefficient of restitution of every impact.
-        duration: length of the segment, s.
-        rows: result, one row per interval, [capacity, 1 + P + 3 N]: time (s), gaps (m), speeds (m/s), accelerations
-            (m/s2) and jerks (m/s3).
-
+    If ``rows`` is full, further intervals are counted but not written. If a contact was missed, the returned number of
+    intervals is negative. ``table`` is one world in the layout of ``physics.rows``, updated. ``duration`` is the length
+    of the segment, s. A row [1 + P + 3 N] has time (s), gaps (m), speeds (m/s), accelerations (m/s2) and jerks (m/s3).
     """
     vehicles, building = table.shape[1], builds_up(table)
     start_events(table, building)
@@ -63,17 +56,11 @@ def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) ->
 
 
 def segment_pieces(worlds: Worlds, command_mps2: Floats, until_s: Floats) -> list[Floats]:
-    """Return the motion of each world until ``until_s`` under constant commands, as intervals of constant jerk.
+    """Return the motion of each world until ``until_s`` [n] (s) under the commands ``command_mps2`` [n, N].
 
-    Args:
-        worlds: n worlds of N vehicles; they are not changed.
-        command_mps2: commanded accelerations, [n, N] m/s2.
-        until_s: end of each segment, [n] s.
-
-    Returns one array [k, 1 + N + 3 N] per world, with one row per interval of constant jerk. The columns are: absolute
-    time at which the interval begins (s), distance that Vehicle 1 has travelled since the segment began (m), N - 1 gaps
-    (m), N speeds (m/s), N accelerations (m/s2) and N jerks (m/s3).
-
+    The result is one array [k, 1 + N + 3 N] per world, with one row per interval of constant jerk. The columns are:
+    absolute time at which the interval begins (s), distance that Vehicle 1 has travelled since the segment began (m),
+    N - 1 gaps (m), N speeds (m/s), N accelerations (m/s2) and N jerks (m/s3).
     """
     v, N, durations = worlds.vehicles, worlds.N, until_s - worlds.time_s
     front_gaps = worlds.with_post_ahead(durations).obstacle_gap_m  # its change is the distance that Vehicle 1 travels

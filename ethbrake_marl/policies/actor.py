@@ -24,8 +24,8 @@ class Actor:
     def __init__(self, spec: NetworkSpec, tensors: Mapping[str, Float32s], prefix: str = "") -> None:
         """Build the layers from the weights and biases in ``tensors``, which must fit ``spec.tensors``.
 
-        ``prefix`` is the beginning of the tensors' names, for example ``among_1.``, if this policy is part of another
-        policy.
+        ``prefix`` is the beginning of the tensors' names if this policy is part of another policy, for example
+        ``among_1.``.
         """
         self.spec = spec
         self._networks = [layers_of(prefix + name, len(spec.policy_hidden), tensors) for name in spec.actors]
@@ -46,21 +46,15 @@ class Actor:
         return action
 
     def choose(self, x: Float32s) -> NDArray[np.int64]:
-        """Return the index (from 0) of the expert that the gating network selects for each observation, [rows].
-
-        ``x`` are observations of the policy, one per column, [F, rows].
-        """
+        """Return the index (from 0) of the expert that the gating network selects for each observation, [rows]."""
         chosen: NDArray[np.int64] = self._forward(self._gate, x).argmax(axis=0)
         return chosen
 
     def take(self, number: NDArray[np.int64], x: Float32s) -> Float32s:
-        """Return for each observation the action that its entry of ``number`` selects, [1, rows].
+        """Return for each observation the action that its entry of ``number`` [rows] selects, [1, rows].
 
-        Args:
-            number: index of the chosen policy or action for each observation, [rows]. The lowest values of ``number``
-                (0, 1, ...) choose a policy in ``NetworkSpec.among``; the values after them choose a fixed action.
-            x: observations of the policy, one per column, [F, rows].
-
+        The lowest values of ``number`` (0, 1, ...) choose a policy in ``NetworkSpec.among``; the values after them
+        choose a fixed action.
         """
         actions = self._actions[np.newaxis, np.maximum(number - len(self._among), 0)]
         for m, member in enumerate(self._among):
@@ -70,7 +64,7 @@ class Actor:
         return actions
 
     def _block(self, x: Float32s) -> Float32s:
-        """Return the actions [A, rows] for the observations ``x`` [F, rows], one column per observation."""
+        """Return the actions [A, rows] for the observations ``x``."""
         if len(self._networks) == 1:
             y = self._forward(self._networks[0], x)
             if self.spec.choices is not None:
@@ -87,7 +81,7 @@ class Actor:
         return y
 
     def _forward(self, layers: Layers, x: Float32s) -> Float32s:
-        """Return the outputs [outputs, rows] of the network with these ``layers`` for the inputs ``x`` [F, rows]."""
+        """Return the outputs [outputs, rows] of the network with these ``layers``."""
         for number, (weight, bias) in enumerate(layers, start=1):
             y = np.empty((weight.shape[0], x.shape[1]), dtype=np.float32)
             dense(weight, bias, x, y)

@@ -89,9 +89,9 @@ def _read(path: Path) -> bytes:
 def _check_observed(path: Path, manifest: Manifest) -> None:
     """Raise an error unless the features that a policy observes are the same as when the policy was trained.
 
-    ``path`` is the path of the manifest file, for error messages. Raises ``InvalidInput`` for a registered feature that
-    is missing or has changed, and ``CorruptBundle`` for features of this package that are missing or whose scaling has
-    changed.
+    Raises ``InvalidInput`` for a registered feature that is missing or has changed, and ``CorruptBundle`` for features
+    of this package that are missing or whose scaling has changed. ``path`` is the manifest file, for the error
+    message.
     """
     seen = manifest.observation
     for was in seen.registered:

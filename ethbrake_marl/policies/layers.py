@@ -24,7 +24,7 @@ _SMALL = 1e-4  # below this, x - x^3 / 3 is tanh(x) to double precision
 def squash(values: NDArray[np.float32]) -> None:
     """Replace every entry of ``values`` [k, rows] by its hyperbolic tangent, in place.
 
-    The rounding error of the hyperbolic tangent is little more than half a unit in the last place of a float32.
+    The rounding error is little more than half a unit in the last place of a float32.
     """
     for j in range(values.shape[0]):
         row = values[j]
@@ -52,18 +52,12 @@ def layers_of(name: str, hidden: int, tensors: Mapping[str, Float32s]) -> Layers
 
 @compiled
 def dense(weight: Float32s, bias: Float32s, x: Float32s, y: Float32s) -> None:
-    """Compute one layer of a network, ``y = weight x + bias``.
+    """Compute one layer of a network, ``y = weight x + bias``, into ``y`` [O, rows].
 
-    The products of weights and inputs are added in groups of four, ``(a + b) + (c + d)``, always in this order, without
-    fused or reordered operations (no fastmath). The rounding error is half as large as in a sum that adds one product
-    after another. The result for a column of ``x`` does not depend on the other columns.
-
-    Args:
-        weight: weights of K inputs and O outputs, [O, K].
-        bias: bias of each output, [O].
-        x: inputs of the layer, one column per observation, [K, rows].
-        y: array to which the outputs of the layer are written, [O, rows].
-
+    ``weight`` is [O, K], ``bias`` [O], and ``x`` [K, rows] has one column per observation. The products of weights and
+    inputs are added in groups of four, ``(a + b) + (c + d)``, always in this order, without fused or reordered
+    operations (no fastmath). The rounding error is half as large as in a sum that adds one product after another. The
+    result for a column of ``x`` does not depend on the other columns.
     """
     inputs = weight.shape[1]
     whole = inputs - inputs % 4

@@ -25,7 +25,7 @@ _PACKAGES = ("ethbrake-marl", "gymnasium", "numba", "numpy", "safetensors", "sta
 def installed_versions() -> dict[str, str]:
     """Return name -> version of Python, of this package, and of every package on which training results may depend.
 
-    The result includes packages whose entry points are used in this process (``registry.versions_used``).
+    These include packages whose entry points are used in this process (``registry.versions_used``).
     """
     return {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES} | versions_used()
 

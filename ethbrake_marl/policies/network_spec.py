@@ -39,17 +39,15 @@ class NetworkSpec(FileModel):
     whose noise comes from a second head of the actor. If ``value_hidden`` is empty, there is no critic; a policy can
     act without a critic.
 
-    If ``networks`` is above 1, the policy is a mixture of experts. A mixture of experts has ``networks`` actors of the
-    same shape, and a gating network (hidden layers ``gate_hidden``) that gives each actor a score at every decision.
-    The actor with the highest score acts; if several actors have the highest score, the first of them acts. A mixture
-    of experts has no noise and no critic.
+    If ``networks`` is above 1, the policy is a mixture of experts. It has ``networks`` actors of the same shape, and a
+    gating network (hidden layers ``gate_hidden``) that gives each actor a score at every decision. The actor with the
+    highest score acts; among equal scores, the first actor acts. A mixture of experts has no noise and no critic.
 
     With output ``choice`` the actor computes a score for each of ``choices`` actions, which are evenly spaced from -1
-    to 1. The policy takes the action with the highest score; if several actions have the highest score, it takes the
-    lowest of these actions. A policy with output ``choice`` has no noise and no critic. The actor of a policy with
-    output ``choice`` may also compute a score for each of several other policies (``among``) that act on the same
-    observation; if a policy has the highest score, it chooses the action. In the actor's result, the scores of the
-    policies in ``among`` come before the scores of the fixed actions.
+    to 1. The policy takes the action with the highest score; among equal scores, it takes the lowest action. A policy
+    with output ``choice`` has no noise and no critic. Its actor may also compute a score for each of several other
+    policies (``among``) that act on the same observation; if a policy has the highest score, it chooses the action. In
+    the actor's result, the scores of the policies in ``among`` come before the scores of the fixed actions.
     """
 
     observation_size: Annotated[int, Field(ge=1, le=4096)]  # F, length of an observation
@@ -101,7 +99,7 @@ class NetworkSpec(FileModel):
 
     @property
     def actions(self) -> Float32s:
-        """Fixed actions to which the actor gives scores if ``output`` is ``choice``, [choices], from -1 to 1."""
+        """Fixed actions that output ``choice`` scores, [choices], from -1 to 1."""
         levels: Float32s = np.linspace(-1.0, 1.0, self.choices or 0).astype(np.float32)
         return levels
 
@@ -133,7 +131,7 @@ class NetworkSpec(FileModel):
 
     @property
     def _outputs(self) -> int:
-        """Number of outputs of each actor: number of scores if ``output`` is ``choice``, else size of an action."""
+        """Number of outputs of each actor."""
         return self.action_size if self.choices is None else len(self.among) + self.choices
 
     def _network(self, name: str, hidden: tuple[int, ...], outputs: int) -> list[TensorRow]:

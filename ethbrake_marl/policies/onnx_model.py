@@ -17,13 +17,8 @@ from ethbrake_marl.policies.network_spec import Activation, Float32s, NetworkSpe
 def onnx_model(manifest: Manifest, observation: ObservationSpec, tensors: Mapping[str, Float32s]) -> bytes:
     """Return the ONNX model of a policy, as bytes. The model computes actions and commanded accelerations.
 
-    Args:
-        manifest: manifest of the policy.
-        observation: observation of the policy; it must contain the vehicle's braking and driving capacities.
-        tensors: name -> tensor of the policy.
-
-    Raises ``MissingExtra`` if the package onnx is not installed.
-
+    ``observation`` must contain the vehicle's braking and driving capacities. Raises ``MissingExtra`` if the package
+    onnx is not installed.
     """
     with naming_extras():
         import onnx  # an optional extra, imported only here

@@ -32,7 +32,7 @@ WEIGHTS = "weights.safetensors"
 
 @dataclass(frozen=True)
 class Policy:
-    """A policy in memory, with manifest and tensors. Calling ``policy(observation)`` returns the deterministic action.
+    """A policy in memory. Calling ``policy(observation)`` returns the deterministic action.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -84,7 +84,7 @@ class Policy:
 
     @property
     def drivers(self) -> dict[str, Policy]:
-        """Mapping from each vehicle that this policy learned to control to the policy: ``{"vehicle_2": policy}``."""
+        """The policy for each vehicle that it learned to control, by vehicle name: ``{"vehicle_2": policy}``."""
         return dict.fromkeys(self.manifest.learners, self)
 
     @classmethod
@@ -147,9 +147,8 @@ class Policy:
         """Return the ONNX model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
 
         The acceleration is the action times the vehicle's braking capacity (action below 0) or driving capacity (action
-        above 0). The braking and driving capacities are read from the observation. The ONNX model adds products in
-        another order than this package, so its results differ by rounding errors. Raises ``MissingExtra`` if the
-        package onnx is not installed.
+        above 0), which are read from the observation. The ONNX model adds products in another order than this package,
+        so its results differ by rounding errors. Raises ``MissingExtra`` if the package onnx is not installed.
         """
         return onnx_model(self.manifest, self.observation, self.tensors)
 

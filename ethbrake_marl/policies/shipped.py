@@ -1,7 +1,7 @@
 """Policies that are shipped with the package, loaded by name.
 
-Each shipped policy is a folder in ``_policies/`` with a bundle and ``card.md``. The card says in which scenario the
-policy was trained, how good the policy is, and where it fails.
+Each shipped policy is a folder in ``_policies/`` with a bundle and ``card.md``, which says in which scenario the policy
+was trained, how good it is, and where it fails.
 """
 
 from __future__ import annotations
@@ -29,11 +29,10 @@ def load_shipped(name: str) -> Policy:
 
 
 def load_named_policy(name: str) -> Policy:
-    """Load a shipped policy by its name, or any policy by its path.
+    """Load a shipped policy by its name, or any policy by the path of a run or a bundle.
 
-    ``name`` is the name of a shipped policy, or the path of a run or a bundle. If a folder has the same name as a
-    shipped policy, such as ``ppo``, write ``./ppo`` for the folder. Raises the errors of ``load_policy``, and
-    ``UnknownName`` for the old spelling ``shipped/NAME``.
+    If a folder has the same name as a shipped policy, such as ``ppo``, write ``./ppo`` for the folder. Raises the
+    errors of ``load_policy``, and ``UnknownName`` for the old spelling ``shipped/NAME``.
     """
     refuse_shipped_path(name)
     return load_shipped(name) if name in shipped_policies() else load_policy(name)

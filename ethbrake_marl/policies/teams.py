@@ -15,7 +15,7 @@ from ethbrake_marl.policies.policy import MANIFEST, Policy
 
 @dataclass(frozen=True)
 class PolicyTeam:
-    """Policies of several learners that were trained together, with one policy for each learner."""
+    """Policies of several learners that were trained together, one for each learner."""
 
     drivers: Mapping[str, Policy]  # vehicle name -> policy, front to rear: ``{"vehicle_2": policy, ...}``
 
@@ -41,8 +41,7 @@ Trained = Policy | PolicyTeam  # result of a training: one policy for all learne
 def read_trained(folder: Path) -> Trained:
     """Read the policy or team that ``save`` wrote into ``folder``.
 
-    Raises ``CorruptBundle`` if ``folder`` contains neither a policy nor a team. Also raises the errors of
-    ``load_policy``.
+    Raises ``CorruptBundle`` if ``folder`` contains neither, and the errors of ``load_policy``.
     """
     if (folder / MANIFEST).exists():
         return load_policy(folder)
