@@ -10,7 +10,7 @@ Arguments that several functions share, for one world with M possible worlds, K 
 
 - ``world``: parameters of the possible worlds.
 - ``states`` [M, S], ``ended`` [M]: their present states, in the layout of ``Running.states``, and whether their
-episodes have ended.
+  episodes have ended.
 - ``step``: number of the present decision.
 - ``constants`` [C, K]: constant actions that may replace the rest of a plan.
 - ``plan`` [L, K]: the present plan, with the actions of each decision; changed in place.
@@ -132,8 +132,7 @@ def try_action(
     world: Members, states: Floats, ended: Bools, step: int, action: Floats, budget: float, certified: float,
     constants: Floats, plan: Floats, room: Floats, after: Floats, over: Bools,
 ) -> tuple[float, float, int]:  # fmt: skip
-    """Simulate one step with ``action`` [K]; then search for a plan from the next state on that stays within the
-    budget.
+    """Simulate one step with ``action`` [K]; then search for a plan after this step that stays within the budget.
 
     The plan that is tried first continues after ``action`` with the rest of the present plan; the other plans continue
     after ``action`` with a constant action. An action for which the physics fails is not certified.

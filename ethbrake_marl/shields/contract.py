@@ -8,11 +8,11 @@ A *guard* is the object in an engine that decides which actions are applied. The
 - ``state``: the engine with its running episodes, before the step. The guard reads the engine and does not change it.
 
 - ``memory``: the guard's memory of the running episodes. The guard never changes its memory in place: ``decide``
-returns a new memory.
+  returns a new memory.
 
 - ``proposed``: proposed actions, [n, L] in [-1, 1]. A column of NaN means that the caller gave no action for the
-learner of this column; the learner's policy then proposes an action. A single NaN is an invalid action and is never
-applied.
+  learner of this column; the learner's policy then proposes an action. A single NaN is an invalid action and is never
+  applied.
 
 - ``applied``: actions that the engine applies in this step, [n, L].
 
@@ -88,13 +88,13 @@ class ShieldGuard(ABC):
 
     A subclass implements ``decide`` (choose the applied actions), ``_started`` (start episodes) and ``tell`` (compute
     the infos). A subclass may also override ``check`` (compare the world after the step with the prediction) and
-    ``intervened`` (say which proposals were replaced). ``ruling`` is in all methods the decision in the last step; None
-    before the first decision.
+    ``intervened`` (say which proposals were replaced). In every method ``ruling`` is the decision in the last step,
+    None before the first decision.
 
     Args:
         engine: the engine that gets this guard. All learners of the engine are shielded.
         policies: vehicle index -> policy that proposes an action if the caller gives no action for the vehicle. A
-        policy with a memory is called at every decision, even if its proposal is not needed, to update its memory.
+            policy with a memory is called at every decision, even if its proposal is not needed, to update its memory.
         shield: initial state of the shield, before any episode; its type depends on the mode.
         mode: mode of the shield; the infos report its number.
         where: name with which error messages begin: the function or class that the user called.

@@ -34,14 +34,9 @@ def interventions(
 ) -> list[Intervention]:
     """Return one log entry for each action that a decision replaced.
 
-    Args:
-        now: the n running episodes before the decision.
-        episode: number of the episode that runs in each row (world) of the batch, [n].
-        vehicles: indices of the K shielded vehicles.
-        proposed: proposed actions, [n] or [n, K].
-        decision: the shield's decision on the proposed actions.
-        held: the shield's plans before the decision, which become part of the log entries.
-
+    ``now`` are the n episodes before the decision, ``episode`` [n] the number of the episode in each row, ``vehicles``
+    the indices of the K shielded vehicles, ``proposed`` [n] or [n, K] the proposed actions, and ``held`` the plans
+    before the decision.
     """
     times, states, shape = now.time_s, now.nominal().states, (now.n, len(vehicles))
     columns = (proposed, decision.applied, decision.reason, decision.margin, decision.intervened)

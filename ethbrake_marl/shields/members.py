@@ -7,12 +7,12 @@ Arguments that several functions share:
 
 - ``world``: parameters of the possible worlds; ``m``: index of one of them.
 - ``states`` [M, S], ``ended`` [M]: present state of each possible world, in the layout of ``Running.states``, and
-whether its episode has ended. ``state`` [S] is the state of one possible world.
+  whether its episode has ended. ``state`` [S] is the state of one possible world.
 - ``step``: number of the present decision.
 - ``action`` [K], ``plan`` [L, K]: actions of the shielded vehicles at one decision and at every decision.
 - ``after`` [M, S] or [S], ``over`` [M]: receive the states after the step, and whether the episodes have then ended.
 - ``most``: a simulation stops as soon as the harm exceeds this number, m2/s2, because harm never falls during an
-episode.
+  episode.
 """
 
 from __future__ import annotations

@@ -8,19 +8,19 @@ does not cover anything that happens after the horizon.
 **Induction.** Between two decisions the shield has a *plan*. Let ``c`` be the harm of the plan: the harm of the whole
 episode if the plan is executed from the present state. ``c`` includes the harm so far. In the first-impact count, ``c``
 leaves out further impacts of pairs that already had an impact. The function ``members.follow_plan`` computes ``c``: it
-simulates the plan decision by decision, with the same floating-point operations as the engine's step, and adds up the
-harm, in the same order as the engine. Hence:
+simulates the plan decision by decision, with the same floating-point operations as the engine's step, in the same
+order, and adds up the harm in the same order as the engine. Hence:
 
 1. *Start.* At the first decision ``c = B``.
 
 2. *A proposal is applied* only if the harm of some plan from the next state on is at most the budget. ``follow_plan``
-computes the harm of this new plan from exactly the next state. The new plan becomes the shield's plan, and its harm
-becomes ``c``. If the proposal equals the planned action, the plan and ``c`` stay the same, because a new simulation
-would repeat the same operations.
+   computes the harm of this new plan from exactly the next state. The new plan becomes the shield's plan, and its harm
+   becomes ``c``. If the proposal equals the planned action, the plan and ``c`` stay the same, because a new simulation
+   would repeat the same operations.
 
 3. *Otherwise the planned action is applied.* When ``follow_plan`` computed ``c``, the simulation passed through the
-state after the planned action. So from this state on, the rest of the plan again has the harm ``c``, to the last bit.
-The shield may also replace the rest of the plan by a plan with less harm.
+   state after the planned action. So from this state on, the rest of the plan again has the harm ``c``, to the last
+   bit. The shield may also replace the rest of the plan by a plan with less harm.
 
 4. *End.* When the episode ends, no action is left to execute, and ``c`` is the harm of the episode.
 
@@ -42,8 +42,8 @@ most ``B``.
 
 Arguments that several methods share:
 
-- ``worlds``: n worlds at the alert; ``possible``: the M possible worlds of each of them, [n * M], each world itself
-first.
+- ``worlds``: n worlds at the alert; ``possible``: the M possible worlds of each world, [n * M], with the world itself
+  first.
 - ``rows``: indices of the batch rows in which new episodes start, [n].
 - ``memory``: the shield's memory before the decision; ``asked``: True for each world in which to decide, [n].
 - ``seen``: the observed worlds, [n, columns]; the columns are the first columns of ``Running.states``.
@@ -99,8 +99,8 @@ class StepShield:
     shield chooses again whenever a distrusted world differs from the prediction. If the engine continues an episode
     after the end that the shield predicted, the shielded vehicles brake fully.
 
-    With several ``possible`` worlds for each world, each harm is the largest harm over these possible worlds, and each
-    observed number must lie within the range of its predictions in them.
+    With several ``possible`` worlds for each world, each harm is the largest harm over the possible worlds, and each
+    observed number must lie within the range of its predictions.
 
     Args:
         scenario: the scenario of all worlds.
@@ -108,10 +108,9 @@ class StepShield:
         harm_count: which harm is bounded: ``first`` (first impact of each pair) or ``total`` (every impact).
         allowance: amount by which the bound is loosened until the episode ends, m2/s2.
         others: scripts of the unshielded vehicles (vehicle index -> script); each script must fix its commands at the
-        alert. None: the scenario's scripts.
+            alert. None: the scenario's scripts.
         cap: ``baseline``: no vehicle bears more harm than under the constant actions that do the least harm; None: only
-            the
-        harm summed over all vehicles is bounded.
+            the harm summed over all vehicles is bounded.
         logging: whether ``log`` lists the interventions (replaced actions).
 
     Raises ``InvalidInput`` for an unknown harm count, an unknown vehicle, a negative allowance, or a script in
@@ -215,13 +214,11 @@ class StepShield:
         To enlarge the batch to k rows, start episodes in all rows from 0 to k - 1 in one call.
 
         Args:
-            worlds: worlds of the new episodes, as the shield assumes them (the true worlds may differ).
+            worlds: the worlds of the new episodes, as the shield assumes them (the true worlds may differ).
             rows: indices of the batch rows in which the new episodes start.
             policy: policy that is simulated from the alert, or vehicle index -> policy for several vehicles; in worlds
-                where it
-            does less harm than the best constant actions, its harm is the bound. None: the bound is the harm of the
-                best
-            constant actions.
+                where it does less harm than the best constant actions, its harm is the bound. None: the bound is the
+                harm of the best constant actions.
             possible: the possible worlds of each world; None: the result of ``members_of(worlds)``.
 
         Raises ``InvalidInput`` for rows that do not exist in the batch, and if the messages in ``worlds`` lack a
@@ -334,13 +331,12 @@ class StepShield:
 
         Args:
             proposed: proposed actions, [n], or [n, K] for several vehicles; clipped to [-1, 1]. Where the proposal is
-            NaN, the planned action is applied.
+                NaN, the planned action is applied.
             seen: the observed worlds, which are compared with the prediction; None: nothing is compared.
             only: True for each world in which to decide, [n]; all other worlds stay unchanged. None: the shield decides
-                in
-            every world whose episode has not ended.
+                in every world whose episode has not ended.
             proposer: the policies that propose actions. If no other plan certifies a proposal, the shield simulates the
-            policies after this proposal, and tries their actions as a plan. None: no policy is simulated.
+                policies after this proposal, and tries their actions as a plan. None: no policy is simulated.
 
         Returns the decision with the actions to apply. After the call, ``memory`` contains the state that is predicted
         for the next decision.
