@@ -324,7 +324,7 @@ class Backup(NamedTuple):
     """The shield's present plans in n worlds. Where a proposal is not accepted, the plan's action is applied."""
 
     plan: Floats  # [n, L], or [n, L, K] for K shielded vehicles: actions of each decision; entry j is for decision j
-    harm: Floats  # [n] harm of the episode in the worst possible world if the plan is executed from now on (m2/s2)
+    harm: Floats  # [n] harm of each plan (m2/s2)
     constants: Floats = np.array(CONSTANTS)  # [C] or [C, K] constant actions that may replace the rest of a plan
 
 
@@ -334,8 +334,8 @@ class Decision(NamedTuple):
     applied: Floats  # [n] or [n, K] actions in [-1, 1]
     intervened: Bools  # [n] or [n, K] whether the proposal was replaced (clipping to [-1, 1] does not count)
     reason: NDArray[np.int64]  # [n] or [n, K] codes of ShieldReason
-    bound: Floats  # [n] largest possible harm of the episode from now on (m2/s2)
-    margin: Floats  # [n] or [n, K] budget minus least harm found after the proposal (m2/s2); negative: rejected
+    bound: Floats  # [n] bound of the episode from now on (m2/s2)
+    margin: Floats  # [n] or [n, K] (m2/s2); negative: rejected
     after: Running  # the predicted episodes at the next decision
     backup: Backup  # the plan whose harm is the bound
 

@@ -23,9 +23,9 @@ class Intervention(NamedTuple):
     proposed: float  # proposed action, before clipping to [-1, 1]
     applied: float  # applied action, in [-1, 1]
     reason: int  # code of ShieldReason
-    bound: float  # harm that the episode will not exceed, after this decision (m2/s2)
-    margin: float  # budget minus least harm of any plan tried after the proposal (m2/s2); negative: rejected
-    state: Floats  # [S] speeds, gaps, hit flags and harm at the decision, in the layout of ``Running.states``
+    bound: float  # bound after this decision (m2/s2)
+    margin: float  # margin of the proposal (m2/s2); negative: rejected
+    state: Floats  # [S] state at the decision, in the layout of ``Running.states``
     plan: Floats  # [L], or [L, K] for K vehicles: plan before the decision; entries before ``step``: applied actions
 
 

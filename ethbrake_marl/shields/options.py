@@ -160,8 +160,7 @@ def check_mode(mode: object) -> str:
 
 
 def misplaced(name: str, value: object, mode: str, takers: list[str], where: str) -> InvalidInput:
-    """Return the error to raise if the setting ``name`` has a ``value``, but the mode ``mode`` does not accept the
-    setting.
+    """Return the error to raise if the setting ``name`` has a ``value`` that the mode ``mode`` does not accept.
 
     ``takers`` are the names of the modes that accept it. The message begins with ``where``.
     """

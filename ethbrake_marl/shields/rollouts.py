@@ -83,8 +83,7 @@ def certify_by_policy(
 def certify_rollouts(
     running: Running, proposed: Floats, rows: Ints, budget: Floats, held: Floats, proposer: Proposer
 ) -> Decision:
-    """Decide again in the worlds ``rows``, whose proposals were rejected; this time the plans are rollouts of the
-    policy.
+    """Decide again in the worlds ``rows``, whose proposals were rejected; this time the plans are policy rollouts.
 
     In each world one plan is tried: the proposal, clipped to [-1, 1], followed by the policy's actions in a simulation
     from the next state on. If this plan stays within the budget and the caps, the plan becomes the backup, and the

@@ -24,7 +24,7 @@ class Running(NamedTuple):
     states: Floats  # [n * M, S] speeds, gaps, hit flags, harms, forces; in the layout of ``physics.episode.save``
     steps: Ints  # [n] number of the present decision, from 0
     ended: Bools  # [n * M] whether the episode is over
-    caps: Floats = np.zeros((0, 0))  # [n * M, N] largest harm that each vehicle may bear (m2/s2); [0, 0]: no caps
+    caps: Floats = np.zeros((0, 0))  # [n * M, N] cap of each vehicle (m2/s2); [0, 0]: no caps
 
     @property
     def uncapped(self) -> Running:
