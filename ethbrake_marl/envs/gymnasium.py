@@ -100,8 +100,8 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
         reward: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams`` object.
         observation: features that the learner observes; None: the features that the scenario declares or, if it
             declares none, default features (``observation_for``).
-        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: an action is an index from 0 to K - 1.
-            Index k selects number k of K evenly spaced numbers from -1 (full braking capacity) to 1 (full driving
+        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete; an action is an
+            index from 0 to K - 1, for K evenly spaced numbers from -1 (full braking capacity) to 1 (full driving
             capacity).
         reward_vector: None: a reward is a number. ``vehicles``: a reward is an array [N] that contains minus the harm
             that each vehicle bears in the step. A list of components: a reward is an array with these components (see
@@ -164,7 +164,10 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
         return self._observe(), Report.of(self.engine).plain_infos(self._column)[0]
 
     def step(self, action: NDArray[Any]) -> tuple[Observations, Any, bool, bool, dict[str, Any]]:
-        """Advance by one time step with an ``action`` [1]; return observation, reward, terminated, truncated and info."""
+        """Advance by one time step with an ``action`` [1] in [-1, 1].
+
+        Returns observation, reward, terminated, truncated and info.
+        """
         if not self._running:
             raise InvalidInput("step: no episode is running; call reset first")
         step = self.engine.step(learner_actions(self.engine, {self._name: action}, self.actions))

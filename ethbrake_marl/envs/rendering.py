@@ -253,7 +253,7 @@ def _draw_vehicle(pen: _Pen, scene: Scene, i: int) -> None:
 
 
 def _draw_panel(pen: _Pen, scene: Scene, i: int) -> None:
-    """Draw the panel of vehicle ``i``, with a bar for the command: to the left for braking, to the right for driving."""
+    """Draw the panel of vehicle ``i``. Its bar extends to the left for braking and to the right for driving."""
     left, width = _panel(scene, i)
     pen.box(left, _PANEL_TOP, left + 20, _PANEL_TOP + 18, vehicle_colour(i))
     middle, half, top = left + width / 2, width / 2, _PANEL_TOP + 62

@@ -71,8 +71,8 @@ def make_sb3_vec_env(
         step_infos: True: every step returns all infos, as the other environments do; steps are then slower. False: only
             the last step of an episode returns all infos.
         render_mode: ``rgb_array`` or None. ``render`` and ``VecVideoRecorder`` show all worlds side by side.
-        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: an action is an index from 0 to K - 1.
-            Index k selects number k of K evenly spaced numbers from -1 (full braking capacity) to 1 (full driving
+        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete; an action is an
+            index from 0 to K - 1, for K evenly spaced numbers from -1 (full braking capacity) to 1 (full driving
             capacity).
 
     >>> import ethbrake_marl as eb
@@ -274,8 +274,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         return [False for _ in self._get_indices(indices)]
 
     def _close_episodes(self, ended: Ints, step: Step, infos: list[dict[str, Any]]) -> None:
-        """Write the final infos of the episodes that have ended in the worlds ``ended`` (indices) into ``infos``, row
-        by row.
+        """Write the final infos of the episodes that have ended in the worlds ``ended`` (indices) into ``infos``.
 
         Call this method before the next episodes start.
         """
@@ -310,7 +309,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         """Ignore the empty infos that the constructor of Stable-Baselines3's ``VecEnv`` assigns."""
 
     def _observe(self, worlds: Ints | None = None) -> Observations:
-        """Return the observations of the learners in ``worlds`` (indices; None: all) as a new array, float32 [rows, F]."""
+        """Return the observations of all learners in ``worlds`` (indices; None: all worlds), a new array [rows, F]."""
         every = self.engine.observe_all(self._learners, worlds)
         rows = every.reshape(-1, every.shape[2])
         if self.appended is None:
