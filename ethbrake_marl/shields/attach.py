@@ -62,7 +62,7 @@ Proposing = Agent | LearnedPolicy | Team | Mapping[str, Agent | LearnedPolicy]
 
 
 def guard_of(engine: Engine, policy: Proposing | None, options: ShieldOptions) -> ShieldGuard:
-    """Return a guard that shields all learners of an engine; the engine does not change.
+    """Return a guard that shields all learners of an engine; this function does not change the engine.
 
     ``policy`` proposes the actions that the caller leaves out; it may be None in all modes except ``episode``. Raises
     ``InvalidInput`` if no vehicle learns, if several vehicles learn and the mode is not ``step``, and if ``policy`` is

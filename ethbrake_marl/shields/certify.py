@@ -68,8 +68,8 @@ NEARLY = 1e-9
 def best_constant(world: Members, states: Floats, ended: Bools, step: int, constants: Floats) -> tuple[int, float]:
     """Return the index (in ``constants``) of the action that does the least harm, and the harm of this action, m2/s2.
 
-    The action is held from now to the horizon. The time until the horizon is simulated as one segment, not decision by
-    decision.
+    The harm of a constant action is the largest harm over the possible worlds if the action is held from now to the
+    horizon. The time until the horizon is simulated as one segment, not decision by decision.
     """
     best, least, critical = 0, math.inf, 0
     for c in range(constants.shape[0]):
@@ -162,10 +162,10 @@ def try_action(
 
 @compiled
 def tell_action(out: Floats, action: Floats, bound: float, margin: float) -> None:
-    """Write the applied actions ``action`` [K], the bound and the margin (m2/s2) into ``out``.
+    """Write the applied actions ``action`` [K], ``bound`` and ``margin`` (m2/s2) into ``out``.
 
-    The caller must already have written the column ``REASON``. If a vehicle's proposal was rejected, the vehicle's
-    margin in ``out`` does not change.
+    ``margin`` is the budget minus the harm of the plan after this decision. If a vehicle's proposal was rejected, the
+    vehicle's margin in ``out`` does not change. The caller must already have written the column ``REASON``.
     """
     for c in range(action.shape[0]):
         out[c, APPLIED], out[c, BOUND] = action[c], bound
@@ -403,7 +403,7 @@ def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) 
         running: the running episodes at this decision.
         proposed: proposed actions, [n] or [n, K]; clipped to [-1, 1]. NaN is replaced by the planned action.
         backup: the present plans and their harm.
-        budget: [n] m2/s2, at least the harm of ``backup``.
+        budget: budget of each world, at least the harm of ``backup``, [n] m2/s2.
 
     Raises ``InvalidInput`` if the shapes of the arrays do not fit together, or if a budget is below the harm of
     ``backup``. Raises ``PhysicsError``, which names the worlds, if the physics fails with the applied action.

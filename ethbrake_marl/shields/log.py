@@ -34,9 +34,9 @@ def interventions(
 ) -> list[Intervention]:
     """Return one log entry for each action that a decision replaced.
 
-    ``now`` are the n episodes before the decision, ``episode`` [n] the number of the episode in each row, ``vehicles``
-    the indices of the K shielded vehicles, ``proposed`` [n] or [n, K] the proposed actions, and ``held`` the plans
-    before the decision.
+    ``now`` are the n episodes before the decision, and ``held`` the plans before the decision. ``episode`` [n] are the
+    numbers of the episodes, ``vehicles`` the indices of the K shielded vehicles, and ``proposed`` [n] or [n, K] the
+    proposed actions.
     """
     times, states, shape = now.time_s, now.nominal().states, (now.n, len(vehicles))
     columns = (proposed, decision.applied, decision.reason, decision.margin, decision.intervened)

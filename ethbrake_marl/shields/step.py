@@ -313,9 +313,10 @@ class StepShield:
     ) -> tuple[Floats, Any]:
         """Return the bound of each episode at the alert, [n] m2/s2, and further memory (``StepMemory.enclosure``).
 
-        ``plan`` is the first plan of each world, [n, L] or [n, L, K], and ``harm`` [n] m2/s2 its harm, the largest over
-        the possible worlds. ``problem`` describes the possible worlds for the functions of ``engine.profiles``. This
-        class returns ``harm`` and None; a subclass may return another bound and a further memory.
+        ``plan`` is the first plan of each world, [n, L] or [n, L, K]; ``harm`` is the harm of this plan, the largest
+        over the possible worlds, [n] m2/s2. ``problem`` describes the possible worlds for the functions of
+        ``engine.profiles``. This class returns ``harm`` and None; a subclass may return another bound and a further
+        memory.
         """
         return harm, None
 
@@ -388,9 +389,9 @@ class StepShield:
     ) -> Decision:
         """Return the decision that is applied: ``decision``, in which a subclass may replace further actions.
 
-        The plans of ``decision`` already stay within the ``budget`` [n] (m2/s2) in every possible world. Here ``now``
-        are the running episodes before the decision, and ``asked`` is True only for trusted worlds. This class returns
-        ``decision`` unchanged.
+        ``decision`` already accepts proposals that only a rollout of the policy certifies, and its plans stay within
+        the ``budget`` [n] (m2/s2) in every possible world. ``now`` are the running episodes before the decision;
+        ``asked`` is True only for trusted worlds. This class returns ``decision`` unchanged.
         """
         return decision
 
