@@ -292,7 +292,7 @@ class Begun:
         of the stream.
 
         Raises ``InvalidInput`` for a seed that is not a whole number >= 0, for an invalid initial state or listed
-        world, or if the options contain both. The environment then stays unchanged.
+        world, or if the options contain both an initial state and a listed world. The environment then stays unchanged.
         """
         named = None if seed is None else chosen_seed(seed)
         if not (options is None or isinstance(options, Mapping)):

@@ -126,8 +126,8 @@ def only_learner(engine: Engine) -> int:
 def learner_actions(engine: Engine, actions: Mapping[str, Any], count: int | None) -> Floats | dict[int, Floats]:
     """Return the actions of the L learners as an array [1, L], which ``Engine.step`` accepts for one world.
 
-    If the engine has a shield, actions may be missing. The result is then a mapping from the index of each learner that
-    has an action to this action [1].
+    If the engine has a shield, actions may be missing. If some are missing, the result is a mapping from the index of
+    each learner that has an action to this action [1].
 
     Args:
         engine: engine with one world.

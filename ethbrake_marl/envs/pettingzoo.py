@@ -148,9 +148,8 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
         agents: which vehicles are agents: ``all`` vehicles or only the ``learners``. Choose ``learners`` for training
             libraries that train every agent.
         max_cycles: number of steps after which an episode is truncated; None: at the horizon only.
-        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete; an action is an
-            index from 0 to K - 1, for K evenly spaced numbers from -1 (full braking capacity) to 1 (full driving
-            capacity).
+        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete; the indices 0, 1,
+            ..., K - 1 stand for evenly spaced numbers from -1 (full braking capacity) to 1 (full driving capacity).
         reward_vector: None: a reward is a number. ``vehicles``: a reward is an array [N] that contains minus the harm
             that each vehicle bears in the step. A list of components: a reward is an array with these components (see
             docs/environments.md).
@@ -250,8 +249,8 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
     ) -> tuple[dict[str, Observations], dict[str, Any], dict[str, bool], dict[str, bool], Infos]:
         """Advance by one time step; return observations, rewards, terminations, truncations and infos of all agents.
 
-        ``actions`` and each of the five results are mappings from the names of agents; an action is [1] in [-1, 1].
-        Raises ``InvalidInput``, which names the learner, if the action of a learner is missing or invalid.
+        ``actions`` and the five results are mappings from the names of agents; each action is [1] in [-1, 1]. Raises
+        ``InvalidInput``, which names the learner, if the action of a learner is missing or invalid.
         """
         if not self.agents:
             raise InvalidInput("step: no episode is running; call reset first")

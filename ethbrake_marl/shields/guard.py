@@ -33,7 +33,7 @@ class StepGuard(ShieldGuard):
         shield: the shield for the engine's learners, before any episode.
         mode: mode of the shield; the infos report its number.
         where: name with which error messages begin: the function or class that the user called.
-        shares: whether the infos contain the harm that each vehicle bears; with a cap they always do.
+        shares: whether the infos contain the harm that each vehicle bears; with a cap, they always contain this harm.
         later_rollouts: whether a rollout of the policy that starts after the alert may certify an action.
         assumed: the worlds at the alert, as the shield assumes them; None: the shield knows the true worlds. Policies
             always observe the true worlds.

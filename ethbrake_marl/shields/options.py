@@ -1,7 +1,7 @@
 """Settings of a shield: the keywords of every shield interface, their checks, and the guard that is made from them.
 
 A *mode* is the registered name of a kind of shield (entry-point group ``ethbrake_marl.shields``); its registry entry
-contains the class of its settings. The modes ``step`` and ``episode`` use ``ShieldOptions``. A mode with further
+contains the class of the mode's settings. The modes ``step`` and ``episode`` use ``ShieldOptions``. A mode with further
 settings has a subclass of ``ShieldOptions``, which adds and checks the further fields and makes the guard of the mode.
 """
 
@@ -45,8 +45,8 @@ class ShieldOptions:
             replaced.
         logging: whether ``shield.log`` collects the replaced actions; not allowed in mode ``episode``.
         shares: whether the infos contain the harm that each vehicle bears under the present plan, and under the
-            constant actions that do the least harm; with a ``cap`` they always do. ``shares=True`` slows a step by a
-            few percent, and is not allowed in mode ``episode``.
+            constant actions that do the least harm; with a ``cap``, they always contain this harm. ``shares=True``
+            slows a step by a few percent, and is not allowed in mode ``episode``.
         where: name with which error messages begin: the function or class that the user called.
 
     Raises ``InvalidInput`` for an invalid setting, and ``UnknownName`` for an unknown mode.

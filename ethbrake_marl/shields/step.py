@@ -88,9 +88,7 @@ class StepShield:
     original.
 
     At the alert the bound is the harm of E-V2X-BM's constant deceleration, executed decision by decision. In worlds
-    where ``policy``, simulated from the alert, does less harm than E-V2X-BM, the bound is the policy's harm. The bound
-    never rises, and covers the time up to the scenario's horizon. ``memory.settles`` [n] is True for the worlds in
-    which all vehicles are at rest at the horizon under the first plan.
+    where ``policy``, simulated from the alert, does less harm than E-V2X-BM, the bound is the policy's harm.
 
     At each decision the observed worlds are compared with the shield's prediction, bit by bit. If a world differs from
     its prediction (a vehicle brakes beyond its capacity, a number is NaN, a message is missing), this world is marked
