@@ -100,8 +100,8 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
         reward: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams`` object.
         observation: features that the learner observes; None: the features that the scenario declares or, if it
             declares none, default features (``observation_for``).
-        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete; the indices 0, 1,
-            ..., K - 1 stand for evenly spaced numbers from -1 (full braking capacity) to 1 (full driving capacity).
+        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete; the indices
+            0 to K - 1 stand for K evenly spaced numbers from -1 (full braking capacity) to 1 (full driving capacity).
         reward_vector: None: a reward is a number. ``vehicles``: a reward is an array [N] that contains minus the harm
             that each vehicle bears in the step. A list of components: a reward is an array with these components (see
             docs/environments.md).

@@ -148,8 +148,8 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
         agents: which vehicles are agents: ``all`` vehicles or only the ``learners``. Choose ``learners`` for training
             libraries that train every agent.
         max_cycles: number of steps after which an episode is truncated; None: at the horizon only.
-        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete; the indices 0, 1,
-            ..., K - 1 stand for evenly spaced numbers from -1 (full braking capacity) to 1 (full driving capacity).
+        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete; the indices
+            0 to K - 1 stand for K evenly spaced numbers from -1 (full braking capacity) to 1 (full driving capacity).
         reward_vector: None: a reward is a number. ``vehicles``: a reward is an array [N] that contains minus the harm
             that each vehicle bears in the step. A list of components: a reward is an array with these components (see
             docs/environments.md).

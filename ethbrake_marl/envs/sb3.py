@@ -71,8 +71,8 @@ def make_sb3_vec_env(
         step_infos: True: every step returns all infos, as the other environments do; steps are then slower. False: only
             the last step of an episode returns all infos.
         render_mode: ``rgb_array`` or None. ``render`` and ``VecVideoRecorder`` show all worlds side by side.
-        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete; the indices 0, 1,
-            ..., K - 1 stand for evenly spaced numbers from -1 (full braking capacity) to 1 (full driving capacity).
+        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete; the indices
+            0 to K - 1 stand for K evenly spaced numbers from -1 (full braking capacity) to 1 (full driving capacity).
 
     >>> import ethbrake_marl as eb
     >>> eb.make_sb3_vec_env("paper-random", 4, seed=7).reset().shape

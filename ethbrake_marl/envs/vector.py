@@ -107,8 +107,8 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
             ``infos["final_info"]`` contain the last observation and infos of the old episode. ``Disabled``: no new
             episode starts; the caller must reset the row before the next step.
         max_episode_steps: number of steps after which an episode is truncated; None: at the horizon only.
-        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete; the indices 0, 1,
-            ..., K - 1 stand for evenly spaced numbers from -1 (full braking capacity) to 1 (full driving capacity).
+        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete; the indices
+            0 to K - 1 stand for K evenly spaced numbers from -1 (full braking capacity) to 1 (full driving capacity).
         reward_vector: None: rewards are numbers, [n]. ``vehicles``: rewards are [n, N] and contain minus the harm that
             each vehicle bears in the step. A list of K components: rewards are [n, K] (see docs/environments.md).
 
