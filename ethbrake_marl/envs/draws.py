@@ -28,8 +28,8 @@ def describe_worlds(engine: Engine) -> Columns:
 
     There is one column for each quantity of a world at the alert, with the same name as in a table of initial states.
     If the scenario is a mixture, the column ``scenario`` names the drawn scenario; if the scenario has vehicle types,
-    columns such as ``vehicle_2_type`` name the drawn types. The columns ``world_seed`` and ``world`` are the same as
-    the infos with these names.
+    columns such as ``vehicle_2_type`` name the drawn types. The columns ``world_seed`` and ``world`` are the infos with
+    these names.
 
     Raises ``InvalidInput`` if the caller passed the worlds and the environment was later restored from a snapshot,
     because a snapshot does not contain these worlds. Also raises ``InvalidInput`` if the physics failed in a drawn
@@ -59,8 +59,7 @@ def describe_worlds(engine: Engine) -> Columns:
 def _drawn_again(engine: Engine, numbers: Ints) -> Sample:
     """Draw again the worlds that have the ``numbers`` in the training stream; return them in this order.
 
-    Raises ``InvalidInput`` if a drawn world differs from the running world. The two worlds differ if the physics failed
-    in the drawn world before its first decision, so that another world replaced the drawn world.
+    Raises ``InvalidInput`` if a drawn world differs from the running world (see ``describe_worlds``).
     """
     ordered, places = np.unique(numbers, return_inverse=True)
     breaks = np.flatnonzero(np.diff(ordered) > _MOST_APART) + 1

@@ -87,8 +87,8 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
 
     - Observation: the features of ``ObservationSpec``, float32 [F].
     - Action: an array [1] in [-1, 1]. -1 brakes with full capacity, 0 coasts, +1 drives with full capacity.
-    - End: an episode is *terminated* when all vehicles are at rest and no command would move one. If this does not
-      happen before the horizon, the episode is *truncated* at the horizon.
+    - End: an episode is *terminated* when all vehicles are at rest and no command would move one. Otherwise the episode
+      is *truncated* at the horizon.
     - Infos and options of ``reset``: see docs/environments.md.
 
     Args:
@@ -97,13 +97,11 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
             pictures.
         learners: a list with the one vehicle that learns, by name (``vehicle_2``) or index (0 = front); None: the
             learner of the scenario.
-        reward: reward of a step: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams``
-            object.
+        reward: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams`` object.
         observation: features that the learner observes; None: the features that the scenario declares or, if it
             declares none, default features (``observation_for``).
-        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete, and an action is
-            an index from 0 to K - 1. Index k selects number k of K evenly spaced numbers from -1 (full braking
-            capacity) to 1 (full driving capacity), counted from 0.
+        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete; the indices
+            0 to K - 1 stand for K evenly spaced numbers from -1 (full braking capacity) to 1 (full driving capacity).
         reward_vector: None: a reward is a number. ``vehicles``: a reward is an array [N] that contains minus the harm
             that each vehicle bears in the step. A list of components: a reward is an array with these components (see
             docs/environments.md).
@@ -165,9 +163,9 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
         return self._observe(), Report.of(self.engine).plain_infos(self._column)[0]
 
     def step(self, action: NDArray[Any]) -> tuple[Observations, Any, bool, bool, dict[str, Any]]:
-        """Advance by one time step, and return observation, reward, terminated, truncated and info.
+        """Advance by one time step with an ``action`` [1] in [-1, 1].
 
-        ``action`` is an array [1] in [-1, 1]: -1 brakes with full capacity, 0 coasts, +1 drives with full capacity.
+        Returns observation, reward, terminated, truncated and info.
         """
         if not self._running:
             raise InvalidInput("step: no episode is running; call reset first")

@@ -68,13 +68,9 @@ def shield_columns(engine: Engine, rows: Ints | None = None) -> Columns:
 def plain_rows(columns: Columns, vehicles: Ints, count: int) -> list[dict[str, Any]]:
     """Return one dictionary of plain values for each world and vehicle, such as ``{"time_s": 0.5, "collided": 0.0}``.
 
-    The list begins with the dictionaries for the vehicles of the first world.
-
-    Args:
-        columns: mapping from the name of an info to its values, [n, N].
-        vehicles: indices of the vehicles whose infos are returned.
-        count: number of empty dictionaries to return if ``columns`` is empty.
-
+    The list begins with the dictionaries for the vehicles of the first world. ``columns`` maps the name of an info to
+    its values, [n, N]. ``vehicles`` are the indices of the vehicles whose infos are returned. If ``columns`` is empty,
+    the result is a list of ``count`` empty dictionaries.
     """
     values = [column.take(vehicles, axis=1).reshape(-1).tolist() for column in columns.values()]
     return [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)] or [{} for _ in range(count)]
@@ -174,17 +170,12 @@ class Report(NamedTuple):
         return infos
 
     def batch_info(self, vehicle: int, rows: Bools, stepped: Bools) -> dict[str, Any]:
-        """Return one vehicle's infos in all n worlds, in the format of Gymnasium's vector environments.
+        """Return the infos of one vehicle (index) in all n worlds, in the format of Gymnasium's vector environments.
 
         The result contains two arrays for each info, for example ``time_s`` [n] and ``_time_s`` [n]. ``_time_s`` is
-        true for the worlds in which ``time_s`` has a value.
-
-        Args:
-            vehicle: index of the vehicle whose infos are returned (0 = front).
-            rows: mask [n], True for the worlds whose infos have values.
-            stepped: mask [n], True for each world in which the last step belongs to the running episode, not to the
-                episode before it. In all other worlds ``cost`` and the reward terms are 0.
-
+        ``rows`` [n], which is true for the worlds in which ``time_s`` has a value. ``stepped`` [n] is true for each
+        world in which the last step belongs to the running episode, not to the episode before it; in all other worlds
+        ``cost`` and the reward terms are 0.
         """
         columns: dict[str, NDArray[Any]] = {name: info[:, vehicle] for name, info in self.columns().items()}
         columns["collided"] = columns["collided"] == 1.0
@@ -208,14 +199,10 @@ class Report(NamedTuple):
 
 @compiled
 def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> None:
-    """Write the values of the infos in ``COLUMNS`` to ``out``.
+    """Write the values of the infos in ``COLUMNS`` to ``out``, [n, N, len(COLUMNS)].
 
-    Args:
-        state: packed states of the worlds (``physics.columns``), which contain motion and harm.
-        params: packed parameters of the worlds (``physics.columns``), which contain masses and capacities.
-        wanted: chosen command of each vehicle, [n, N] m/s2.
-        out: array to write to, [n, N, len(COLUMNS)].
-
+    ``state`` and ``params`` are the packed states and parameters of the worlds (``physics.columns``), and ``wanted``
+    [n, N] are the chosen commands, m/s2.
     """
     n, N = wanted.shape
     column = columns(state)
@@ -251,7 +238,7 @@ def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> 
 
 
 class Begun:
-    """Base class of all environments. This class starts episodes with a seed and options.
+    """Base class of all environments, which starts episodes with a seed and options.
 
     A subclass sets ``engine`` in its constructor, and calls ``_restart`` in its ``reset``. The worlds of a seed form a
     *stream*: each new episode takes the next world of this seed. ``np_random`` and ``np_random_seed`` have the same
@@ -299,18 +286,13 @@ class Begun:
 
         With ``options["initial_state"]``, every world starts in this state, which ``scenario.tables.worlds_from_state``
         reads. With ``options["listed_world"] = {"seed": 7, "number": 3}``, the first world is world 3 of the evaluation
-        list with seed 7, the second world is world 4 of this list, and so on. Later episodes, which start without a
-        call of ``reset``, take the next worlds of the stream. For other options a warning ``UnknownResetOption`` is
-        issued, and these options are ignored.
-
-        Args:
-            seed: start with the first world of this seed; None: continue with the next world of the stream.
-            options: the options of ``reset``; None: there are no options.
+        list with seed 7, the second world is world 4, and so on. Later episodes, which start without a call of
+        ``reset``, take the next worlds of the stream. For other options a warning ``UnknownResetOption`` is issued, and
+        these options are ignored. ``seed`` starts with the first world of this seed; None: continue with the next world
+        of the stream.
 
         Raises ``InvalidInput`` for a seed that is not a whole number >= 0, for an invalid initial state or listed
-        world, or if the options contain both an initial state and a listed world. If this error is raised, the
-        environment stays unchanged.
-
+        world, or if the options contain both an initial state and a listed world. The environment then stays unchanged.
         """
         named = None if seed is None else chosen_seed(seed)
         if not (options is None or isinstance(options, Mapping)):
@@ -345,17 +327,14 @@ class Begun:
     def describe_worlds(self) -> Columns:
         """Return what was drawn at random for each running world: a mapping from column names to values [n].
 
-        The columns are described in ``envs.draws.describe_worlds``.
+        See ``envs.draws.describe_worlds`` for the columns.
         """
         self._check_started("describe_worlds")
         return describe_worlds(self.engine)
 
 
 class OneWorld(Begun):
-    """Base class of environments with a single world. This class defines ``describe_world``, ``render`` and ``close``.
-
-    A subclass sets ``viewer`` in its constructor.
-    """
+    """Base class of environments with a single world. A subclass sets ``viewer`` in its constructor."""
 
     viewer: Viewer  # object that draws pictures of the running episode
 

@@ -49,8 +49,8 @@ def reward_box(engine: Engine) -> Box[np.float64]:
 def learner_action_space(actions: int | None) -> Any:
     """Return the action space of a learner.
 
-    ``actions`` is the number of discrete actions, at least 2. If ``actions`` is None, the result is ``action_box()``.
-    Raises ``InvalidInput`` if ``actions`` is anything else.
+    ``actions`` is the number of discrete actions, at least 2; None: the result is ``action_box()``. Raises
+    ``InvalidInput`` if ``actions`` is anything else.
     """
     if actions is None:
         return action_box()
@@ -75,12 +75,11 @@ def make_engine(
             ``Scenario``.
         n: number of worlds that are simulated together, at least 1.
         learners: vehicles that learn, by name (``vehicle_2``) or index (0 = front); None: the learners of the scenario.
-        reward: reward of a step: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams``
-            object.
+        reward: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams`` object.
         observation: features that every vehicle observes, or a mapping from each vehicle's name to its features; None:
             the features that the scenario declares or, if it declares none, default features.
         seed: seed of the stream of worlds.
-        reward_vector: components of a vector reward. The result of a step contains the vector reward as ``vector``, in
+        reward_vector: components of a vector reward, which the result of a step then contains as ``vector``, in
             addition to ``reward``. None: there is no vector reward.
 
     >>> import ethbrake_marl as eb
@@ -127,14 +126,14 @@ def only_learner(engine: Engine) -> int:
 def learner_actions(engine: Engine, actions: Mapping[str, Any], count: int | None) -> Floats | dict[int, Floats]:
     """Return the actions of the L learners as an array [1, L], which ``Engine.step`` accepts for one world.
 
-    If the engine has a shield, actions may be missing. If actions are missing, the result is a mapping from the index
-    of each learner that has an action to this action [1].
+    If the engine has a shield, actions may be missing. If some are missing, the result is a mapping from the index of
+    each learner that has an action to this action [1].
 
     Args:
         engine: engine with one world.
         actions: mapping from the name of each learner to its action [1] or, with discrete actions, to the index of the
             action.
-        count: number of discrete actions; None: the actions are not discrete, but numbers in [-1, 1].
+        count: number of discrete actions; None: actions are numbers in [-1, 1].
 
     Raises ``InvalidInput``, which names the vehicle, if an action has the wrong shape, or if an action is missing and
     the engine has no shield. This function does not check the range of the actions, because ``Engine.step`` checks it.
@@ -168,7 +167,7 @@ class UnknownResetOption(UserWarning):
 
 
 class IgnoredAction(UserWarning):
-    """Warning: an action was passed for a vehicle that follows a script. The environment ignores this action."""
+    """Warning: an action was passed for a vehicle that follows a script, and is ignored."""
 
 
 def chosen_seed(seed: int | None) -> int:
@@ -189,9 +188,8 @@ def wanted_worlds(engine: Engine, options: Mapping[str, Any]) -> Worlds | None:
     """Return the worlds that the ``options`` of a reset choose, one for each of the engine's worlds.
 
     With the key ``initial_state``, all worlds start in this state. With the key ``listed_world``, the worlds are
-    consecutive worlds of an evaluation list. If ``options`` contains neither key, the result is None: the stream
-    supplies the worlds. Raises ``InvalidInput`` if ``options`` contains both ``initial_state`` and ``listed_world``, or
-    if the value of a key is invalid.
+    consecutive worlds of an evaluation list. With neither key the result is None: the stream supplies the worlds.
+    Raises ``InvalidInput`` for both keys together, and for an invalid value.
     """
     if LISTED_WORLD not in options:
         if INITIAL_STATE not in options:

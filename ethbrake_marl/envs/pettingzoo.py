@@ -57,7 +57,7 @@ class SeededInside:
 
 
 class Ordered(SeededInside, OrderEnforcingWrapper):  # type: ignore[misc]  # PettingZoo is untyped
-    """PettingZoo's ``OrderEnforcingWrapper``, whose ``np_random`` is that of the environment inside the wrapper."""
+    """PettingZoo's ``OrderEnforcingWrapper`` with the random generator of the innermost environment."""
 
     def __str__(self) -> str:
         return str(self.env)
@@ -142,17 +142,14 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
         render_mode: ``human``, ``rgb_array``, ``rgb_array_list`` or ``ansi`` (see docs/environments.md); None: no
             pictures.
         learners: vehicles that learn, by name (``vehicle_2``) or index (0 = front); None: the learners of the scenario.
-        reward: reward of a step: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams``
-            object.
+        reward: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams`` object.
         observation: features that every vehicle observes, or a mapping from each vehicle's name to its features; None:
             the features that the scenario declares or, if it declares none, default features.
         agents: which vehicles are agents: ``all`` vehicles or only the ``learners``. Choose ``learners`` for training
             libraries that train every agent.
-        max_cycles: number of steps after which an episode is truncated; None: an episode is truncated at the horizon
-            only.
-        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete, and an action is
-            an index from 0 to K - 1. Index k selects number k of K evenly spaced numbers from -1 (full braking
-            capacity) to 1 (full driving capacity), counted from 0.
+        max_cycles: number of steps after which an episode is truncated; None: at the horizon only.
+        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete; the indices
+            0 to K - 1 stand for K evenly spaced numbers from -1 (full braking capacity) to 1 (full driving capacity).
         reward_vector: None: a reward is a number. ``vehicles``: a reward is an array [N] that contains minus the harm
             that each vehicle bears in the step. A list of components: a reward is an array with these components (see
             docs/environments.md).
@@ -252,9 +249,8 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
     ) -> tuple[dict[str, Observations], dict[str, Any], dict[str, bool], dict[str, bool], Infos]:
         """Advance by one time step; return observations, rewards, terminations, truncations and infos of all agents.
 
-        ``actions`` is a mapping from the names of agents to their actions, each [1] in [-1, 1]. Each of the five
-        results is a mapping from the names of agents, too. Raises ``InvalidInput``, which names the learner, if the
-        action of a learner is missing or invalid.
+        ``actions`` and the five results are mappings from the names of agents; each action is [1] in [-1, 1]. Raises
+        ``InvalidInput``, which names the learner, if the action of a learner is missing or invalid.
         """
         if not self.agents:
             raise InvalidInput("step: no episode is running; call reset first")
@@ -352,7 +348,7 @@ def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[s
 
 
 def env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
-    """Return the environment in which agents act one after another (AEC), the same as ``raw_env``.
+    """Return the same AEC environment as ``raw_env``: agents act one after another, from front to rear.
 
     ``scenario`` and ``settings`` have the same meaning as in ``parallel_env``. An invalid action raises
     ``InvalidInput``. After this error the episode goes on, and it is the same agent's turn again.

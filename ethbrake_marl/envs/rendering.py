@@ -53,12 +53,12 @@ class Struck(NamedTuple):
 
     @property
     def who(self) -> str:
-        """Text that names the two parties of the impact, such as "Vehicles 1 and 2"."""
+        """The two parties of the impact, such as "Vehicles 1 and 2"."""
         return "Vehicle 1 and the obstacle" if self.pair < 0 else f"Vehicles {self.pair + 1} and {self.pair + 2}"
 
     @property
     def speed(self) -> str:
-        """The closing speed of the impact as a text, such as "3.2 m/s" or "< 0.1 m/s"."""
+        """Closing speed of the impact, such as "3.2 m/s" or "< 0.1 m/s"."""
         return f"{self.closing_mps:.1f} m/s" if self.closing_mps >= 0.05 else "< 0.1 m/s"
 
 
@@ -165,8 +165,7 @@ def follow(view: View, front_m: Floats) -> View:
 def star(x: float, y: float, far: float, near: float) -> list[tuple[float, float]]:
     """Return the 16 corners of a star with eight points and the centre (x, y).
 
-    ``far`` is the distance of the points from the centre; ``near`` is the distance of the inner corners from the
-    centre.
+    ``far`` and ``near`` are the distances of the points and of the inner corners from the centre.
     """
     return [
         (x + r * math.cos(k * math.pi / 8), y + r * math.sin(k * math.pi / 8)) for k, r in enumerate([far, near] * 8)
@@ -206,7 +205,7 @@ class _Pen:
         self._draw = draw
 
     def box(self, left: float, top: float, right: float, bottom: float, fill: str, edge: str | None = None) -> None:
-        """Draw a box with slightly round corners in the colour ``fill``; its edge has the colour ``edge``."""
+        """Draw a box with slightly round corners in the colour ``fill``, with an edge in the colour ``edge``."""
         corners = [value * _FINE for value in (left, top, max(right, left + 1), max(bottom, top + 1))]
         self._draw.rounded_rectangle(corners, 2 * _FINE, fill=fill, outline=edge, width=_FINE * 2)
 
@@ -215,7 +214,7 @@ class _Pen:
         self._draw.line([x1 * _FINE, y1 * _FINE, x2 * _FINE, y2 * _FINE], fill=colour, width=round(width * _FINE))
 
     def shape(self, points: list[tuple[float, float]], fill: str, edge: str | None = None) -> None:
-        """Draw a polygon with the corners ``points`` in the colour ``fill``; its edge has the colour ``edge``."""
+        """Draw a polygon with the corners ``points`` in the colour ``fill``, with an edge in the colour ``edge``."""
         self._draw.polygon([(x * _FINE, y * _FINE) for x, y in points], fill=fill, outline=edge, width=_FINE)
 
 
@@ -254,10 +253,7 @@ def _draw_vehicle(pen: _Pen, scene: Scene, i: int) -> None:
 
 
 def _draw_panel(pen: _Pen, scene: Scene, i: int) -> None:
-    """Draw the panel of vehicle ``i``.
-
-    A bar in the panel shows the command: the bar extends to the left for braking and to the right for driving.
-    """
+    """Draw the panel of vehicle ``i``. Its bar extends to the left for braking and to the right for driving."""
     left, width = _panel(scene, i)
     pen.box(left, _PANEL_TOP, left + 20, _PANEL_TOP + 18, vehicle_colour(i))
     middle, half, top = left + width / 2, width / 2, _PANEL_TOP + 62

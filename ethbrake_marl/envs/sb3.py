@@ -58,23 +58,21 @@ def make_sb3_vec_env(
         n_envs: number of worlds that are simulated together, at least 1.
         seed: seed of the stream of worlds; None: a random seed.
         learners: vehicles that learn, by name (``vehicle_2``) or index (0 = front); None: the learners of the scenario.
-        reward: reward of a step: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams``
-            object.
+        reward: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams`` object.
         observation: features that the learners observe; None: the features that the scenario declares or, if it
             declares none, default features (``observation_for``).
-        horizon_is_end: True: an episode that reaches the horizon is reported as ended, not as truncated. Therefore the
-            algorithm does not add an estimate of the return after the horizon. An estimate of the return after the
-            horizon could grow without limit, because harm after the horizon is not counted (see docs/train.md). False:
-            an episode that reaches the horizon is reported as truncated (``TimeLimit.truncated`` is true).
+        horizon_is_end: True: an episode that reaches the horizon is reported as ended, not as truncated, so that the
+            algorithm does not add an estimate of the return after the horizon. Such an estimate could grow without
+            limit, because harm after the horizon is not counted (see docs/train.md). False: an episode that reaches the
+            horizon is reported as truncated (``TimeLimit.truncated`` is true).
         appended: numbers to append to each observation. ``number``: the learner's number, counted among the learners of
             its world from the front, from 0. ``state``: the full state of the line (``game.full_state.full_state``),
             for a central critic. None: no numbers.
         step_infos: True: every step returns all infos, as the other environments do; steps are then slower. False: only
             the last step of an episode returns all infos.
         render_mode: ``rgb_array`` or None. ``render`` and ``VecVideoRecorder`` show all worlds side by side.
-        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete, and an action is
-            an index from 0 to K - 1. Index k selects number k of K evenly spaced numbers from -1 (full braking
-            capacity) to 1 (full driving capacity), counted from 0.
+        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete; the indices
+            0 to K - 1 stand for K evenly spaced numbers from -1 (full braking capacity) to 1 (full driving capacity).
 
     >>> import ethbrake_marl as eb
     >>> eb.make_sb3_vec_env("paper-random", 4, seed=7).reset().shape
@@ -107,8 +105,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         seed: seed of the stream of worlds.
         horizon_is_end: whether an episode that reaches the horizon is reported as ended, not as truncated; see
             ``make_sb3_vec_env``.
-        appended: numbers to append to each observation: ``number`` (the learner's number among the learners of its
-            world) or ``state`` (the full state of the line). None: no numbers.
+        appended: numbers to append to each observation: ``number``, ``state`` or None; see ``make_sb3_vec_env``.
         step_infos: True: every step returns all infos. False: only the last step of an episode returns all infos.
         render_mode: ``rgb_array`` or None.
         actions: number of discrete actions; None: an action is a number in [-1, 1].
@@ -159,7 +156,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         self.metadata = {**self.viewer.metadata, "render_modes": ["rgb_array"]}
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Set the seed of the worlds for the next reset, and return a list that contains this seed once per row.
+        """Set the seed of the worlds for the next reset; return a list that contains this seed once per row.
 
         If ``seed`` is None, the seed is random. All rows have the same seed, because they share one stream of worlds.
         """
@@ -276,13 +273,9 @@ class EthBrakeVecEnv(Begun, VecEnv):
         return [False for _ in self._get_indices(indices)]
 
     def _close_episodes(self, ended: Ints, step: Step, infos: list[dict[str, Any]]) -> None:
-        """Write the final infos of the ended episodes into ``infos``. Call this method before the next episodes start.
+        """Write the final infos of the episodes that have ended in the worlds ``ended`` (indices) into ``infos``.
 
-        Args:
-            ended: indices of the worlds whose episodes have ended.
-            step: results of the last step.
-            infos: list with one dictionary per row; the dictionaries in the rows of ended episodes are replaced.
-
+        Call this method before the next episodes start.
         """
         rows, final = self._rows(ended), self._observe(ended)
         plain = Report.of(self.engine, step, ended).plain_infos(self._learners)
@@ -315,10 +308,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         """Ignore the empty infos that the constructor of Stable-Baselines3's ``VecEnv`` assigns."""
 
     def _observe(self, worlds: Ints | None = None) -> Observations:
-        """Return the observations of all learners as a new array, float32 [rows, F].
-
-        ``worlds`` are the indices of the worlds whose learners' observations are returned; None: all worlds.
-        """
+        """Return the observations of all learners in ``worlds`` (indices; None: all worlds), a new array [rows, F]."""
         every = self.engine.observe_all(self._learners, worlds)
         rows = every.reshape(-1, every.shape[2])
         if self.appended is None:

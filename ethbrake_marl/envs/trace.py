@@ -1,7 +1,7 @@
 """``Trace``: object that records how the vehicles of an engine move, so that pictures can show any moment.
 
-A ``Trace`` records the state and the commands at the beginning of each step. From this state and these commands the
-``Trace`` computes the exact state at any moment within the step.
+A ``Trace`` records the state and the commands at the beginning of each step, and computes from them the exact state at
+any moment within the step.
 """
 
 from __future__ import annotations
@@ -61,14 +61,10 @@ class Motion:
         return replace(self, command_mps2=command, until_s=worlds.time_s, parts=parts)
 
     def scenes(self, engine: Engine, row: int, times_s: Floats | None = None) -> list[Scene]:
-        """Return the scenes of one world at several times. The motion must have an end (see ``closed``).
+        """Return the scenes of the world ``row`` at several times. The motion must have an end (see ``closed``).
 
-        Args:
-            engine: the engine whose worlds were recorded.
-            row: index of the world whose scenes are returned.
-            times_s: times within this motion in increasing order, [k] s since the alert; None: only the end of the
-                motion.
-
+        ``times_s`` [k] are times within this motion in increasing order, s since the alert; None: only the end of the
+        motion.
         """
         times = self.until_s[[row]] if times_s is None else times_s
         alert_view = View(float(self.left_m[row]), float(self.right_m[row]))
@@ -138,13 +134,9 @@ class Trace:
         engine.watch(self, () if alert is None else self.begun((), alert, np.arange(alert.n)))
 
     def begun(self, memory: Memory, alert: Worlds, rows: Ints) -> Memory:
-        """Return the recorded motions, updated for new episodes that have started in the worlds ``rows``.
+        """Return the recorded motions, updated for new episodes that have started in the worlds ``rows`` (indices).
 
-        Args:
-            memory: the motions recorded before this call.
-            alert: the worlds of the new episodes at the alert.
-            rows: indices of the worlds in which new episodes have started.
-
+        ``memory`` are the motions recorded so far, and ``alert`` the worlds of the new episodes at the alert.
         """
         v, n = alert.vehicles, alert.n
         # The view contains the whole line until all vehicles are at rest if all brake fully as soon as they can. A rear
@@ -172,17 +164,10 @@ class Trace:
         return (replace(last, start=last.start.assign(rows, alert), struck=struck, **columns),)
 
     def stepped(self, memory: Memory, before: Engine, after: Engine) -> Memory:
-        """Return the recorded motions after a step.
+        """Return the recorded motions after a step; only the last one is open.
 
-        If the constructor's argument ``whole`` is true, the result contains all motions of the episode so far, of which
-        only the last one is open (its end is not yet known). If ``whole`` is false, the result contains only the motion
-        of the new step.
-
-        Args:
-            memory: the motions recorded before this call.
-            before: the engine before the step.
-            after: the engine after the step.
-
+        If ``whole`` is true, the result contains all motions of the episode so far, otherwise only the motion of the
+        new step. ``before`` and ``after`` are the engine before and after the step.
         """
         last = memory[-1].closed(before)
         front_m, met = last.front_m, [last.struck]

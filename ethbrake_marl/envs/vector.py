@@ -38,8 +38,8 @@ from ethbrake_marl.physics.state import Bools, Floats
 class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArray[Any]]):
     """Wrapper whose ``step`` also returns a cost, as Safety-Gymnasium does, for example for OmniSafe.
 
-    ``step`` returns observation, reward, cost, terminated, truncated and info. The cost is the harm (m2/s2) that the
-    step added to the whole line: first-impact or total harm, whichever the reward uses.
+    The cost is the harm (m2/s2) that the step added to the whole line: first-impact or total harm, whichever the reward
+    uses.
 
     Args:
         env: an ``EthBrakeEnv``, or wrappers that pass on the infos of an ``EthBrakeEnv`` inside.
@@ -67,9 +67,9 @@ class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArra
     def step(  # type: ignore[override]  # six values, as safe-RL libraries have it
         self, action: NDArray[Any]
     ) -> tuple[Observations, float, float, bool, bool, dict[str, Any]]:
-        """Advance by one time step, and return observation, reward, cost, terminated, truncated and info.
+        """Advance by one time step with an ``action`` [1] in [-1, 1].
 
-        ``action`` is an array [1] in [-1, 1]. The cost is the harm (m2/s2) that the step added to the whole line.
+        Returns observation, reward, cost, terminated, truncated and info.
         """
         observation, reward, terminated, truncated, info = self.env.step(action)
         if isinstance(reward, np.ndarray) and reward.ndim:
@@ -93,28 +93,24 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
     Args:
         num_envs: number of worlds that are simulated together, at least 1.
         scenario: name of a shipped scenario, path of a YAML file, or a ``Scenario``.
-        render_mode: ``rgb_array``: ``render`` returns one frame for each world; ``ansi``: ``render`` returns one text
-            for each world; None: no pictures.
+        render_mode: ``rgb_array``: ``render`` returns one frame for each world; ``ansi``: one text for each world;
+            None: no pictures.
         learners: a list with the one vehicle that learns, by name (``vehicle_2``) or index (0 = front); None: the
             learner of the scenario.
-        reward: reward of a step: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams``
-            object.
+        reward: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams`` object.
         observation: features that the learner observes; None: the features that the scenario declares or, if it
             declares none, default features (``observation_for``).
         autoreset_mode: Gymnasium's autoreset mode: what happens in a row whose episode ends. ``NextStep`` (default):
             the step that ends an episode returns the last observation of this episode. The next step ignores the row's
             action, starts a new episode in the row, and returns the reward 0 for the row. ``SameStep``: the step that
-            ends an episode also starts the next episode and returns the first observation of the next episode;
-            ``infos["final_obs"]`` and ``infos["final_info"]`` contain the last observation and infos of the old
-            episode. ``Disabled``: no new episode starts; the caller must reset the row before the next step.
-        max_episode_steps: number of steps after which an episode is truncated; None: an episode is truncated at the
-            horizon only.
-        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete, and an action is
-            an index from 0 to K - 1. Index k selects number k of K evenly spaced numbers from -1 (full braking
-            capacity) to 1 (full driving capacity), counted from 0.
-        reward_vector: None: each world has a number as its reward, so that rewards are [n]. ``vehicles``: rewards are
-            [n, N] and contain minus the harm that each vehicle bears in the step. A list of K components: rewards are
-            [n, K] (see docs/environments.md).
+            ends an episode also starts the next episode and returns its first observation; ``infos["final_obs"]`` and
+            ``infos["final_info"]`` contain the last observation and infos of the old episode. ``Disabled``: no new
+            episode starts; the caller must reset the row before the next step.
+        max_episode_steps: number of steps after which an episode is truncated; None: at the horizon only.
+        actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete; the indices
+            0 to K - 1 stand for K evenly spaced numbers from -1 (full braking capacity) to 1 (full driving capacity).
+        reward_vector: None: rewards are numbers, [n]. ``vehicles``: rewards are [n, N] and contain minus the harm that
+            each vehicle bears in the step. A list of K components: rewards are [n, K] (see docs/environments.md).
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -183,8 +179,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         """Advance every world by one time step with the actions [n, 1] in [-1, 1].
 
         Returns observations [n, F], rewards [n], terminated [n], truncated [n], and infos in the format of Gymnasium's
-        vector environments. The constructor's argument ``autoreset_mode`` determines when a new episode starts after
-        the end of an episode.
+        vector environments. ``autoreset_mode`` determines when a new episode starts after the end of an episode.
         """
         if not self._started:
             raise InvalidInput("step: no episode is running; call reset first")
@@ -222,8 +217,8 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
     def _fill_ignored(self, actions: NDArray[Any], before: Bools) -> NDArray[Any]:
         """Return ``actions`` with the action 0 in each world whose action is ignored.
 
-        In the autoreset mode ``NextStep``, the action of a world is ignored if its episode had ended before the step.
-        The mask ``before`` [n] is true for the worlds whose episode had ended before the step.
+        In the autoreset mode ``NextStep`` these are the worlds whose episode had ended before the step, for which
+        ``before`` [n] is true.
         """
         if self.autoreset_mode is not AutoresetMode.NEXT_STEP or not before.any():
             return actions

@@ -21,9 +21,9 @@ class Viewer:
 
     Args:
         engine: the engine whose worlds are shown, from the engine's next reset on.
-        mode: render mode: ``human``, ``rgb_array``, ``rgb_array_list`` or ``ansi``; None: the viewer draws no pictures.
-        batch: True: the environment has many worlds, all of which are shown. With many worlds only the modes
-            ``rgb_array`` and ``ansi`` are allowed. False: the environment has one world.
+        mode: render mode: ``human``, ``rgb_array``, ``rgb_array_list`` or ``ansi``; None: no pictures.
+        batch: whether the environment has many worlds, all of which are shown; only the modes ``rgb_array`` and
+            ``ansi`` are then allowed.
 
     Raises ``InvalidInput`` for a mode that is not allowed. Raises ``MissingExtra`` for the mode ``human`` if pygame is
     not installed.
@@ -68,9 +68,7 @@ class Viewer:
     def render(self) -> Any:
         """Return a picture of the present moment, or a tuple with one picture per world if ``batch`` is true.
 
-        The type of a picture depends on the render mode. ``rgb_array``: a frame [H, W, 3] uint8. ``rgb_array_list``: a
-        list of all frames since the last call of ``render``. ``ansi``: a text. ``human``: None, because a window
-        already shows every step.
+        The type of a picture is as in ``OneWorld.render``.
         """
         motions = self._motions(f"render: the environment needs a render_mode: {', '.join(self.modes)}")
         if self.mode == "human":
@@ -85,8 +83,8 @@ class Viewer:
     def step_frames(self, fps: float = SMOOTH_FPS) -> list[Frame]:
         """Return frames [H, W, 3] of the last step or, after a reset, of the motion up to the first decision.
 
-        ``fps`` is the number of frames per second of the motion. Raises ``InvalidInput`` before the first reset, if the
-        viewer has no render mode, and unless ``fps`` is a whole number of at least 1.
+        Raises ``InvalidInput`` before the first reset, if the viewer has no render mode, and unless ``fps`` (frames per
+        second) is a whole number of at least 1.
         """
         check_whole_number("step_frames: fps", fps, 1)
         motion = self._motions("step_frames: the environment needs the render_mode 'rgb_array'")[-1]

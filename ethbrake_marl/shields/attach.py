@@ -18,7 +18,7 @@ from ethbrake_marl.shields.options import ShieldOptions
 
 
 def proposing_agent(policy: object, where: str) -> Agent:
-    """Return ``policy`` as an agent: an agent is returned unchanged, a learned policy becomes a ``LearnedAgent``.
+    """Return ``policy`` as an agent: a learned policy becomes a ``LearnedAgent``.
 
     Raises ``InvalidInput`` if ``policy`` is neither an agent nor a learned policy; the message begins with ``where``.
     """
@@ -38,14 +38,10 @@ def proposing_agents(
 ) -> dict[int, Agent]:
     """Return the agents that propose the actions of the shielded vehicles: vehicle index -> agent.
 
-    Args:
-        policy: a team, a mapping from vehicle name to policy, or one policy that proposes the actions of all vehicles.
-        vehicles: indices of the shielded vehicles.
-        where: name with which error messages begin: the function or class that the user called.
-
-    Raises ``InvalidInput`` for any other type of ``policy``, and if a team or mapping does not contain exactly the
-    shielded vehicles.
-
+    ``policy`` is a team, a mapping from vehicle name to policy, or one policy that proposes the actions of all
+    vehicles. ``vehicles`` are the indices of the shielded vehicles. Raises ``InvalidInput``, with a message that begins
+    with ``where``, for any other type of ``policy``, and if a team or mapping does not contain exactly the shielded
+    vehicles.
     """
     if isinstance(policy, Team):
         drivers: dict[int, Agent] = policy.drivers
@@ -66,17 +62,11 @@ Proposing = Agent | LearnedPolicy | Team | Mapping[str, Agent | LearnedPolicy]
 
 
 def guard_of(engine: Engine, policy: Proposing | None, options: ShieldOptions) -> ShieldGuard:
-    """Return a guard that shields all learners of an engine.
+    """Return a guard that shields all learners of an engine; this function does not change the engine.
 
-    Args:
-        engine: the engine whose learners are shielded; this function does not change the engine.
-        policy: policy that proposes the actions that the caller leaves out. In all modes except ``episode``, ``policy``
-            may be None.
-        options: settings of the shield, such as its mode.
-
-    Raises ``InvalidInput`` if no vehicle learns, if several vehicles learn and the mode is not ``step``, and if
-    ``policy`` is of the wrong type.
-
+    ``policy`` proposes the actions that the caller leaves out; it may be None in all modes except ``episode``. Raises
+    ``InvalidInput`` if no vehicle learns, if several vehicles learn and the mode is not ``step``, and if ``policy`` is
+    of the wrong type.
     """
     where, mode, scenario, vehicles = options.where, options.mode, engine.scenario, engine.learners
     if not vehicles:
@@ -110,8 +100,7 @@ class Attached:
         where: name with which error messages begin: the name of the shield wrapper.
         options: keywords of ``ShieldOptions``.
 
-    An ``Attached`` object has the attributes ``engine``, ``guard`` and ``options``. Raises ``InvalidInput`` if ``env``
-    is not an environment of this package, or if ``env`` already has a shield.
+    Raises ``InvalidInput`` if ``env`` is not an environment of this package, or if ``env`` already has a shield.
 
     """
 
@@ -152,8 +141,8 @@ class Attached:
     def shield(self) -> Any:
         """Current state of the shield, for reading only; None before the first reset.
 
-        In mode ``step`` the state is a ``StepShield``, in mode ``episode`` it is the memory of the ``HybridAgent``. For
-        the mode of an extension, the extension defines the type of the state.
+        In mode ``step`` the state is a ``StepShield``, in mode ``episode`` the memory of the ``HybridAgent``. An
+        extension defines the type of the state for its own mode.
         """
         return self.memory.shield
 
@@ -172,10 +161,7 @@ class Attached:
             raise InvalidInput(f"{self.options.where}: this shield was closed; put a new shield around the environment")
 
     def close(self) -> None:
-        """Remove this shield from the environment.
-
-        After ``close``, the attributes ``memory`` and ``shield`` keep their last values.
-        """
+        """Remove this shield from the environment; the attributes ``memory`` and ``shield`` keep their last values."""
         if self.engine.guard is self.guard:
             self._left = self.memory
             self.engine.protect(None)

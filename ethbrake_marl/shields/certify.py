@@ -1,13 +1,26 @@
 """Apply proposed actions if a plan that begins with them stays within the budget; if not, apply the backup plan.
 
-A *plan* is a sequence of actions, one for each decision up to the horizon. The *backup* is the present plan of the
-shield. The *budget* is the largest harm that the shield accepts for the whole episode. The shield may consider several
-*possible worlds* (members) for each world. Each plan is simulated in all possible worlds of a world, with the compiled
-functions of the module ``members``.
+The *backup* is the shield's present plan. Two plans that begin with the proposed action are simulated: one continues
+with the rest of the backup, the other with the constant action that does the least harm. Each plan is simulated in all
+possible worlds (members) of a world, with the compiled functions of the module ``members``. The *harm of a plan* is the
+harm of the whole episode if the plan is executed from now on, in the worst possible world, m2/s2. The module ``step``
+proves that the harm of the episode never exceeds the bound at the alert.
 
-Two plans that begin with the proposed action are simulated. One plan continues with the rest of the backup, the other
-with the constant action that does the least harm. The module ``step`` proves that the harm of the episode never exceeds
-the bound at the alert.
+Arguments that several functions share, for one world with M possible worlds, K shielded vehicles and L decisions:
+
+- ``world``: parameters of the possible worlds.
+- ``states`` [M, S], ``ended`` [M]: their present states, in the layout of ``Running.states``, and whether their
+  episodes have ended.
+- ``step``: number of the present decision.
+- ``constants`` [C, K]: constant actions that may replace the rest of a plan.
+- ``plan`` [L, K]: the present plan, with the actions of each decision; changed in place.
+- ``budget``, ``certified``: the budget, and the harm of the present plan, m2/s2.
+- ``after`` [M, S], ``over`` [M]: receive the states after the step, and whether the episodes have then ended.
+- ``out`` [K, 4]: receives each shielded vehicle's applied action, reason, bound and margin.
+- ``room`` [2, L, K], ``trial`` [L, K], ``tried`` [2, K]: workspaces for the plans and actions that are tried.
+
+Functions for n worlds take arrays of budgets [n], plans [n, L, K] and results [n, K, 4]; ``after`` and ``over`` then
+have n * M rows.
 """
 
 from __future__ import annotations
@@ -57,14 +70,6 @@ def best_constant(world: Members, states: Floats, ended: Bools, step: int, const
 
     The harm of a constant action is the largest harm over the possible worlds if the action is held from now to the
     horizon. The time until the horizon is simulated as one segment, not decision by decision.
-
-    Args:
-        world: parameters of the M possible worlds that the shield considers for one world (``Members``).
-        states: present state of each possible world, [M, S], in the layout of ``Running.states``.
-        ended: for each possible world, True if the episode has ended, [M].
-        step: number of the present decision.
-        constants: C constant actions to try, each with one number per shielded vehicle, [C, K].
-
     """
     best, least, critical = 0, math.inf, 0
     for c in range(constants.shape[0]):
@@ -88,20 +93,8 @@ def better_plan(
 ) -> tuple[float, float]:  # fmt: skip
     """Replace the rest of a plan by the best constant action if the new harm is below ``value`` and at most ``most``.
 
-    Args:
-        world: parameters of the M possible worlds that the shield considers for one world (``Members``).
-        states: present state of each possible world, [M, S], in the layout of ``Running.states``.
-        ended: for each possible world, True if the episode has ended, [M].
-        step: number of the present decision; actions from this decision on are replaced.
-        constants: C constant actions to try, each with one number per shielded vehicle, [C, K].
-        value: harm of the present ``plan``, the largest over the possible worlds, m2/s2.
-        most: largest harm that the new plan may have, m2/s2.
-        plan: the present plan, with the actions of each decision, [L, K]; changed in place.
-        trial: memory into which the function writes the plan that it tries, [L, K].
-
-    Returns the harm of the resulting plan, and the least harm of all plans that were tried, whether accepted or not
-    (both m2/s2).
-
+    ``value`` is the harm of ``plan``. Actions from decision ``step`` on are replaced. Returns the harm of the resulting
+    plan, and the least harm of all plans that were tried, whether accepted or not (both m2/s2).
     """
     so_far = worst_so_far(world, states)
     if value <= so_far or so_far > most:  # nothing can be better
@@ -121,14 +114,13 @@ def better_plan(
 
 @compiled
 def copy_action(action: Floats, to: Floats) -> None:
-    """Copy every entry of ``action`` into the array ``to`` of the same length."""
     for c in range(to.shape[0]):
         to[c] = action[c]
 
 
 @compiled
 def is_planned(action: Floats, planned: Floats) -> bool:
-    """Return whether the actions ``action`` [K] of all K shielded vehicles equal their ``planned`` actions [K]."""
+    """Return whether the actions ``action`` [K] of all shielded vehicles equal their ``planned`` actions [K]."""
     for c in range(planned.shape[0]):  # noqa: SIM110  # all() is not compiled
         if action[c] != planned[c]:
             return False
@@ -140,29 +132,14 @@ def try_action(
     world: Members, states: Floats, ended: Bools, step: int, action: Floats, budget: float, certified: float,
     constants: Floats, plan: Floats, room: Floats, after: Floats, over: Bools,
 ) -> tuple[float, float, int]:  # fmt: skip
-    """Simulate one step with ``action``; then search for a plan, from the next state on, that stays within the budget.
+    """Simulate one step with ``action`` [K]; then search for a plan after this step that stays within the budget.
 
     The plan that is tried first continues after ``action`` with the rest of the present plan; the other plans continue
     after ``action`` with a constant action. An action for which the physics fails is not certified.
 
-    Args:
-        world: parameters of the M possible worlds that the shield considers for one world (``Members``).
-        states: present state of each possible world, [M, S], in the layout of ``Running.states``.
-        ended: for each possible world, True if the episode has ended, [M].
-        step: number of the present decision.
-        action: actions whose consequences are tried, one per shielded vehicle, [K].
-        budget: largest harm of the whole episode that the shield accepts, m2/s2.
-        certified: harm of the present ``plan``, m2/s2.
-        constants: C constant actions to try, each with one number per shielded vehicle, [C, K].
-        plan: the shield's present plan, [L, K]. If the search succeeds, ``plan`` is replaced in place by the plan
-            found, which begins with ``action``.
-        room: memory for two plans, into which the function writes the plans that it tries, [2, L, K].
-        after: receives the state of each possible world after the step, [M, S].
-        over: for each possible world, receives True if the episode has ended after the step, [M].
-
     Returns the harm of the resulting plan, the least harm of all plans that were tried (both m2/s2), and the reason (a
-    code of ``ShieldReason``). The search has succeeded if the harm of the resulting plan is at most ``budget``.
-
+    code of ``ShieldReason``). The search has succeeded if the harm of the resulting plan is at most ``budget``;
+    ``plan`` is then the resulting plan, which begins with ``action``.
     """
     going = take_steps(world, states, ended, step, action, after, over)
     value = worst_so_far(world, after) if going >= 0 else math.inf
@@ -185,17 +162,10 @@ def try_action(
 
 @compiled
 def tell_action(out: Floats, action: Floats, bound: float, margin: float) -> None:
-    """Write the applied action, bound and margin of each shielded vehicle into its row of ``out``.
+    """Write the applied actions ``action`` [K], ``bound`` and ``margin`` (m2/s2) into ``out``.
 
-    If a vehicle's proposal was rejected, the vehicle's margin in ``out`` does not change.
-
-    Args:
-        out: columns ``APPLIED``, ``REASON``, ``BOUND`` and ``MARGIN`` for each vehicle, [K, 4]; changed in place. The
-            caller must already have written the column ``REASON``.
-        action: applied actions, [K].
-        bound: harm that the episode will not exceed, m2/s2.
-        margin: budget minus the harm of the plan after this decision, m2/s2.
-
+    ``margin`` is the budget minus the harm of the plan after this decision. If a vehicle's proposal was rejected, the
+    vehicle's margin in ``out`` does not change. The caller must already have written the column ``REASON``.
     """
     for c in range(action.shape[0]):
         out[c, APPLIED], out[c, BOUND] = action[c], bound
@@ -214,25 +184,8 @@ def decide_world(
     budget, the proposals are tried one by one, front to rear, while the other vehicles act as planned. An accepted
     proposal becomes part of the plan before the next vehicle's proposal is tried.
 
-    Args:
-        world: parameters of the M possible worlds that the shield considers for one world (``Members``).
-        states: present state of each possible world, [M, S], in the layout of ``Running.states``.
-        ended: for each possible world, True if the episode has ended, [M].
-        step: number of the present decision.
-        proposed: proposed actions, [K]; NaN for a vehicle without a proposal.
-        budget: largest harm of the whole episode that the shield accepts, m2/s2.
-        certified: harm of the present ``plan``, m2/s2.
-        constants: constant actions that may replace the rest of a plan, [C, K].
-        plan: the present plan, with the actions of each decision, [L, K]; replaced in place by the new plan, whose harm
-            is written into the column ``BOUND`` of ``out``.
-        room: memory for two plans, into which the function writes the plans that it tries, [2, L, K].
-        tried: workspace for the actions that are tried, [2, K].
-        after: receives the state of each possible world after the step, [M, S].
-        over: for each possible world, receives True if the episode has ended after the step, [M].
-        out: receives, for each shielded vehicle, the applied action, reason, bound and margin, [K, 4].
-
-    Returns False if the physics fails with the actions to apply, otherwise True.
-
+    ``proposed`` [K] is NaN for a vehicle without a proposal. The harm of the new plan is written into the column
+    ``BOUND`` of ``out``. Returns False if the physics fails with the actions to apply, otherwise True.
     """
     deviating = 0
     for c in range(proposed.shape[0]):
@@ -278,20 +231,8 @@ def certify_worlds(
 ) -> None:  # fmt: skip
     """Call ``decide_world`` for each world whose episode has not ended.
 
-    A world whose episode has ended keeps its state and its plan.
-
-    Args:
-        running: the running episodes at this decision, in n worlds with M possible worlds each.
-        proposed: proposed actions, [n, K]; NaN for a vehicle without a proposal.
-        budget: largest harm of the whole episode that the shield accepts in each world, [n] m2/s2.
-        certified: harm of each of the present ``plans``, [n] m2/s2.
-        constants: constant actions that may replace the rest of a plan, [C, K].
-        plans: plan of each world, with the actions of each decision, [n, L, K]; changed in place.
-        after: receives the state of each possible world after the step, [n * M, S].
-        out: receives, for each shielded vehicle, the applied action, reason, bound and margin, [n, K, 4].
-        over: for each possible world, receives True if the episode has ended after the step, [n * M].
-        failed: for each world, receives True if the physics failed, [n].
-
+    A world whose episode has ended keeps its state and its plan. ``proposed`` [n, K] is NaN for a vehicle without a
+    proposal. ``failed`` [n] receives True for each world in which the physics failed.
     """
     n, every = running.steps.shape[0], all_members(running)
     room, tried = np.zeros((2, plans.shape[1], plans.shape[2])), np.zeros((2, plans.shape[2]))
@@ -316,11 +257,10 @@ def certify_worlds(
 
 @compiled
 def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Floats) -> None:
-    """Write into ``value`` [n] m2/s2 the harm of each whole episode if its plan is executed from now on.
+    """Write into ``value`` [n] m2/s2 the harm of each plan in ``plans``; infinite if the physics fails.
 
-    The harm of a plan is the largest harm over the possible worlds, and infinite if the physics fails. If one of the
-    ``constants`` [C, K], repeated up to the horizon, does less harm than the rest of a plan in ``plans`` [n, L, K],
-    this constant action replaces the rest of the plan, and ``value`` contains the harm of the changed plan.
+    If one of the ``constants``, repeated up to the horizon, does less harm than the rest of a plan, this constant
+    action replaces the rest of the plan, and ``value`` contains the harm of the changed plan.
     """
     n, every = running.steps.shape[0], all_members(running)
     trial = np.zeros((plans.shape[1], plans.shape[2]))
@@ -339,9 +279,8 @@ def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Flo
 def ends_of_plans(running: Running, plans: Floats, rests: Bools, borne: Floats) -> None:
     """Simulate the ``plans`` [n, L, K] from now on and report how the episodes end.
 
-    ``running`` contains n worlds, each with M possible worlds. The results are written into the arrays ``rests`` and
-    ``borne``. ``rests`` [n] is True for the worlds in which all vehicles come to rest before the horizon and stay at
-    rest, in every possible world. ``borne`` [n * M, N] is the harm that each vehicle bears in the whole episode, m2/s2
+    ``rests`` [n] receives True for the worlds in which all vehicles come to rest before the horizon and stay at rest,
+    in every possible world. ``borne`` [n * M, N] receives the harm that each vehicle bears in the whole episode, m2/s2
     (0 for an obstacle ahead).
     """
     n, every = running.steps.shape[0], all_members(running)
@@ -357,18 +296,12 @@ def ends_of_plans(running: Running, plans: Floats, rests: Bools, borne: Floats) 
 
 @compiled
 def descend_constants(running: Running, grid: Floats, rounds: int, action: Floats) -> None:
-    """Improve the vehicles' constant actions by coordinate descent: change the action of one vehicle at a time.
+    """Improve the vehicles' constant actions ``action`` [n, K] by coordinate descent; ``action`` is changed in place.
 
-    For one vehicle after the other, the vehicle's action is replaced by the action in ``grid`` that does the least harm
-    while the other vehicles keep their actions. Each tried action is held to the horizon, and the time until the
-    horizon is simulated as one segment, not decision by decision.
-
-    Args:
-        running: the running episodes, in n worlds with exactly one possible world each.
-        grid: actions that are tried for each vehicle, [G].
-        rounds: how often the descent tries all actions of all vehicles.
-        action: constant action of each vehicle, [n, K]; changed in place.
-
+    For one vehicle after the other, the vehicle's action is replaced by the action in ``grid`` [G] that does the least
+    harm while the other vehicles keep their actions. The descent goes ``rounds`` times over all vehicles. Each world
+    must have exactly one possible world. Each tried action is held to the horizon, and the time until the horizon is
+    simulated as one segment, not decision by decision.
     """
     every, states, ended, steps = all_members(running), running.states, running.ended, running.steps
     for k in range(states.shape[0]):
@@ -391,7 +324,7 @@ class Backup(NamedTuple):
     """The shield's present plans in n worlds. Where a proposal is not accepted, the plan's action is applied."""
 
     plan: Floats  # [n, L], or [n, L, K] for K shielded vehicles: actions of each decision; entry j is for decision j
-    harm: Floats  # [n] harm of the episode in the worst possible world if the plan is executed from now on (m2/s2)
+    harm: Floats  # [n] harm of each plan (m2/s2)
     constants: Floats = np.array(CONSTANTS)  # [C] or [C, K] constant actions that may replace the rest of a plan
 
 
@@ -401,8 +334,8 @@ class Decision(NamedTuple):
     applied: Floats  # [n] or [n, K] actions in [-1, 1]
     intervened: Bools  # [n] or [n, K] whether the proposal was replaced (clipping to [-1, 1] does not count)
     reason: NDArray[np.int64]  # [n] or [n, K] codes of ShieldReason
-    bound: Floats  # [n] largest possible harm of the episode from now on (m2/s2)
-    margin: Floats  # [n] or [n, K] budget minus least harm found after the proposal (m2/s2); negative: rejected
+    bound: Floats  # [n] bound of the episode from now on (m2/s2)
+    margin: Floats  # [n] or [n, K] (m2/s2); negative: rejected
     after: Running  # the predicted episodes at the next decision
     backup: Backup  # the plan whose harm is the bound
 
@@ -428,11 +361,10 @@ class Decision(NamedTuple):
 
 
 def plan_harm(running: Running, plan: Floats) -> Floats:
-    """Return the harm of each whole episode if its plan is executed from now on, [n] m2/s2.
+    """Return the harm of each plan, [n] m2/s2.
 
-    ``plan`` contains the actions of each decision, [n, L], or [n, L, K] for K vehicles. Each harm is the largest harm
-    over the possible worlds, and equals, to the bit, the harm that the engine would count. Caps on the harm of single
-    vehicles are ignored.
+    ``plan`` has the shape [n, L], or [n, L, K] for K vehicles. The result equals, to the bit, the harm that the engine
+    would count. Caps are ignored.
     """
     return bettered_plan(running, plan, np.zeros(0))[1]
 
@@ -440,14 +372,7 @@ def plan_harm(running: Running, plan: Floats) -> Floats:
 def bettered_plan(running: Running, plan: Floats, constants: Floats) -> tuple[Floats, Floats]:
     """Replace the rest of a plan by the best constant action where that lowers the harm; return plans and harms.
 
-    Args:
-        running: the n episodes at a decision.
-        plan: actions of each decision, [n, L] or [n, L, K].
-        constants: constant actions that may replace the rest of a plan, [C] or [C, K].
-
-    Returns the resulting plans, in the shape of ``plan``, and the harm of each whole episode under its plan (the
-    largest harm over the possible worlds), [n] m2/s2.
-
+    ``plan`` and the resulting plans are [n, L] or [n, L, K], ``constants`` [C] or [C, K], and the harms [n] m2/s2.
     """
     value = np.empty(running.n)
     _check_plan(running, plan)
@@ -471,17 +396,14 @@ def from_now(past: Floats, later: Floats | float, steps: Ints) -> Floats:
 def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) -> Decision:
     """Decide in every world: apply the proposed action if it can be certified, else the action of the backup plan.
 
-    A proposal is certified if a plan that begins with the proposed action keeps the harm of the episode within the
-    budget. This function does not change its arguments.
+    A proposal is certified if a plan that begins with the proposed action stays within the budget. This function does
+    not change its arguments.
 
     Args:
         running: the running episodes at this decision.
-        proposed: proposed actions, [n] or [n, K]; clipped to [-1, 1]. A proposed action NaN is replaced by the planned
-            action.
-        backup: the present plan of each world, and the plan's harm; where a proposal cannot be certified, the plan is
-            executed.
-        budget: largest harm of the whole episode that the shield accepts in each world, [n] m2/s2; at least the harm of
-            ``backup``.
+        proposed: proposed actions, [n] or [n, K]; clipped to [-1, 1]. NaN is replaced by the planned action.
+        backup: the present plans and their harm.
+        budget: budget of each world, at least the harm of ``backup``, [n] m2/s2.
 
     Raises ``InvalidInput`` if the shapes of the arrays do not fit together, or if a budget is below the harm of
     ``backup``. Raises ``PhysicsError``, which names the worlds, if the physics fails with the applied action.

@@ -25,9 +25,6 @@ def check_amount(name: str, value: object, where: str, unit: str = "") -> None:
 
 
 def check_scenario(scenario: object, where: str) -> None:
-    """Raise ``InvalidInput`` unless ``scenario`` is a ``Scenario`` (not a name).
-
-    The error message begins with ``where``.
-    """
+    """Raise ``InvalidInput`` unless ``scenario`` is a ``Scenario`` (not a name). The message begins with ``where``."""
     if not isinstance(scenario, Scenario):
         raise InvalidInput(f"{where}: scenario = {scenario!r}: must be a Scenario; eb.load_scenario(name) loads one")

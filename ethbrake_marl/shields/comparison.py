@@ -72,13 +72,10 @@ def difference(predicted: Floats, seen: Floats) -> str:
 def ends_under(running: Running, plan: Floats) -> tuple[Bools, Floats]:
     """Return whether all vehicles come to rest, and each vehicle's harm, if the plans are executed from now on.
 
-    ``plan`` contains the actions of each decision, [n, L], or [n, L, K] for K shielded vehicles. ``running`` contains n
-    worlds, each with M possible worlds.
-
-    The first result is True for the worlds in which all vehicles are at rest at the horizon in every possible world,
-    [n]. The second result is the harm of the whole episode that each vehicle bears, [n * M, N] m2/s2. The harm of each
-    vehicle equals, to the bit, the harm that the engine's ledger contains for this vehicle at the end of the episode.
-    With an obstacle ahead, the first of the N columns belongs to the obstacle and is 0.
+    ``plan`` is [n, L], or [n, L, K] for K shielded vehicles. The first result is True for the worlds in which all
+    vehicles are at rest at the horizon in every possible world, [n]. The second result is the harm of the whole episode
+    that each vehicle bears, [n * M, N] m2/s2, equal, to the bit, to the harm in the engine's ledger at the end of the
+    episode. With an obstacle ahead, the first of the N columns belongs to the obstacle and is 0.
     """
     rests, borne = np.empty(running.n, np.bool_), np.empty(running.problem.mass.shape)
     plans = np.ascontiguousarray(plan).reshape(*plan.shape[:2], len(running.problem.vehicles))

@@ -5,13 +5,14 @@ A *guard* is the object in an engine that decides which actions are applied. The
 
     decide(state, memory, proposed) -> (applied, memory, info)
 
-- ``state``: the engine with its running episodes. The guard reads the engine and does not change it.
+- ``state``: the engine with its running episodes, before the step. The guard reads the engine and does not change it.
 
 - ``memory``: the guard's memory of the running episodes. The guard never changes its memory in place: ``decide``
   returns a new memory.
 
 - ``proposed``: proposed actions, [n, L] in [-1, 1]. A column of NaN means that the caller gave no action for the
-  learner of this column. A single NaN is an invalid action.
+  learner of this column; the learner's policy then proposes an action. A single NaN is an invalid action and is never
+  applied.
 
 - ``applied``: actions that the engine applies in this step, [n, L].
 
@@ -61,13 +62,13 @@ class ShieldMode(IntEnum):
 
 
 class Guarded(NamedTuple):
-    """Memory of a guard (``ShieldGuard``) for n episodes."""
+    """Memory of a guard for n episodes."""
 
     shield: Any  # the shield of the mode, with a method ``take(rows)``; in mode ``episode`` the HybridAgent's memory
     policies: dict[int, Memory]  # index of a shielded vehicle -> memory of its policy; empty without policies
 
     def take(self, rows: Ints) -> Guarded:
-        """Return the memory of the episodes in the rows ``rows`` (indices); an index may occur several times."""
+        """Return the memory of the episodes in the rows ``rows``; an index may occur several times."""
         is_tree = isinstance(self.shield, Mapping)
         shield = take_memory(self.shield, rows) if is_tree else self.shield.take(rows)
         return Guarded(shield, take_memory(self.policies, rows))
@@ -83,18 +84,19 @@ class Guarded(NamedTuple):
 
 
 class ShieldGuard(ABC):
-    """Base class of all guards. A guard is the part of an engine that certifies or replaces the learners' actions.
+    """Base class of all guards.
 
     A subclass implements ``decide`` (choose the applied actions), ``_started`` (start episodes) and ``tell`` (compute
     the infos). A subclass may also override ``check`` (compare the world after the step with the prediction) and
-    ``intervened`` (say which proposals were replaced).
+    ``intervened`` (say which proposals were replaced). In every method ``ruling`` is the decision in the last step,
+    None before the first decision.
 
     Args:
         engine: the engine that gets this guard. All learners of the engine are shielded.
         policies: vehicle index -> policy that proposes an action if the caller gives no action for the vehicle. A
             policy with a memory is called at every decision, even if its proposal is not needed, to update its memory.
         shield: initial state of the shield, before any episode; its type depends on the mode.
-        mode: mode of the shield; the infos report the number of the mode.
+        mode: mode of the shield; the infos report its number.
         where: name with which error messages begin: the function or class that the user called.
 
     """
@@ -110,43 +112,32 @@ class ShieldGuard(ABC):
 
     @abstractmethod
     def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
-        """Return the actions to apply in the next step, with the details of the decision.
+        """Return the actions to apply in the next step, with the details of the decision (see the module docstring).
 
-        Args:
-            running: the engine with its running episodes, before the step.
-            memory: memory of the guard.
-            proposed: proposed actions, [n, L]. A column of NaN means that the caller gave no action for the learner of
-                this column; in this case the learner's policy proposes an action. A single NaN is an invalid action and
-                is never applied.
-
+        ``running`` is the engine before the step.
         """
 
     @abstractmethod
     def _started(self, shield: Any, alert: Worlds, rows: Ints) -> Any:
         """Start episodes in the rows with the indices ``rows``; return the shield's new state.
 
-        ``alert`` contains the new worlds at the alert (t = 0), one for each index in ``rows``. ``shield`` is a copy of
-        the shield's old state, which this method may change.
+        ``alert`` contains the new worlds at the alert, one for each index in ``rows``. ``shield`` is a copy of the
+        shield's old state, which this method may change.
         """
 
     @abstractmethod
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
         """Return the infos after a decision: dictionary from name (without ``shield_``) to value.
 
-        A value is a single number, or an array with one number per world [n], learner [n, L] or vehicle [n, N].
-
-        Args:
-            memory: memory of the guard.
-            ruling: the decision in the last step; None before the first decision. The infos must have the same names
-                before the first decision as after it.
-
+        A value is a single number, or an array with one number per world [n], learner [n, L] or vehicle [n, N]. The
+        infos must have the same names before the first decision as after it.
         """
 
     def begin(self, memory: Guarded | None, alert: Worlds, rows: Ints) -> Guarded:
         """Start episodes in the rows with the indices ``rows``; return the guard's new memory.
 
-        ``alert`` contains the new worlds at the alert (t = 0), one for each index in ``rows``. ``memory`` is the
-        guard's old memory, None before the first episode.
+        ``alert`` contains the new worlds at the alert, one for each index in ``rows``. ``memory`` is None before the
+        first episode.
         """
         shield, policies = memory or Guarded(self._fresh, {})
         memories = {i: begin_script(policy, alert, i, self.scripts) for i, policy in self._policies.items()}
@@ -154,10 +145,9 @@ class ShieldGuard(ABC):
         return Guarded(self._started(copy.copy(shield), alert, rows), policies)
 
     def check(self, ruling: Ruling, after: Engine) -> Guarded:
-        """Return the guard's memory after the step.
+        """Return the guard's memory after the step; this base class accepts every step.
 
-        ``ruling`` is the decision that was applied. ``after`` is the engine after the step. This base class accepts
-        every step and returns the memory in ``ruling``.
+        ``after`` is the engine after the step.
         """
         memory: Guarded = ruling.memory
         return memory
@@ -184,10 +174,10 @@ class ShieldGuard(ABC):
         return last
 
     def _of_vehicles(self, infos: Mapping[str, Any], running: Engine) -> dict[str, NDArray[Any]]:
-        """Return ``infos`` (name -> value) with every value expanded to an array with one number per vehicle, [n, N].
+        """Return ``infos`` with every value expanded to an array with one number per vehicle, [n, N].
 
-        ``running`` is the engine that the guard protects. If a value has one column per learner, the columns of all
-        other vehicles are 0 (in the info ``reason``: ``NO_DECISION``).
+        If a value has one column per learner, the columns of all other vehicles are 0 (in the info ``reason``:
+        ``NO_DECISION``).
         """
         shape, spread = running.wanted_mps2.shape, dict[str, NDArray[Any]]()
         for name, value in infos.items():
@@ -202,8 +192,7 @@ class ShieldGuard(ABC):
     def _of_step(self, ruling: Ruling | None) -> dict[str, Any]:
         """Return the infos of all modes: mode, proposed action, applied action, and whether the action was replaced.
 
-        ``ruling`` is the decision in the last step. Before the first step ``ruling`` is None, and the infos report 0 as
-        the proposed and the applied action.
+        Before the first step the infos report 0 as the proposed and the applied action.
         """
         infos: dict[str, Any] = {"mode": self.mode}
         if ruling is None:
@@ -216,12 +205,8 @@ class ShieldGuard(ABC):
     ) -> tuple[Floats, dict[int, Memory]]:
         """Let policies propose for learners without an action; return all proposals [n, L] and the policies' memories.
 
-        Args:
-            worlds: the n worlds that the policies observe; may be None if no policy is called.
-            memories: vehicle index -> memory of this vehicle's policy.
-            proposed: actions that the caller proposes, [n, L]. A column of NaN is replaced by the actions that the
-                policy of the column's learner proposes.
-
+        ``worlds`` are the n worlds that the policies observe; they may be None if no policy is called. ``memories``
+        maps a vehicle index to the memory of the vehicle's policy.
         """
         left_out = np.isnan(proposed).all(axis=0)
         if left_out.any() and not self._policies:
@@ -247,9 +232,8 @@ class ShieldGuard(ABC):
 def why(ruling: Ruling | None) -> dict[str, Any]:
     """Return the infos ``reason`` and ``margin`` of a decision of mode ``step``, each [n, L].
 
-    ``reason`` is a code of ``ShieldReason``. ``margin`` is the budget (the largest harm that is accepted) minus the
-    least harm of any plan tried after the proposal, m2/s2. Before the first decision ``ruling`` is None, and the infos
-    report the reason ``NO_DECISION`` and the margin 0.
+    ``reason`` is a code of ``ShieldReason``; ``margin`` is in m2/s2. Before the first decision ``ruling`` is None, and
+    the infos report the reason ``NO_DECISION`` and the margin 0.
     """
     if ruling is None:
         return {"reason": ShieldReason.NO_DECISION, "margin": 0.0}

@@ -29,8 +29,8 @@ class ShieldedDriver(ByPolicy):
         policy: the agent or team that proposes actions.
         scenario: the scenario in which actions are certified.
         later_rollouts: whether a rollout of the policy that starts after the alert may certify an action.
-        assumed: the worlds at the alert, as the shield assumes them. If ``assumed`` is None, the shield knows the true
-            worlds. The policy always observes the true worlds.
+        assumed: the worlds at the alert, as the shield assumes them; None: the shield knows the true worlds. The policy
+            always observes the true worlds.
         options: keywords of ``ShieldOptions``.
 
     Raises ``InvalidInput`` if ``policy`` is not an agent or team, for invalid options, and if a team does not drive
@@ -76,7 +76,7 @@ class ShieldedDriver(ByPolicy):
 
     @property
     def adds(self) -> Source:
-        """Knowledge (``Source``) that the shield uses to certify actions, beyond what the policy knows."""
+        """Knowledge that the shield uses to certify actions, beyond what the policy knows."""
         return self.options.adds
 
     @property
@@ -106,15 +106,10 @@ class ShieldedDriver(ByPolicy):
 
 
 def shielded(driver: Driver, scenario: Scenario, mode: str, **options: Any) -> Driver:
-    """Return the agent or team ``driver`` with a shield.
+    """Return the agent or team ``driver`` with a shield that certifies actions in ``scenario``.
 
-    Args:
-        driver: the agent or team to shield. If the scenario has several learners, a copy of the agent drives each of
-            them.
-        scenario: the scenario in which actions are certified.
-        mode: ``step``, ``episode`` or a mode of an extension.
-        options: further keywords of ``ShieldOptions``.
-
+    If the scenario has several learners, a copy of the agent drives each of them. ``mode`` is ``step``, ``episode`` or
+    a mode of an extension; ``options`` are further keywords of ``ShieldOptions``.
     """
     if mode == "episode":
         settings = ShieldOptions(mode, **options)

@@ -21,8 +21,7 @@ CHUNK = 500  # number of worlds simulated together; limits memory, and does not 
 class Shielded(NamedTuple):
     """Results of whole episodes with a step shield in n worlds: N vehicles, of which K are shielded.
 
-    The comments beside the fields state the shapes that the arrays have for a single driver. ``stack`` adds a first
-    axis for several drivers: for instance, the shape of ``harm`` becomes [drivers, n].
+    ``stack`` adds a first axis for several drivers: for instance, the shape of ``harm`` becomes [drivers, n].
     """
 
     harm: Floats  # [n] harm of the episode, first-impact or total harm, whichever the shield bounds (m2/s2)
@@ -35,7 +34,7 @@ class Shielded(NamedTuple):
 
     @staticmethod
     def of(episodes: Episodes, task: Task) -> Shielded:
-        """Return the results of finished ``episodes`` with a step shield; ``task`` contains the harm count."""
+        """Return the results of finished ``episodes`` with a step shield."""
         shield: StepShield = episodes.guarded.shield
         assert shield.memory.running is not None
         return Shielded(
@@ -50,7 +49,7 @@ class Shielded(NamedTuple):
 
     @staticmethod
     def join(parts: Sequence[Shielded]) -> Shielded:
-        """Concatenate the results of several groups of worlds along the axis of worlds."""
+        """Concatenate the results along the axis of worlds."""
         return Shielded(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
     @staticmethod
@@ -62,12 +61,8 @@ class Shielded(NamedTuple):
 def drive_shielded(driver: Driver, worlds: Worlds, task: Task, **settings: Any) -> Shielded:
     """Drive in every world with a copy of ``driver`` behind a step shield, and return the results.
 
-    Args:
-        driver: the agent or team to shield.
-        worlds: n worlds at the alert, simulated in groups of at most ``CHUNK`` worlds.
-        task: scenario, shielded vehicles and harm count.
-        settings: further keywords of ``ShieldedDriver``.
-
+    ``task`` contains the scenario, the shielded vehicles and the harm count. ``settings`` are further keywords of
+    ``ShieldedDriver``.
     """
     parts = []
     for first in range(0, worlds.n, CHUNK):

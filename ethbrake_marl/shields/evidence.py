@@ -51,7 +51,7 @@ def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
         shield: a shield made with ``logging=True``, after it has run the episodes in ``worlds``. Log entries of earlier
             episodes are ignored.
         policy: the agent, or the team of all shielded vehicles, that proposed the actions in the reviewed episodes.
-        worlds: the worlds of the reviewed episodes, as they were at the alert.
+        worlds: the worlds of the reviewed episodes at the alert.
 
     Raises ``InvalidInput`` if the shield has no log, or if ``worlds`` and the shield's batch differ in the number of
     worlds.
@@ -81,17 +81,10 @@ def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
 
 
 def _released_harm(shield: StepShield, policy: Driver, worlds: Worlds, world: Ints, step: Ints) -> Floats:
-    """Return the harm of m episodes in which ``policy`` drives unshielded from a given decision on, [m] m2/s2.
+    """Return the harm of m episodes in which ``policy`` drives unshielded from decision ``step`` [m] on, [m] m2/s2.
 
-    Before decision ``step`` of an episode, the shielded vehicles repeat the actions that the shield applied.
-
-    Args:
-        shield: the shield after it has run the episodes; its plans then contain the actions that were applied.
-        policy: the agent or team that drives from decision ``step`` of an episode on.
-        worlds: the n worlds of the batch at the alert.
-        world: for each of the m episodes, the index of its world in ``worlds``, [m].
-        step: number of the first decision at which the policy drives, in each of the m episodes, [m].
-
+    Before decision ``step`` the shielded vehicles repeat the actions that the shield applied. ``world`` [m] are the
+    indices of the episodes' worlds in ``worlds``.
     """
     scenario, plan = shield.scenario, shield.memory.backup.plan[world]
     actions = plan.reshape(*plan.shape[:2], len(shield.vehicles))
@@ -106,13 +99,9 @@ def _released_harm(shield: StepShield, policy: Driver, worlds: Worlds, world: In
 class _Released(AgentAround):
     """Agent that repeats recorded actions until a given decision, and follows a policy from that decision on.
 
-    Args:
-        policy: the policy that drives from the decision with the number ``release`` on.
-        actions: recorded actions of m episodes, one for each of L decisions, [m, L].
-        release: number of the first decision at which the policy drives, in each of the m episodes, [m].
-        deciding: indices of all shielded vehicles, which decide at the same times.
-        time_step_s: time between two decisions, s.
-
+    ``actions`` [m, L] are the recorded actions of m episodes, and ``release`` [m] is the first decision at which the
+    policy drives. ``deciding`` are the indices of all shielded vehicles, which decide at the same times, every
+    ``time_step_s`` seconds.
     """
 
     def __init__(

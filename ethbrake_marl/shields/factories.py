@@ -13,7 +13,6 @@ from ethbrake_marl.shields.paper_hybrid import Bound, HybridAgent
 def shield_episodes(policy: Agent, argument: str | None, settings: AgentSettings) -> HybridAgent:
     """Return ``policy`` behind the paper's Algorithm 1 (``+episode``).
 
-    At the alert Algorithm 1 chooses the policy or E-V2X-BM, whichever does less harm, for the whole episode.
     ``argument`` is None, or ``pairwise`` for the paper's closed form of E-V2X-BM. ``settings`` must contain the key
     ``scenario``.
     """

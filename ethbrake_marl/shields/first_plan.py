@@ -48,7 +48,7 @@ def best_constants(
         vehicle: index of the shielded vehicle (0 = front), or indices of several.
         width: number of decisions of a plan.
         scenario: the scenario of ``worlds``.
-        harm_count: which harm is minimised: ``first`` (first impact of each pair) or ``total`` (every impact).
+        harm_count: ``first`` (first impact of each pair) or ``total`` (every impact).
 
     """
     vehicles = [vehicle] if isinstance(vehicle, int) else list(vehicle)
@@ -72,12 +72,8 @@ def best_constants(
 def _best_joint_action(running: Running, optima: list[Floats], width: int) -> Floats:
     """Return the constant actions of K vehicles that together do the least harm in each world, [n, K] in [-1, 1].
 
-    Args:
-        running: n episodes at the alert.
-        optima: for each of the K vehicles, the constant action that does the least harm while the other K - 1 vehicles
-            brake fully; K arrays [n].
-        width: number of decisions of a plan.
-
+    ``optima`` are K arrays [n]: for each vehicle, the constant action that does the least harm while the other K - 1
+    vehicles brake fully. ``width`` is the number of decisions of a plan.
     """
     best = np.full((running.n, len(optima)), -1.0)
     least = plan_harm(running, held(best, width))
@@ -94,10 +90,10 @@ def _best_joint_action(running: Running, optima: list[Floats], width: int) -> Fl
 
 
 def joint_constants(vehicles: int) -> Floats:
-    """Return C combinations of constant actions of K vehicles to try, [C, K] in [-1, 0], front to rear.
+    """Return C combinations of constant actions of K = ``vehicles`` vehicles to try, [C, K] in [-1, 0], front to rear.
 
-    ``vehicles`` is the number K. In each combination the actions of all vehicles are equal, or they change linearly
-    from the first to the last vehicle.
+    In each combination the actions of all vehicles are equal, or they change linearly from the first to the last
+    vehicle.
     """
     alike = np.repeat(np.array(CONSTANTS)[:, np.newaxis], vehicles, axis=1)
     share = np.linspace(0.0, 1.0, vehicles)

@@ -30,16 +30,15 @@ class StepGuard(ShieldGuard):
         engine: the engine that gets this guard.
         policies: vehicle index -> policy that is simulated from each alert, and that proposes an action if the caller
             gives no action for the vehicle.
-        shield: the shield for the engine's learners, in the state before any episode.
-        mode: mode of the shield; the infos report the number of the mode.
+        shield: the shield for the engine's learners, before any episode.
+        mode: mode of the shield; the infos report its number.
         where: name with which error messages begin: the function or class that the user called.
-        shares: whether the infos contain the harm that each vehicle bears; if the shield has a cap, the infos always
-            contain this harm.
+        shares: whether the infos contain the harm that each vehicle bears; with a cap, they always contain this harm.
         later_rollouts: whether a rollout of the policy that starts after the alert may certify an action.
-        assumed: the worlds at the alert, as the shield assumes them. If ``assumed`` is None, the shield knows the true
-            worlds. Policies always observe the true worlds.
-        warns: whether to warn once with ``MovingAtHorizon`` if a vehicle would still move at the horizon under the plan
-            made at the alert.
+        assumed: the worlds at the alert, as the shield assumes them; None: the shield knows the true worlds. Policies
+            always observe the true worlds.
+        warns: whether to warn once with ``MovingAtHorizon`` if a vehicle would still move at the horizon under the
+            first plan.
 
     """
 
@@ -81,16 +80,7 @@ class StepGuard(ShieldGuard):
         return shield
 
     def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
-        """Let the shield certify or replace the proposals in all worlds whose episodes still run.
-
-        Args:
-            running: the engine with its running episodes, before the step.
-            memory: memory of the guard.
-            proposed: proposed actions, [n, L]. A column of NaN means that the caller gave no action for the learner of
-                this column; in this case the learner's policy proposes an action. A single NaN is an invalid action and
-                is never applied.
-
-        """
+        """Let the shield certify or replace the proposals in all worlds whose episodes still run."""
         shield: StepShield = memory.shield
         goes_on, finished = ~running.ended, shield.memory.running.finished  # type: ignore[union-attr]  # it has begun
         worlds = running.worlds if self._policies or self._assumed is not None else None  # computed at each access
@@ -110,10 +100,9 @@ class StepGuard(ShieldGuard):
     def check(self, ruling: Ruling, after: Engine) -> Guarded:
         """Compare the worlds after the step with the shield's prediction; return the guard's memory.
 
-        ``ruling`` is the decision that was applied. ``after`` is the engine after the step. Raises ``UncertifiedStep``
-        if a world differs from the prediction. If the shield has assumed worlds, which may be wrong, a world that
-        differs from the prediction becomes distrusted, and no error is raised. Worlds in which the physics failed are
-        not compared with the prediction.
+        Raises ``UncertifiedStep`` if a world differs from the prediction. If the shield has assumed worlds, which may
+        be wrong, no error is raised, and a world that differs from the prediction becomes distrusted. Worlds in which
+        the physics failed are not compared with the prediction.
         """
         memory: Guarded = ruling.memory
         shield: StepShield = memory.shield
@@ -143,10 +132,8 @@ class StepGuard(ShieldGuard):
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
         """Return the infos of a step by name: actions, reason, margin, bound, trusted, settles.
 
-        If the guard reports shares (settings ``shares`` and ``cap``), the infos also contain the harm that each vehicle
-        bears. ``memory`` is the guard's memory. ``ruling`` is the decision in the last step, None before the first
-        decision. Each value is a single number, or an array with one number per world [n], learner [n, L] or vehicle
-        [n, N].
+        If the guard reports shares, the infos also contain the harm that each vehicle bears. Each value is a single
+        number, or an array with one number per world [n], learner [n, L] or vehicle [n, N].
         """
         shield: StepShield = memory.shield
         infos = self._of_step(ruling) | why(ruling)

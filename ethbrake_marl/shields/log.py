@@ -23,9 +23,9 @@ class Intervention(NamedTuple):
     proposed: float  # proposed action, before clipping to [-1, 1]
     applied: float  # applied action, in [-1, 1]
     reason: int  # code of ShieldReason
-    bound: float  # harm that the episode will not exceed, after this decision (m2/s2)
-    margin: float  # budget minus least harm of any plan tried after the proposal (m2/s2); negative: rejected
-    state: Floats  # [S] speeds, gaps, hit flags and harm at the decision, in the layout of ``Running.states``
+    bound: float  # bound after this decision (m2/s2)
+    margin: float  # margin of the proposal (m2/s2); negative: rejected
+    state: Floats  # [S] state at the decision, in the layout of ``Running.states``
     plan: Floats  # [L], or [L, K] for K vehicles: plan before the decision; entries before ``step``: applied actions
 
 
@@ -34,14 +34,9 @@ def interventions(
 ) -> list[Intervention]:
     """Return one log entry for each action that a decision replaced.
 
-    Args:
-        now: the n running episodes before the decision.
-        episode: number of the episode that runs in each row (world) of the batch, [n].
-        vehicles: indices of the K shielded vehicles.
-        proposed: proposed actions, [n] or [n, K].
-        decision: the shield's decision on the proposed actions.
-        held: the shield's plans before the decision, which become part of the log entries.
-
+    ``now`` are the n episodes before the decision, and ``held`` the plans before the decision. ``episode`` [n] are the
+    numbers of the episodes, ``vehicles`` the indices of the K shielded vehicles, and ``proposed`` [n] or [n, K] the
+    proposed actions.
     """
     times, states, shape = now.time_s, now.nominal().states, (now.n, len(vehicles))
     columns = (proposed, decision.applied, decision.reason, decision.margin, decision.intervened)

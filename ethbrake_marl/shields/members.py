@@ -1,8 +1,18 @@
 """Simulate the possible worlds of a world, decision by decision, with the same floating-point operations as the engine.
 
 The shield's bound must hold in each of the M possible worlds (*members*) of a world. Usually M is 1: the world itself
-is its only member. K of the N vehicles are shielded. An action of the shield is an array [K] with one number per
-shielded vehicle. A plan contains one such array for each of L decisions, [L, K].
+is its only member. K of the N vehicles are shielded. A plan has an action [K] for each of L decisions, [L, K].
+
+Arguments that several functions share:
+
+- ``world``: parameters of the possible worlds; ``m``: index of one of them.
+- ``states`` [M, S], ``ended`` [M]: present state of each possible world, in the layout of ``Running.states``, and
+  whether its episode has ended. ``state`` [S] is the state of one possible world.
+- ``step``: number of the present decision.
+- ``action`` [K], ``plan`` [L, K]: actions of the shielded vehicles at one decision and at every decision.
+- ``after`` [M, S] or [S], ``over`` [M]: receive the states after the step, and whether the episodes have then ended.
+- ``most``: a simulation stops as soon as the harm exceeds this number, m2/s2, because harm never falls during an
+  episode.
 """
 
 from __future__ import annotations
@@ -29,8 +39,7 @@ OF_COMMAND, OF_LATENCY, OF_MASS, OF_LIMIT, OF_BRAKE_RATE, OF_RELEASE_RATE, OF_CA
 class Members(NamedTuple):
     """Parameters of M possible worlds, and an array to simulate in, as input for the package's compiled functions.
 
-    ``all_members`` returns the possible worlds of a whole batch. ``members_from`` returns the possible worlds of one
-    world.
+    ``all_members`` returns the possible worlds of a whole batch, and ``members_from`` the possible worlds of one world.
     """
 
     table: Floats  # workspace in which one possible world is simulated, see ``physics.rows``
@@ -71,7 +80,7 @@ def members_from(every: Members, a: int, b: int) -> Members:
 
 @compiled
 def enter(world: Members, m: int, state: Floats) -> None:
-    """Write possible world ``m`` (index) with its saved ``state`` [S] into the workspace ``world.table``."""
+    """Write possible world ``m`` with its ``state`` into the workspace ``world.table``."""
     table, lines = world.table, world.lines
     for i in range(table.shape[1]):
         table[ROW.COMMAND, i], table[ROW.LATENCY, i] = lines[m, OF_COMMAND, i], lines[m, OF_LATENCY, i]
@@ -84,17 +93,8 @@ def enter(world: Members, m: int, state: Floats) -> None:
 def take_step(world: Members, m: int, state: Floats, step: int, action: Floats, after: Floats) -> int:
     """Advance one possible world from one decision to the next, and save its new state.
 
-    Args:
-        world: parameters of the M possible worlds that the shield considers for one world (``Members``).
-        m: index of the possible world that is advanced.
-        state: present state of this possible world, [S].
-        step: number of the present decision.
-        action: actions of the shielded vehicles, [K].
-        after: receives the state of this possible world after the step, [S].
-
     Returns ``GOES_ON`` (0) if the episode continues, a positive code if the episode ended, or a negative code if the
     physics failed.
-
     """
     enter(world, m, state)
     for c in range(world.vehicles.shape[0]):
@@ -113,19 +113,8 @@ def take_steps(
 ) -> int:
     """Advance every possible world of one world from one decision to the next, with the same action.
 
-    A possible world whose episode has ended keeps its state.
-
-    Args:
-        world: parameters of the M possible worlds that the shield considers for one world (``Members``).
-        states: present state of each possible world, [M, S], in the layout of ``Running.states``.
-        ended: for each possible world, True if the episode has ended, [M].
-        step: number of the present decision.
-        action: actions of the shielded vehicles, [K].
-        after: receives the state of each possible world after the step, [M, S].
-        over: for each possible world, receives True if the episode has ended after the step, [M].
-
-    Returns the number of possible worlds whose episode continues, or -1 if the physics failed in one of them.
-
+    A possible world whose episode has ended keeps its state. Returns the number of possible worlds whose episode
+    continues, or -1 if the physics failed in one of them.
     """
     going = 0
     for m in range(ended.shape[0]):
@@ -166,7 +155,7 @@ def borne_by(table: Floats, total: float, i: int) -> float:
 def within_caps(world: Members, m: int) -> bool:
     """Return whether every vehicle bears at most its cap in possible world ``m``; True if there are no caps.
 
-    A cap is the largest harm that a vehicle may bear. ``world.table`` must contain the state of possible world ``m``.
+    ``world.table`` must contain the state of possible world ``m``.
     """
     if world.lines.shape[1] > OF_CAP:
         for i in range(world.lines.shape[2]):
@@ -177,10 +166,7 @@ def within_caps(world: Members, m: int) -> bool:
 
 @compiled
 def worst_so_far(world: Members, states: Floats) -> float:
-    """Return the largest harm so far over the possible worlds in ``world``, m2/s2; infinity if a cap is exceeded.
-
-    ``states`` [M, S] contains the present state of each possible world.
-    """
+    """Return the largest harm so far over the possible worlds, m2/s2; infinity if a cap is exceeded."""
     worst = 0.0
     for m in range(states.shape[0]):
         enter(world, m, states[m])
@@ -194,20 +180,8 @@ def worst_so_far(world: Members, states: Floats) -> float:
 def follow_plan(world: Members, m: int, state: Floats, ended: bool, step: int, plan: Floats, most: float) -> float:
     """Return the harm of the whole episode if a plan is executed in one possible world from now on, m2/s2.
 
-    The harm equals, to the bit, the harm that the engine would count, because the operations are the same.
-
-    Args:
-        world: parameters of the M possible worlds that the shield considers for one world (``Members``).
-        m: index of the possible world to simulate.
-        state: present state of this possible world, [S].
-        ended: whether the episode has ended in this possible world.
-        step: number of the present decision.
-        plan: actions of each decision, [L, K].
-        most: the simulation stops as soon as the harm exceeds this number, m2/s2, because harm never falls during an
-            episode.
-
-    Returns infinity if the harm exceeds ``most``, if a vehicle bears more than its cap, or if the physics fails.
-
+    The harm equals, to the bit, the harm that the engine would count, because the operations are the same. Returns
+    infinity if the harm exceeds ``most``, if a vehicle bears more than its cap, or if the physics fails.
     """
     table, no_rows, total = world.table, world.table[:0], world.clock[m, CLOCK.HARM_IS_TOTAL]
     restitution, grid = world.clock[m, CLOCK.RESTITUTION], grid_of(world.clock[m])
@@ -228,20 +202,7 @@ def follow_plan(world: Members, m: int, state: Floats, ended: bool, step: int, p
 
 @compiled
 def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan: Floats, most: float) -> float:
-    """Return the largest harm of a plan over the possible worlds of one world, m2/s2.
-
-    Args:
-        world: parameters of the M possible worlds that the shield considers for one world (``Members``).
-        states: present state of each possible world, [M, S], in the layout of ``Running.states``.
-        ended: for each possible world, True if the episode has ended, [M].
-        step: number of the present decision.
-        plan: actions of each decision, [L, K]; the simulation executes them from the present decision on.
-        most: the simulation stops as soon as the harm exceeds this number, m2/s2.
-
-    Returns infinity if the harm exceeds ``most`` in a possible world, if a vehicle bears more than its cap, or if the
-    physics fails.
-
-    """
+    """Return the largest harm of ``follow_plan`` over the possible worlds of one world, m2/s2."""
     worst, first = 0.0, world.critical[0]
     for j in range(ended.shape[0]):
         m = (first + j) % ended.shape[0]
@@ -254,20 +215,10 @@ def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan:
 
 @compiled
 def hold_constant(world: Members, m: int, state: Floats, ended: bool, step: int, constants: Floats, c: int) -> float:
-    """Return the harm in one possible world if a constant action is held to the horizon, m2/s2.
+    """Return the harm in one possible world if action ``c`` of ``constants`` [C, K] is held to the horizon, m2/s2.
 
-    The time until the horizon is simulated as one segment, not decision by decision. Returns infinity as the harm if
-    the physics fails.
-
-    Args:
-        world: parameters of the M possible worlds that the shield considers for one world (``Members``).
-        m: index of the possible world to simulate.
-        state: present state of this possible world, [S].
-        ended: whether the episode has ended in this possible world.
-        step: number of the present decision.
-        constants: C constant actions, each with one number per shielded vehicle, [C, K].
-        c: index (in ``constants``) of the action to hold.
-
+    The time until the horizon is simulated as one segment, not decision by decision. Returns infinity if the physics
+    fails.
     """
     table, clock, vehicles, bounds = world.table, world.clock[m], world.vehicles, world.bounds
     enter(world, m, state)

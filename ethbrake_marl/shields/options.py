@@ -1,9 +1,8 @@
 """Settings of a shield: the keywords of every shield interface, their checks, and the guard that is made from them.
 
-A *mode* is the registered name of a kind of shield (entry-point group ``ethbrake_marl.shields``). The registry entry of
-a mode contains the class of the mode's settings. The modes ``step`` and ``episode`` use ``ShieldOptions``. A mode with
-further settings has a subclass of ``ShieldOptions``, which adds and checks the further fields and makes the guard of
-the mode.
+A *mode* is the registered name of a kind of shield (entry-point group ``ethbrake_marl.shields``); its registry entry
+contains the class of the mode's settings. The modes ``step`` and ``episode`` use ``ShieldOptions``. A mode with further
+settings has a subclass of ``ShieldOptions``, which adds and checks the further fields and makes the guard of the mode.
 """
 
 from __future__ import annotations
@@ -40,14 +39,14 @@ class ShieldOptions:
         harm_count: which harm is bounded: ``first`` (first impact of each pair) or ``total`` (every impact).
         allowance: amount by which the bound is loosened, for fewer replaced actions, m2/s2; not allowed in mode
             ``episode``.
-        cap: ``baseline``: no vehicle bears more harm than it would bear under the constant actions that do the least
-            harm; only allowed in mode ``step``. If ``cap`` is None, only the harm summed over all vehicles is bounded.
+        cap: ``baseline``: no vehicle bears more harm than under the constant actions that do the least harm; only
+            allowed in mode ``step``. None: only the harm summed over all vehicles is bounded.
         intervention_penalty: amount subtracted from a learner's reward of a step in which the learner's action was
             replaced.
         logging: whether ``shield.log`` collects the replaced actions; not allowed in mode ``episode``.
         shares: whether the infos contain the harm that each vehicle bears under the present plan, and under the
-            constant actions that do the least harm; if there is a ``cap``, the infos always contain this harm.
-            ``shares=True`` slows a step by a few percent, and is not allowed in mode ``episode``.
+            constant actions that do the least harm; with a ``cap``, they always contain this harm. ``shares=True``
+            slows a step by a few percent, and is not allowed in mode ``episode``.
         where: name with which error messages begin: the function or class that the user called.
 
     Raises ``InvalidInput`` for an invalid setting, and ``UnknownName`` for an unknown mode.
@@ -118,7 +117,7 @@ class ShieldOptions:
         Args:
             scenario: the scenario of all episodes.
             vehicle: index of the shielded vehicle (0 = front), or indices of several.
-            others: scripts of the unshielded vehicles (vehicle index -> script); None: the scenario's scripts.
+            others: vehicle index -> script of each unshielded vehicle; None: the scenario's scripts.
 
         """
         return StepShield(
@@ -129,14 +128,13 @@ class ShieldOptions:
     def check_in(self, scenario: Scenario, *, several: bool) -> None:
         """Raise ``InvalidInput`` if a shield with these settings cannot be used in the scenario.
 
-        If ``several`` is true (a team is shielded), this method checks nothing, because ``guard`` makes the same
-        checks.
+        If ``several`` is true (a team is shielded), nothing is checked, because ``guard`` makes the same checks.
         """
         if not several:
             self.shield(scenario, one_learner(scenario) or 0)
 
     def guard(self, engine: Engine, policies: Mapping[int, Agent], *, several: bool = False, **how: Any) -> ShieldGuard:
-        """Return the guard (the part of an engine that certifies or replaces actions) for all learners of an engine.
+        """Return the guard for all learners of an engine.
 
         Args:
             engine: the engine that gets the guard.
@@ -162,15 +160,9 @@ def check_mode(mode: object) -> str:
 
 
 def misplaced(name: str, value: object, mode: str, takers: list[str], where: str) -> InvalidInput:
-    """Return the error to raise for a setting that the mode ``mode`` does not accept.
+    """Return the error to raise if the setting ``name`` has a ``value`` that the mode ``mode`` does not accept.
 
-    Args:
-        name: name of the setting that the mode does not accept.
-        value: value that the user gave to the setting.
-        mode: the mode that does not accept the setting.
-        takers: names of the modes that accept the setting.
-        where: name with which the message begins: the function or class that the user called.
-
+    ``takers`` are the names of the modes that accept it. The message begins with ``where``.
     """
     return InvalidInput(f"{where}: {name} = {value!r}: not a setting of mode {mode}; use mode {' or '.join(takers)}")
 

@@ -1,14 +1,12 @@
 """The paper's hybrid (Algorithm 1): at the alert, choose the policy or the baseline for the whole episode.
 
-The policy is rolled out (simulated) in the engine from the alert on. The harm of this rollout is then compared with
-``H*``, the harm of the baseline E-V2X-BM. The policy or the baseline, whichever does less harm, drives the whole
-episode.
+The policy is rolled out (simulated) in the engine from the alert on. The harm of this rollout is compared with ``H*``,
+the harm of the baseline E-V2X-BM. The policy or the baseline, whichever does less harm, drives the whole episode.
 
 The coupled ``H*`` is computed in the same engine as the policy's harm. With the coupled ``H*``, the hybrid does at most
 the harm of the baseline in every world, provided that the policy drives exactly as in its rollout. A policy with random
 actions does not repeat its rollout; use the step shield for such a policy. With the paper's pairwise ``H*`` there is no
-guarantee, because the pairwise ``H*`` treats the pair in front and the pair behind as independent. The pairwise ``H*``
-is only about half of the harm that E-V2X-BM's deceleration causes in the engine.
+guarantee. The pairwise ``H*`` is only about half of the harm that E-V2X-BM's deceleration causes in the engine.
 """
 
 from __future__ import annotations
@@ -38,8 +36,6 @@ Bound = Literal["coupled", "pairwise"]  # method to compute H* and a*: the engin
 class HybridAgent(AgentAround):
     """Agent that drives by ``policy`` where the policy's rollout does at most the harm ``H*``, otherwise by E-V2X-BM.
 
-    The policy's rollout simulates the policy from the alert on. ``H*`` is the harm of E-V2X-BM's constant deceleration.
-
     Args:
         policy: the agent that is compared with E-V2X-BM in each world, and chosen or rejected.
         scenario: the scenario in which ``policy`` and E-V2X-BM are compared.
@@ -67,14 +63,7 @@ class HybridAgent(AgentAround):
         self.harm_count: HarmCount = harm_count
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Simulate the policy's episode, choose the driver of each world, and return the memory.
-
-        Args:
-            alert: n worlds at the alert.
-            vehicle: index of the controlled vehicle (0 = front).
-            scripts: dictionary from the index of each scripted vehicle to the vehicle's script.
-
-        """
+        """Simulate the policy's episode, choose the driver of each world, and return the memory."""
         refuse_untold(alert, [vehicle], f"agent {self.name!r}")
         policy = begin_script(self.policy, alert, vehicle, scripts)
         backup = begin_script(self.backup, alert, vehicle, scripts)
@@ -88,14 +77,7 @@ class HybridAgent(AgentAround):
         }  # fmt: skip
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """Return the command of the driver that ``begin`` chose at the alert, [n] m/s2, and the new memory.
-
-        Args:
-            worlds: the n worlds at this decision.
-            memory: the agent's memory, as returned by ``begin`` or by the previous call of ``act``.
-            vehicle: index of the controlled vehicle (0 = front).
-
-        """
+        """Return the command of the driver that ``begin`` chose at the alert, [n] m/s2, and the new memory."""
         command, policy = ask_script(self.policy, worlds, memory["policy"], vehicle)
         constant, _ = self.backup.act(worlds, memory["backup"], vehicle)
         return np.where(memory["chosen_policy"], command, constant), {**memory, "policy": policy}
@@ -124,13 +106,8 @@ class EpisodeGuard(ShieldGuard):
     """Guard of mode ``episode``: at each alert the agent ``hybrid`` chooses the driver of the whole episode.
 
     The driver is either the policy inside ``hybrid`` or E-V2X-BM, whatever actions the caller proposes. A proposal
-    counts as replaced if it differs from the applied action by more than the rounding error of a 32-bit number.
-
-    Args:
-        engine: the engine that gets this guard.
-        hybrid: the agent that chooses the driver at the alert, and then returns the driver's commands.
-        where: name with which error messages begin: the function or class that the user called.
-
+    counts as replaced if it differs from the applied action by more than the rounding error of a 32-bit number. Error
+    messages begin with ``where``.
     """
 
     def __init__(self, engine: Engine, hybrid: HybridAgent, *, where: str = "shield") -> None:
@@ -142,14 +119,7 @@ class EpisodeGuard(ShieldGuard):
         return memory if shield is None else renew_memory(shield, rows, memory)
 
     def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
-        """Return the actions of the driver (policy or E-V2X-BM) that was chosen at the alert.
-
-        Args:
-            running: the engine with its running episodes, before the step.
-            memory: memory of the guard.
-            proposed: proposed actions, [n, 1]; they have no effect.
-
-        """
+        """Return the actions of the driver that was chosen at the alert; the proposed actions have no effect."""
         worlds = running.worlds
         command, hybrid = ask_script(self._hybrid, worlds, memory.shield, self.vehicles[0])
         applied = command_to_action(command, worlds.vehicles, self.vehicles[0])[:, np.newaxis]
@@ -163,8 +133,7 @@ class EpisodeGuard(ShieldGuard):
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
         """Return the infos by name: chosen driver, harm of the policy, harm of E-V2X-BM (each [n]), and the actions.
 
-        ``memory`` is the guard's memory; ``ruling`` is the decision in the last step, None before the first step. The
-        info ``proposed_action`` is NaN where no action was proposed.
+        The info ``proposed_action`` is NaN where no action was proposed.
         """
         compared = {name: memory.shield[name] for name in ("chosen_policy", "policy_harm", "bound_harm")}
         return self._of_step(ruling) | compared

@@ -1,9 +1,15 @@
-"""Rollouts of the policies that propose actions: simulations in which these policies drive. The actions of such a
-simulation are used as a plan.
+"""Rollouts of the policies that propose actions: simulations in which these policies drive, used as plans.
 
-A plan has one action for each decision. A rollout starts at the alert or at a later decision, and its plan is certified
-like any other plan (``plan_harm``). If a policy later deviates from its rollout, the shield may replace actions of the
-policy; the bound still holds.
+A rollout starts at the alert or at a later decision, and its plan is certified like any other plan (``plan_harm``). If
+a policy later deviates from its rollout, the shield may replace actions of the policy; the bound still holds.
+
+Arguments that several functions share:
+
+- ``running``: the n episodes at this decision; ``rows`` [m]: the worlds in which a rollout is tried.
+- ``proposed``: proposed actions, [n] or [n, K].
+- ``budget``: largest harm that the shield accepts in each world, [n] m2/s2.
+- ``held``: the shield's plans before this decision, [n, L] or [n, L, K]; entries before the present decision are the
+  actions applied so far.
 """
 
 from __future__ import annotations
@@ -44,16 +50,9 @@ def rolled_out(
 ) -> Floats:
     """Return the actions of ``policies``, which drive without a shield from the alert to the end of the episodes.
 
-    Args:
-        worlds: n worlds at the alert.
-        policies: dictionary from the index of each shielded vehicle to the vehicle's policy.
-        scenario: the scenario whose scripts drive the other vehicles.
-        vehicle: index of the only shielded vehicle, or a tuple of K indices.
-        width: number of decisions for which to return actions.
-
-    Returns the actions: [n, width] if ``vehicle`` is an index, [n, width, K] if ``vehicle`` is a tuple. For decisions
-    after the end of an episode, the result contains full braking.
-
+    ``policies`` maps the index of each shielded vehicle to the vehicle's policy. The actions have the shape [n, width]
+    if ``vehicle`` is an index, and [n, width, K] if it is a tuple of K indices. After the end of an episode the actions
+    are full braking.
     """
     team = Team({i: _Rounded(policy) for i, policy in policies.items()}, next(iter(policies.values())).name)
     engine = episode_engine(worlds, team, scenario)
@@ -67,14 +66,7 @@ def certify_by_policy(
 ) -> Decision:
     """Return ``decision``, changed so that each rejected proposal that a rollout of the policy certifies is accepted.
 
-    Args:
-        decision: the decision that ``certify`` made without rollouts.
-        running: the n episodes at this decision.
-        proposed: proposed actions, [n] or [n, K].
-        budget: largest harm of the whole episode that the shield accepts in each world, [n] m2/s2.
-        held: the shield's plans before this decision, [n, L] or [n, L, K].
-        proposer: the policies that propose actions, with their memories and the worlds at this decision.
-
+    ``decision`` is the decision that ``certify`` made without rollouts.
     """
     rejected = (decision.reason == NO_CERTIFICATE).reshape(running.n, -1).any(axis=1)
     rows = np.flatnonzero(rejected)
@@ -91,23 +83,12 @@ def certify_by_policy(
 def certify_rollouts(
     running: Running, proposed: Floats, rows: Ints, budget: Floats, held: Floats, proposer: Proposer
 ) -> Decision:
-    """Decide again in the worlds whose proposals were rejected; this time the plans are rollouts of the policy.
+    """Decide again in the worlds ``rows``, whose proposals were rejected; this time the plans are policy rollouts.
 
     In each world one plan is tried: the proposal, clipped to [-1, 1], followed by the policy's actions in a simulation
     from the next state on. If this plan stays within the budget and the caps, the plan becomes the backup, and the
-    proposal is accepted. If the plan exceeds the budget or a cap, the proposal stays rejected, with the reason
-    ``NO_CERTIFICATE``. If a vehicle's proposal is NaN, the vehicle's planned action is used.
-
-    Args:
-        running: the n episodes of the whole batch.
-        proposed: proposed actions of the whole batch, [n] or [n, K].
-        rows: indices of the worlds in which to decide again, [m].
-        budget: largest harm of the whole episode that the shield accepts in each world, [n] m2/s2.
-        held: the shield's present plans of the whole batch, [n, L] or [n, L, K].
-        proposer: the policies that propose actions, with their memories and the worlds at this decision.
-
-    Returns a decision for the m worlds in ``rows`` only.
-
+    proposal is accepted. Otherwise the proposal stays rejected, with the reason ``NO_CERTIFICATE``. If a vehicle's
+    proposal is NaN, the vehicle's planned action is used. The result is a decision for the m worlds in ``rows`` only.
     """
     part, least, silent = running.take(rows), budget[rows], np.isnan(proposed[rows])
     planned = held[rows, np.minimum(running.steps[rows], held.shape[1] - 1)]
@@ -131,17 +112,8 @@ def _later_plan(
 ) -> Floats:
     """Return plans for m worlds: the actions so far, then ``first``, then the policies' actions in a rollout.
 
-    A rollout stops as soon as its harm exceeds the budget.
-
-    Args:
-        running: the n episodes of the whole batch, with one possible world each.
-        first: actions to apply at the present decision, [m] or [m, K].
-        rows: indices of the worlds for which to make a plan, [m].
-        budget: largest harm of the whole episode that the shield accepts in each world, [n] m2/s2.
-        held: the shield's present plans, [n, L] or [n, L, K]; the entries before the present decision are the actions
-            applied so far.
-        proposer: the policies that propose actions, with their memories and the worlds at this decision.
-
+    A rollout stops as soon as its harm exceeds the budget. ``first`` [m] or [m, K] are the actions at the present
+    decision. ``running`` has one possible world for each world.
     """
     policies, memories, worlds = proposer
     memories, seen = take_memory(memories, rows), worlds.take(rows)
@@ -190,8 +162,7 @@ def proposed_actions(
 ) -> tuple[Floats, dict[int, Memory]]:
     """Return the actions that the policies propose, [n, K] in [-1, 1], and the new memory of each vehicle's policy.
 
-    ``policies`` maps the index of each of K vehicles to the vehicle's policy. ``memories`` maps the index of each of
-    these vehicles to the memory of the vehicle's policy. ``worlds`` are n worlds at a decision.
+    ``policies`` and ``memories`` map the index of each of K vehicles to its policy and to the policy's memory.
     """
     asked = {i: proposed_action(policy, worlds, memories[i], i) for i, policy in policies.items()}
     after = {i: memory for i, (_, memory) in asked.items()}
@@ -199,7 +170,7 @@ def proposed_actions(
 
 
 def proposed_action(policy: Agent, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-    """Return the actions [n] in [-1, 1] that ``policy`` proposes for ``vehicle`` (index), and the policy's new memory.
+    """Return the actions [n] in [-1, 1] that ``policy`` proposes for ``vehicle``, and the policy's new memory.
 
     In worlds where the policy commands NaN, the result is NaN.
     """

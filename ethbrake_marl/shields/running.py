@@ -24,11 +24,11 @@ class Running(NamedTuple):
     states: Floats  # [n * M, S] speeds, gaps, hit flags, harms, forces; in the layout of ``physics.episode.save``
     steps: Ints  # [n] number of the present decision, from 0
     ended: Bools  # [n * M] whether the episode is over
-    caps: Floats = np.zeros((0, 0))  # [n * M, N] largest harm that each vehicle may bear (m2/s2); [0, 0]: no caps
+    caps: Floats = np.zeros((0, 0))  # [n * M, N] cap of each vehicle (m2/s2); [0, 0]: no caps
 
     @property
     def uncapped(self) -> Running:
-        """The episodes without ``caps`` (the limits of each vehicle's harm)."""
+        """The episodes without ``caps``."""
         return self._replace(caps=np.zeros((0, 0)))
 
     @property
@@ -43,7 +43,7 @@ class Running(NamedTuple):
 
     @property
     def finished(self) -> Bools:
-        """For each world: whether the episode has ended in all members (possible worlds) of the world, [n]."""
+        """For each world: whether the episode has ended in all possible worlds of the world, [n]."""
         return np.asarray(self.ended.reshape(self.n, -1).all(axis=1), np.bool_)
 
     @property
@@ -75,8 +75,7 @@ def begin_running(problem: ProfileProblem, members: int = 1) -> Running:
     """Return running episodes in the worlds of ``problem``, at their first decision.
 
     ``problem`` contains the states of the worlds at the first decision, and the commands of the unshielded vehicles.
-    ``members`` is the number M of possible worlds of each world. M consecutive rows of ``problem`` contain the M
-    possible worlds of one world.
+    Each ``members`` consecutive rows of ``problem`` are the possible worlds of one world.
     """
     steps, ended = np.zeros(problem.n // members, np.int64), np.zeros(problem.n, np.bool_)
     return Running(problem, problem.start, steps, ended)

@@ -26,9 +26,8 @@ class ShieldedVecEnv(SeededInside, VecEnvWrapper):
 
     Args:
         venv: an environment made by ``make_sb3_vec_env``.
-        policy: policy that is simulated at the start of each episode, from the alert on. In worlds where the policy
-            does less harm than E-V2X-BM, the policy's harm is the bound (the harm that the episode will not exceed). If
-            ``policy`` is None, the bound is the harm of E-V2X-BM.
+        policy: policy that is simulated from the alert on. In worlds where the policy does less harm than E-V2X-BM, the
+            policy's harm is the bound. None: the bound is the harm of E-V2X-BM.
         options: keywords of ``ShieldOptions``.
 
     Raises ``InvalidInput`` if ``venv`` is another kind of environment, and if several vehicles learn and the mode is

@@ -1,16 +1,15 @@
 """Mode ``step`` of the shield: keep the harm of the episode within a bound, whatever actions are proposed.
 
-**Claim.** The *bound* is the harm that the episode will not exceed. Let ``B`` be the bound at the first decision, which
-is the harm of the plan made at the alert. If every step applies the action that ``certify`` returns, then the harm at
-the end of the episode is at most ``B``, whatever actions are proposed. The bound never rises during the episode. An
-episode ends at rest or at the scenario's horizon. The claim does not cover anything that happens after the horizon.
+**Claim.** Let ``B`` be the bound at the first decision, which is the harm of the plan made at the alert. If every step
+applies the action that ``certify`` returns, then the harm at the end of the episode is at most ``B``, whatever actions
+are proposed. The bound never rises during the episode. An episode ends at rest or at the scenario's horizon. The claim
+does not cover anything that happens after the horizon.
 
-**Induction.** Between two decisions the shield has a *plan*, which contains an action for every decision up to the
-horizon. Let ``c`` be the harm of the plan: the harm of the whole episode if the plan is executed from the present
-state. ``c`` includes the harm so far. In the first-impact count, ``c`` leaves out further impacts of pairs that already
-had an impact. The function ``members.follow_plan`` computes ``c``. ``follow_plan`` simulates the plan decision by
-decision, with the same floating-point operations as the engine's step, in the same order. ``follow_plan`` also adds up
-the harm in the same order as the engine. Hence:
+**Induction.** Between two decisions the shield has a *plan*. Let ``c`` be the harm of the plan: the harm of the whole
+episode if the plan is executed from the present state. ``c`` includes the harm so far. In the first-impact count, ``c``
+leaves out further impacts of pairs that already had an impact. The function ``members.follow_plan`` computes ``c``: it
+simulates the plan decision by decision, with the same floating-point operations as the engine's step, in the same
+order, and adds up the harm in the same order as the engine. Hence:
 
 1. *Start.* At the first decision ``c = B``.
 
@@ -20,16 +19,16 @@ the harm in the same order as the engine. Hence:
    would repeat the same operations.
 
 3. *Otherwise the planned action is applied.* When ``follow_plan`` computed ``c``, the simulation passed through the
-   state after the planned action. So from the state after the planned action on, the rest of the plan again has the
-   harm ``c``, to the last bit. The shield may also replace the rest of the plan by a plan with less harm.
+   state after the planned action. So from this state on, the rest of the plan again has the harm ``c``, to the last
+   bit. The shield may also replace the rest of the plan by a plan with less harm.
 
 4. *End.* When the episode ends, no action is left to execute, and ``c`` is the harm of the episode.
 
 The *budget* is the largest harm that a new plan may have: ``c``, or any value from ``c`` to ``B``. Hence ``c <= B`` at
 every decision. ∎
 
-The proof needs no tolerance: as long as the engine behaves as predicted, the harm of the episode and
-the last bound are the same floating-point number.
+The proof needs no tolerance: as long as the engine behaves as predicted, the harm of the episode and the last bound are
+the same floating-point number.
 
 **Several vehicles.** With several shielded vehicles, each action in the proof is an array with one action per shielded
 vehicle. The shield first tries all proposals together. If no plan after all proposals stays within the budget, the
@@ -37,9 +36,17 @@ shield tries the proposals one by one, front to rear: one vehicle's proposal rep
 A single proposal is accepted if some plan after this proposal stays within the budget; if not, the vehicle's planned
 action remains. Before and after each proposal is tried, the shield has a plan whose harm is at most the budget.
 
-**Several members.** The shield may consider several possible worlds, the *members* of a world. With several members,
-each harm in the proof is the largest harm over the members, and the same actions are executed in all members. So in
-*every* member the harm of the episode is at most ``B``.
+**Several members.** With several possible worlds (*members*) of a world, each harm in the proof is the largest harm
+over the members, and the same actions are executed in all members. So in *every* member the harm of the episode is at
+most ``B``.
+
+Arguments that several methods share:
+
+- ``worlds``: n worlds at the alert; ``possible``: the M possible worlds of each world, [n * M], with the world itself
+  first.
+- ``rows``: indices of the batch rows in which new episodes start, [n].
+- ``memory``: the shield's memory before the decision; ``asked``: True for each world in which to decide, [n].
+- ``seen``: the observed worlds, [n, columns]; the columns are the first columns of ``Running.states``.
 """
 
 from __future__ import annotations
@@ -81,21 +88,17 @@ class StepShield:
     original.
 
     At the alert the bound is the harm of E-V2X-BM's constant deceleration, executed decision by decision. In worlds
-    where ``policy``, simulated from the alert, does less harm than E-V2X-BM, the bound is the policy's harm. The bound
-    never rises, and covers the time up to the scenario's horizon. ``memory.settles`` [n] is True for the worlds in
-    which all vehicles are at rest at the horizon if the plan made at the alert is executed.
+    where ``policy``, simulated from the alert, does less harm than E-V2X-BM, the bound is the policy's harm.
 
     At each decision the observed worlds are compared with the shield's prediction, bit by bit. If a world differs from
     its prediction (a vehicle brakes beyond its capacity, a number is NaN, a message is missing), this world is marked
     in ``memory.distrusted`` [n], and its bound no longer holds. In a distrusted world the shield ignores proposals for
     the rest of the episode, and applies the rest of the plan or the best constant action, whichever does less harm. The
-    shield chooses again between the plan and the best constant action whenever a distrusted world differs from the
-    prediction. If the engine continues an episode after the end that the shield predicted, the shielded vehicles brake
-    fully.
+    shield chooses again whenever a distrusted world differs from the prediction. If the engine continues an episode
+    after the end that the shield predicted, the shielded vehicles brake fully.
 
-    If ``begin`` gets several ``possible`` worlds for each world, each harm is the largest harm over these possible
-    worlds. With several possible worlds, each observed number must lie within the range of its predictions in these
-    worlds.
+    With several ``possible`` worlds for each world, each harm is the largest harm over the possible worlds, and each
+    observed number must lie within the range of its predictions.
 
     Args:
         scenario: the scenario of all worlds.
@@ -103,9 +106,9 @@ class StepShield:
         harm_count: which harm is bounded: ``first`` (first impact of each pair) or ``total`` (every impact).
         allowance: amount by which the bound is loosened until the episode ends, m2/s2.
         others: scripts of the unshielded vehicles (vehicle index -> script); each script must fix its commands at the
-            alert. If ``others`` is None, the scenario's scripts drive.
-        cap: ``baseline``: no vehicle bears more harm than it would bear under the constant actions that do the least
-            harm; None: only the harm summed over all vehicles is bounded.
+            alert. None: the scenario's scripts.
+        cap: ``baseline``: no vehicle bears more harm than under the constant actions that do the least harm; None: only
+            the harm summed over all vehicles is bounded.
         logging: whether ``log`` lists the interventions (replaced actions).
 
     Raises ``InvalidInput`` for an unknown harm count, an unknown vehicle, a negative allowance, or a script in
@@ -150,7 +153,7 @@ class StepShield:
 
     @property
     def bound(self) -> Floats:
-        """Bound of each running episode: the harm that the episode will not exceed, [n] m2/s2."""
+        """Bound of each running episode, [n] m2/s2."""
         return self._bound_of(self.memory)
 
     def _bound_of(self, memory: StepMemory) -> Floats:
@@ -161,12 +164,12 @@ class StepShield:
 
     @property
     def predicted_harm(self) -> Floats:
-        """The bound that each episode had at the alert, including the allowance, [n] m2/s2."""
+        """Bound of each episode at the alert, including the allowance, [n] m2/s2."""
         return self.memory.first_bound + self.allowance
 
     @property
     def chosen_policy(self) -> Bools:
-        """For each world: True if no proposed action has been replaced so far in the running episode, [n]."""
+        """For each world: True if no action has been replaced so far in the running episode, [n]."""
         return np.asarray(self.interventions == 0, np.bool_)
 
     @property
@@ -191,7 +194,7 @@ class StepShield:
         return ends_under(running.nominal(), backup.plan)[1][:, -self.scenario.vehicles :]
 
     def take(self, rows: Ints) -> Self:
-        """Return an independent copy of the shield that contains only the episodes in the rows ``rows`` (indices)."""
+        """Return an independent copy of the shield that contains only the episodes in the rows ``rows``."""
         part = copy.copy(self)
         part.memory = self.memory.take(rows)
         return part
@@ -209,14 +212,12 @@ class StepShield:
         To enlarge the batch to k rows, start episodes in all rows from 0 to k - 1 in one call.
 
         Args:
-            worlds: worlds of the new episodes at the alert, as the shield assumes them (the true worlds may differ).
+            worlds: the worlds of the new episodes, as the shield assumes them (the true worlds may differ).
             rows: indices of the batch rows in which the new episodes start.
-            policy: policy that proposes actions, or vehicle index -> policy for several vehicles. The policy is
-                simulated from the alert; in worlds where the policy does less harm than the constant actions with the
-                least harm, the policy's harm is the bound. If ``policy`` is None, the bound is the harm of the constant
-                actions with the least harm.
-            possible: the M possible worlds of each world (the world itself first), [len(rows) * M]; None: the result of
-                ``members_of(worlds)``.
+            policy: policy that is simulated from the alert, or vehicle index -> policy for several vehicles; in worlds
+                where it does less harm than the best constant actions, its harm is the bound. None: the bound is the
+                harm of the best constant actions.
+            possible: the possible worlds of each world; None: the result of ``members_of(worlds)``.
 
         Raises ``InvalidInput`` for rows that do not exist in the batch, and if the messages in ``worlds`` lack a
         quantity that the shield needs.
@@ -235,23 +236,14 @@ class StepShield:
     def members_of(self, worlds: Worlds) -> Worlds:
         """Return the M possible worlds of each of n worlds at the alert, as one batch of n * M worlds.
 
-        In this class M is 1: the only possible world is the world itself. A subclass may return several possible worlds
-        for each world.
+        In this class the only possible world is the world itself. A subclass may return several.
         """
         return worlds
 
     def _begun(
         self, worlds: Worlds, rows: Ints, policy: Agent | Mapping[int, Agent] | None, possible: Worlds
     ) -> StepMemory:
-        """Return the shield's memory of new episodes, with the plan and the bound of each world at the alert.
-
-        Args:
-            worlds: n worlds at the alert.
-            rows: indices of the batch rows in which the new episodes start, [n].
-            policy: the policy that proposes actions, or vehicle index -> policy for several vehicles; None: no policy.
-            possible: the M possible worlds of each world, [n * M].
-
-        """
+        """Return the shield's memory of new episodes, with the plan and the bound of each world at the alert."""
         members, vehicles = possible.n // worlds.n, self.vehicles
         problem = self._problem(possible, members)
         running = begin_running(problem, members)
@@ -288,7 +280,7 @@ class StepShield:
     def _problem(self, possible: Worlds, members: int) -> ProfileProblem:
         """Return the possible worlds and the unshielded vehicles' commands, as input for ``engine.profiles``.
 
-        ``members`` is the number of possible worlds of each world. Raises ``InvalidInput`` if a script's commands are
+        ``members`` is the number M of possible worlds of each world. Raises ``InvalidInput`` if a script's commands are
         not fixed at the alert. With several possible worlds, also raises ``InvalidInput`` if the shield has a cap, or
         if in one possible world the first decision is not before the horizon.
         """
@@ -319,16 +311,10 @@ class StepShield:
     ) -> tuple[Floats, Any]:
         """Return the bound of each episode at the alert, [n] m2/s2, and further memory (``StepMemory.enclosure``).
 
-        This class returns ``harm`` as the bound, and None as the further memory; a subclass may return another bound
-        and a further memory.
-
-        Args:
-            possible: the M possible worlds of each world at the alert.
-            problem: the possible worlds in the form that the functions of ``engine.profiles`` need.
-            rows: indices of the batch rows in which the new episodes start.
-            plan: plan made for each world at the alert: the actions of each decision, [n, L] or [n, L, K].
-            harm: harm of the plan made for each world at the alert, the largest over the possible worlds, [n] m2/s2.
-
+        ``plan`` is the first plan of each world, [n, L] or [n, L, K]; ``harm`` is the harm of this plan, the largest
+        over the possible worlds, [n] m2/s2. ``problem`` describes the possible worlds for the functions of
+        ``engine.profiles``. This class returns ``harm`` and None; a subclass may return another bound and a further
+        memory.
         """
         return harm, None
 
@@ -345,16 +331,14 @@ class StepShield:
         Args:
             proposed: proposed actions, [n], or [n, K] for several vehicles; clipped to [-1, 1]. Where the proposal is
                 NaN, the planned action is applied.
-            seen: the observed worlds, [n, columns], which are compared with the prediction; the columns are the first
-                columns of ``Running.states``. If ``seen`` is None, nothing is compared.
-            only: True for each world in which to decide, [n]; all other worlds stay unchanged. If ``only`` is None, the
-                shield decides in every world whose episode has not ended.
-            proposer: the policies that propose actions, with their memories and the worlds at this decision. If no
-                other plan certifies a proposal, the shield simulates the policies after this proposal, and tries their
-                actions as a plan. If ``proposer`` is None, no policy is simulated.
+            seen: the observed worlds, which are compared with the prediction; None: nothing is compared.
+            only: True for each world in which to decide, [n]; all other worlds stay unchanged. None: the shield decides
+                in every world whose episode has not ended.
+            proposer: the policies that propose actions. If no other plan certifies a proposal, the shield simulates the
+                policies after this proposal, and tries their actions as a plan. None: no policy is simulated.
 
-        Returns the decision with the actions to apply. After the call, the attribute ``memory`` contains the state that
-        is predicted for the next decision.
+        Returns the decision with the actions to apply. After the call, ``memory`` contains the state that is predicted
+        for the next decision.
 
         """
         memory = self.memory
@@ -371,11 +355,7 @@ class StepShield:
     def _decided(
         self, memory: StepMemory, proposed: Floats, asked: Bools, proposer: Proposer | None
     ) -> tuple[Decision, StepMemory]:
-        """Return the decision on ``proposed`` [n] or [n, K], and the memory after the decision.
-
-        ``memory`` is the memory before the decision. ``asked`` [n] is True for the worlds in which to decide.
-        ``proposer`` contains the policies to simulate; None: no policy.
-        """
+        """Return the decision on ``proposed`` [n] or [n, K], and the memory after the decision."""
         before, held, budget = memory.running, memory.backup, self._bound_of(memory)
         assert before is not None
         goes_on, asked = asked & before.finished, asked & ~before.finished
@@ -407,26 +387,17 @@ class StepShield:
     ) -> Decision:
         """Return the decision that is applied: ``decision``, in which a subclass may replace further actions.
 
-        The plans of ``decision`` already stay within the budget in every possible world. This class returns
-        ``decision`` unchanged.
-
-        Args:
-            now: the running episodes before the decision.
-            memory: the shield's memory before the decision, which contains the old plan.
-            budget: largest harm of the whole episode that the shield accepts in each world, [n] m2/s2.
-            decision: the decision of ``certify``, changed so that proposals that only a rollout of the policy certifies
-                are accepted, too.
-            asked: True for each world in which to decide (only trusted worlds), [n].
-
+        ``decision`` already accepts proposals that only a rollout of the policy certifies, and its plans stay within
+        the ``budget`` [n] (m2/s2) in every possible world. ``now`` are the running episodes before the decision;
+        ``asked`` is True only for trusted worlds. This class returns ``decision`` unchanged.
         """
         return decision
 
     def as_seen(self, seen: Floats) -> Floats:
-        """Return the observed worlds ``seen`` [n, columns] in a form that can be compared with the prediction.
+        """Return the observed worlds ``seen`` in a form that can be compared with the prediction.
 
         Predictions may have a column for the gap to an obstacle ahead. In worlds without an obstacle, the observed gap
-        to the obstacle is infinite; the result contains the predicted number instead. The result contains all other
-        numbers of ``seen`` unchanged.
+        to the obstacle is infinite; the result contains the predicted number instead.
         """
         running = self.memory.running
         assert running is not None
@@ -438,7 +409,7 @@ class StepShield:
         return seen
 
     def expects(self, seen: Floats) -> Bools:
-        """Return whether each observed world in ``seen`` [n, columns] agrees with the prediction, [n].
+        """Return whether each observed world in ``seen`` agrees with the prediction, [n].
 
         With a single possible world, each observed number must equal the predicted number to the bit. With several
         possible worlds, each observed number must lie within the range of its predictions in the possible worlds. Once
@@ -459,7 +430,6 @@ class StepShield:
         """For each world: return whether an impact has happened in at least one of its possible worlds, [n].
 
         After an impact in a possible world, the true world may lie outside the range of the possible worlds.
-        ``running`` contains the episodes as the shield predicted them.
         """
         N = running.problem.mass.shape[1]
         predicted = running.states.reshape(running.n, running.members, -1)
@@ -468,9 +438,7 @@ class StepShield:
     def _compared(self, memory: StepMemory, seen: Floats, asked: Bools) -> StepMemory:
         """Compare the observed worlds with the prediction in ``memory``; return the new memory.
 
-        ``seen`` [n, columns] contains the observed worlds; its columns are the first columns of ``Running.states``.
-        ``asked`` [n] is True for the worlds that are compared with the prediction. A world that differs from the
-        prediction becomes distrusted, and gets a new plan from the observed state on.
+        A world that differs from the prediction becomes distrusted, and gets a new plan from the observed state on.
         """
         running, backup, seen = memory.running, memory.backup, self.as_seen(seen)
         assert running is not None

@@ -27,7 +27,7 @@ class StepMemory(NamedTuple):
     logged: int = 0  # number of interventions in the log
 
     def take(self, rows: Ints) -> StepMemory:
-        """Return the memory of only the episodes in the rows ``rows`` (indices)."""
+        """Return the memory of only the episodes in the rows ``rows``."""
         running, backup, enclosure = self.running, self.backup, self.enclosure
         return self._replace(
             running=None if running is None else running.take(rows),
@@ -37,12 +37,11 @@ class StepMemory(NamedTuple):
         )
 
     def put(self, rows: Ints, begun: StepMemory) -> StepMemory:
-        """Return a copy of this memory in which new episodes replace the episodes in the rows ``rows`` (indices).
+        """Return a copy of this memory in which new episodes replace the episodes in the rows ``rows``.
 
-        ``begun`` is the memory of the new episodes, in the order of ``rows``. The field ``begun.enclosure`` (further
-        memory of a subclass) contains all rows of the batch; all other fields of ``begun`` contain only the new
-        episodes. If there are at least as many new episodes as rows in the batch, the new episodes replace the whole
-        batch. Each new episode gets a higher number than the old episode in its row.
+        ``begun`` is the memory of the new episodes, in the order of ``rows``; only its field ``enclosure`` contains all
+        rows of the batch. If there are at least as many new episodes as rows in the batch, the new episodes replace the
+        whole batch. Each new episode gets a higher number than the old episode in its row.
         """
         old, new = self.running, begun.running
         assert new is not None

@@ -34,7 +34,6 @@ class _Closing:
     attached: Attached  # the link to the engine and its guard
 
     def close(self, **settings: Any) -> None:
-        """Remove the shield from the environment, then call ``close(**settings)`` of the environment."""
         self.attached.close()
         super().close(**settings)  # type: ignore[misc]  # of the wrapper's own library
 
@@ -44,14 +43,14 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
 
     Mode ``step`` (the default) certifies or replaces the actions of all learners together. In mode ``episode`` (the
     paper's Algorithm 1) the policy or E-V2X-BM drives the whole episode, whatever actions are proposed. The bounds hold
-    as long as the other vehicles follow their scripts. The infos of each agent, ``infos[agent]``, describe the shield's
-    decision under the keys ``shield_...``. See docs/shield.md.
+    as long as the other vehicles follow their scripts. ``infos[agent]`` describes the shield's decision under the keys
+    ``shield_...``. See docs/shield.md.
 
     Args:
         env: ``eb.parallel_env(...)`` with one learner (in mode ``step`` one or more), or a wrapper around it.
         policy: an agent, a policy, a ``Team``, or a mapping from learner name to policy. The policy proposes the
             actions that the caller leaves out. In worlds where the policy does less harm than E-V2X-BM, the policy's
-            harm is the bound (the harm that the episode will not exceed). Mode ``episode`` needs a policy.
+            harm is the bound. Mode ``episode`` needs a policy.
         agents: names of the learners to shield; must contain every learner. None: all learners.
         options: keywords of ``ShieldOptions``, including ``mode``.
 
@@ -96,8 +95,7 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
     ) -> tuple[dict[str, Observations], dict[str, dict[str, Any]]]:
         """Start an episode; return the observations and infos of the agents.
 
-        ``seed`` and ``options`` are passed to the environment. ``infos[agent]["shield_bound_harm"]`` is the shield's
-        bound on the harm of the episode, m2/s2.
+        ``infos[agent]["shield_bound_harm"]`` is the bound of the episode, m2/s2.
         """
         self.attached.check_open()
         result: tuple[dict[str, Observations], dict[str, dict[str, Any]]] = super().reset(seed=seed, options=options)
@@ -137,9 +135,8 @@ class ShieldedEnv(
 
     Args:
         env: an ``EthBrake-v1`` environment, or a wrapper around it.
-        policy: policy that is simulated at the start of each episode, from the alert on. In worlds where the policy
-            does less harm than E-V2X-BM, the policy's harm is the bound (the harm that the episode will not exceed). In
-            all modes except ``episode``, ``policy`` may be None.
+        policy: policy that is simulated from the alert on. In worlds where the policy does less harm than E-V2X-BM, the
+            policy's harm is the bound. In all modes except ``episode``, ``policy`` may be None.
         options: keywords of ``ShieldOptions``, including ``mode``.
 
     Raises ``InvalidInput`` if ``env`` is another kind of environment, and for invalid arguments.
@@ -168,8 +165,7 @@ class ShieldedEnv(
     ) -> tuple[Observations, dict[str, Any]]:
         """Start an episode; return observation and info.
 
-        ``seed`` and ``options`` are passed to the environment. ``info["shield_bound_harm"]`` is the shield's bound on
-        the harm of the episode, m2/s2.
+        ``info["shield_bound_harm"]`` is the bound of the episode, m2/s2.
         """
         self.attached.check_open()
         result = self.env.reset(seed=seed, options=options)
@@ -179,8 +175,8 @@ class ShieldedEnv(
     def step(self, action: NDArray[Any]) -> Any:
         """Advance by one time step; the shield certifies or replaces the action [1].
 
-        Returns what ``step`` of the wrapped environment returns, but with the intervention penalty subtracted from the
-        reward. If the environment contains a ``CostEnv``, the cost is among the returned values.
+        Returns what ``step`` of the wrapped environment returns (with a ``CostEnv`` inside, also the cost), but with
+        the intervention penalty subtracted from the reward.
         """
         self.attached.check_open()
         observation, reward, *others = self.env.step(action)
@@ -197,9 +193,8 @@ class ShieldedVectorEnv(_Closing, VectorWrapper):
 
     Args:
         env: an ``EthBrakeVectorEnv``, or a wrapper around it.
-        policy: policy that is simulated at the start of each episode, from the alert on. In worlds where the policy
-            does less harm than E-V2X-BM, the policy's harm is the bound (the harm that the episode will not exceed). In
-            all modes except ``episode``, ``policy`` may be None.
+        policy: policy that is simulated from the alert on. In worlds where the policy does less harm than E-V2X-BM, the
+            policy's harm is the bound. In all modes except ``episode``, ``policy`` may be None.
         options: keywords of ``ShieldOptions``, including ``mode``.
 
     Raises ``InvalidInput`` if ``env`` is another kind of environment, and for invalid arguments.
@@ -226,8 +221,7 @@ class ShieldedVectorEnv(_Closing, VectorWrapper):
     ) -> tuple[Observations, dict[str, Any]]:
         """Start an episode in every row; return observations [rows, F] and infos.
 
-        ``seed`` and ``options`` are passed to the environment. ``infos["shield_bound_harm"]`` [rows] contains the
-        shield's bound on the harm of each episode, m2/s2.
+        ``infos["shield_bound_harm"]`` [rows] contains the bound of each episode, m2/s2.
         """
         self.attached.check_open()
         result = self.env.reset(seed=seed, options=options)
@@ -256,8 +250,7 @@ def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, *
             shield certifies the changed action. ``env`` may also be an agent or a team; ``options`` must then contain
             ``scenario``, the scenario in which actions are certified.
         policy: policy that proposes the actions that the caller leaves out. In worlds where the policy does less harm
-            than E-V2X-BM, the policy's harm is the bound (the harm that the episode will not exceed). In all modes
-            except ``episode``, ``policy`` may be None.
+            than E-V2X-BM, the policy's harm is the bound. In all modes except ``episode``, ``policy`` may be None.
         mode: ``step``, ``episode``, or the mode of an extension. None means ``step``; but if the mode ``step`` does not
             accept one of the ``options``, None means the first mode that accepts all of them.
         options: further keywords of ``ShieldOptions``.
