@@ -89,7 +89,7 @@ class NetworkShape(Shape):
     )
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
-        """Return the description of an actor and a critic; for the arguments, see ``Shape.spec``."""
+        """Return the description of an actor and a critic; see ``Shape.spec``."""
         return super().spec(observation_size, value_hidden=self.value, **more)
 
 
