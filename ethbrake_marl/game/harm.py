@@ -165,10 +165,9 @@ def empty_ledger(worlds: Worlds) -> Ledger:
 
 @compiled
 def split(pair_harm: Floats, mass_t: Floats) -> Floats:
-    """Divide the harm of each pair, [n, P], between its two vehicles; return the harm that each vehicle bears, [n, N].
+    """Divide the harm of each pair between its two vehicles; return the harm that each vehicle bears, [n, N] m2/s2.
 
-    The lighter vehicle of a pair bears the larger part. Harm is in m2/s2; ``mass_t`` is the mass of each vehicle, [n,
-    N] t.
+    The lighter vehicle of a pair bears the larger part. ``pair_harm`` is the harm of each pair, [n, P] m2/s2.
     """
     n, vehicles = mass_t.shape
     harm = np.zeros((n, vehicles))

@@ -45,7 +45,7 @@ class EpisodeImpacts:
     def largest_speed_change_mps(self) -> Floats:
         """Largest change of speed of each vehicle in a single impact (delta-v), [n, N] m/s; 0 without an impact.
 
-        Changes of speed by a push, which is not an impact, are not included.
+        A push by a vehicle that is already in contact is not an impact and is not included.
         """
         rows, change = self.rows, np.zeros(self.worlds.speeds_mps.shape)
         np.maximum.at(change, (rows.world, rows.pair + 1), np.abs(rows.rear_speed_change_mps))
@@ -56,9 +56,9 @@ class EpisodeImpacts:
     def and_then(self, way: Iterable[tuple[Worlds, Floats, Floats]], some: Bools) -> EpisodeImpacts:
         """Return the impacts of this object together with the impacts in the next segments of the same episodes.
 
-        ``way`` has consecutive segments (time intervals) from ``Engine.segments``: the worlds at the start of the
-        segment, the constant commands [n, N] m/s2, and the times [n] s at which the segment ends. Only the new impacts
-        of worlds for which the mask ``some`` [n] is True are added.
+        ``way`` has consecutive segments (time intervals) from ``Engine.segments``. Each segment is a tuple: the worlds
+        at its start, the constant commands [n, N] m/s2, and the times [n] s at which it ends. New impacts are added
+        only in worlds for which the mask ``some`` [n] is True.
         """
         parts, blocks = list(way), [self.rows]
         for k, (before, command_mps2, until_s) in enumerate(parts, 1):

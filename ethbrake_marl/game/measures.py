@@ -58,9 +58,9 @@ class NamedMeasure:
     def of(self, given: StepOutcome | EpisodeImpacts, counts: Bools | None = None, steps: Ints | None = None) -> Any:
         """Return the value of a registered measure: [n] for one number per world, [n, N] for one number per vehicle.
 
-        The value is 0 in worlds where the mask ``counts`` [n] is False. ``steps``, the number of steps that each
-        episode has taken, [n], appears in error messages. Raises ``InvalidInput``, which names the measure, if a value
-        is not finite or the result has a wrong shape or type.
+        The value is 0 in worlds where the mask ``counts`` [n] is False; None: all worlds count. ``steps``, the number
+        of steps that each episode has taken, [n], appears in error messages. Raises ``InvalidInput``, which names the
+        measure, if a value is not finite or the result has a wrong shape or type.
         """
         if isinstance(given, StepOutcome):
             given.protect()

@@ -345,8 +345,8 @@ def _observe_rows(
 ) -> None:  # fmt: skip
     """Write the features of each observer into ``out``, [n, observers, F], group by group.
 
-    The function is one long loop, because it was four times slower when the loop called smaller functions. For
-    ``offsets``, ``role``, ``with_obstacle`` and ``features``, see ``Scaling``.
+    The function is one long loop, because it was four times slower when the loop called smaller functions. For the
+    arguments from ``offsets`` to ``features``, see ``Scaling``.
     """
     of = columns(state)
     N, speed, command, gap_column, hit, obstacle = of.vehicles, of.speed, of.command, of.gap, of.hit, of.obstacle

@@ -151,7 +151,7 @@ def list_scenarios() -> list[CatalogueEntry]:
 
 
 def _known_paths() -> dict[str, Path]:
-    """Return the file of every shipped and registered scenario, by name; raise ``AlreadyExists`` for a repeated name."""
+    """Return the file of every shipped and registered scenario by name; raise ``AlreadyExists`` for a repeated name."""
     shipped = _shipped_paths()
     known = dict(shipped)
     for folder in FOLDERS.values():

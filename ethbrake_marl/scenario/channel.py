@@ -16,8 +16,8 @@ link. A vehicle's sensors see its direct neighbours after a delay, called a *hop
 
     latency_i = max(own latency_i, min(tau_i1, latency_(i-1) + hop_(i, i-1)))
 
-At this time, its own latency has elapsed, and it has either received the message of Vehicle 1 or seen the vehicle ahead
-brake. Vehicle i knows the state of vehicle j from ``max(latency_i, tau_ij)`` on, or from
+At this time, vehicle i's own latency has elapsed, and vehicle i has either received the message of Vehicle 1 or seen
+the vehicle ahead brake. Vehicle i knows the state of vehicle j from ``max(latency_i, tau_ij)`` on, or from
 ``max(latency_i, min(tau_ij, hop_ij))`` on if it also sees vehicle j. If a vehicle observes another vehicle's latency,
 it observes the *own* latency of that vehicle, which does not include delays of the channel. Under the preset ``paper``
 a vehicle knows the state of every vehicle as soon as its own latency has elapsed.
@@ -308,7 +308,7 @@ class V2X(FileModel):
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        """The name of a preset, or a mapping."""
+        """JSON schema: the name of a preset, or a mapping."""
         mapping = handler(core)
         return {"anyOf": [{"enum": list(CHANNELS), "type": "string"}, mapping]}
 
@@ -396,8 +396,8 @@ class V2X(FileModel):
     def with_channel(self, worlds: Worlds, u: Floats, key: Floats, time_step_s: float, equipped: Equipped) -> Worlds:
         """Return ``worlds`` with the times from which each vehicle knows every other, and with the periodic messages.
 
-        ``worlds`` are at the alert and do not yet contain delays or messages of a channel. ``key`` has a number in [0,
-        1) for each world, [n], from which the random losses of all messages after the first one are computed.
+        ``worlds`` are at the alert and do not yet contain delays or messages of a channel. The random losses of all
+        messages after the first one are computed from ``key``, which has a number in [0, 1) for each world, [n].
         """
         channel, contents = self.channel, self.channel.contents(worlds.N)
         worlds = replace(worlds, vehicles=self.with_news(worlds.vehicles, u, equipped))
@@ -416,8 +416,7 @@ class V2X(FileModel):
         """Return the user's ``worlds`` with this channel's data added; raise ``InvalidInput`` if the channel is random.
 
         ``worlds`` do not yet contain delays or messages of a channel. ``equipped`` is None if the equipment differs
-        randomly between worlds, which also raises ``InvalidInput``. The error message begins with ``where``, which says
-        where the user gave the worlds.
+        randomly between worlds. The error message begins with ``where``, which says where the user gave the worlds.
         """
         if not self.by_link:
             return worlds
@@ -432,8 +431,7 @@ class V2X(FileModel):
 
 
 def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
-    """Return the number k of message periods that a burst of losses lasts, for each uniform number in ``u`` (any
-    shape).
+    """Return the number k of message periods that a burst of losses lasts, in the shape of ``u`` (any shape).
 
     For m = 1, 2, ..., the result k is at least m exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``, where p is
     ``loss_begins`` and r is ``loss_ends``. This rule is the inverse of the distribution function of k in the stationary

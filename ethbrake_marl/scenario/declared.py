@@ -243,7 +243,7 @@ class ScenarioFields(FileModel):
     @field_validator(*QUANTITY.declared)
     @classmethod
     def _entries(cls, value: Any, info: ValidationInfo) -> Any:
-        """Check that all possible values of a quantity are in range, and that a list has the right length."""
+        """Check that all values of a quantity are in range, and that a list has one value per vehicle or pair."""
         rule, vehicles = QUANTITY.declared[str(info.field_name)], info.data.get("vehicles")
         if value is None:
             return value
@@ -438,8 +438,8 @@ class ScenarioFields(FileModel):
     def quantities(self, field: str) -> tuple[AnyQuantity, ...]:
         """Return the declaration of the quantity ``field``: a number or distribution for each vehicle, pair or world.
 
-        Raises ``InvalidInput`` for a mixture, and for a key that this scenario does not use, for example ``gaps_m`` if
-        it declares ``time_gaps_s``.
+        Gaps have one entry per pair; restitution and line speed have one per world. Raises ``InvalidInput`` for a
+        mixture, and for a key that this scenario does not use, for example ``gaps_m`` if it declares ``time_gaps_s``.
         """
         declared: AnyQuantity | tuple[AnyQuantity, ...] | None = getattr(self, QUANTITY.declared[field].name)
         if self.members:

@@ -79,7 +79,8 @@ def member_content(member: ScenarioFields) -> dict[str, Any]:
 def _member_document(document: Document, i: int, entry: Mapping[str, Any], beside: Mapping[str, Any]) -> Document:
     """Return scenario ``i`` (from 0) of a mixture as a document, without title, description and source.
 
-    ``entry`` is its entry in the list ``mixture``. The keys ``beside`` the list replace the same keys of the scenario.
+    ``entry`` is the scenario's entry in the list ``mixture``. The keys in ``beside``, which stand beside ``mixture`` in
+    the file, replace the same keys of the scenario.
     """
     own = {key: value for key, value in entry["scenario"].items() if key not in WORDS}
     inside = {path[3:]: line for path, line in document.lines.items() if path[:3] == ("mixture", i, "scenario")}

@@ -39,9 +39,9 @@ class Ranges:
     def sample(self, points: Floats) -> tuple[Sample, Bools]:
         """Return the worlds at ``points`` of the unit cube, and whether the scenario accepts each world, [n].
 
-        A world is not accepted if the scenario says ``early_impacts: reject`` and an impact happens in this world
-        before the first learner can act. ``points`` has coordinates in [0, 1), in the order of ``names``, [n,
-        coordinates].
+        The coordinates of the points, [n, coordinates], are in [0, 1) and in the order of ``names``. A world is not
+        accepted if the scenario says ``early_impacts: reject`` and an impact happens in this world before the first
+        learner can act.
         """
         n, vehicles = len(points), self.scenario.vehicles
         widths = {(): BLOCK * vehicles, TYPES: PER_TYPE * vehicles, OBSTACLE: OF_WORLD, SURROUNDINGS: OF_WORLD}

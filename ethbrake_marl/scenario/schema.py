@@ -248,8 +248,7 @@ def _reference(key: str) -> dict[str, Any]:
 
 
 def _range(key: str, low: float, high: float, positive: bool = False) -> dict[str, Any]:
-    """Return the JSON schema of a quantity; it allows only numbers from ``low`` to ``high``, also in distributions and
-    lists.
+    """Return the JSON schema of a quantity; its numbers, also in distributions and lists, must be in [low, high].
 
     If ``positive`` is true, ``low`` itself is not allowed.
     """

@@ -172,8 +172,9 @@ def _numbers(what: str, value: ArrayLike) -> Floats:
 
 
 def _read_csv(file: Path) -> tuple[list[str], list[list[str]], list[int]]:
-    """Return the header of a CSV file, its rows (at least one, of unchecked texts), and the line at which each row
-    begins.
+    """Return the header of a CSV file, its rows (at least one), and the line at which each row begins.
+
+    The cells of the rows are unchecked texts.
     """
     rows: list[list[str]] = []
     lines: list[int] = []

@@ -38,9 +38,7 @@ class Algorithm(ABC):
         return (model.policy,)
 
     def tensors(self, actor: BasePolicy, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return a copy of the weights of ``actor``, one of the ``actors``: name of a tensor in a policy bundle -> its
-        values.
-        """
+        """Return a copy of the weights of ``actor``: name of a tensor in a policy bundle -> its values."""
         return tensors_of(actor, network)
 
     def optimizers(self, model: BaseAlgorithm) -> Mapping[str, Optimizer]:

@@ -169,8 +169,9 @@ def _try_step(optimizer: torch.optim.Optimizer) -> None:
 
 
 def check_counter(name: str, value: object, kind: type) -> None:
-    """Raise ``ValueError`` unless a counter of a checkpoint has the type ``kind``; an ``int`` must be from 0 to 2^53 -
-    1.
+    """Raise ``ValueError`` unless a counter of a checkpoint has the type ``kind``.
+
+    A counter of type ``int`` must be from 0 to 2^53 - 1.
     """
     if type(value) is not kind or (kind is int and not 0 <= value < 1 << 53):  # type: ignore[operator]  # an int
         right = "a whole number, at least 0" if kind is int else f"of type {kind.__name__}"

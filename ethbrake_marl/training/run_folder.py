@@ -144,7 +144,7 @@ class RunDirectory:
         return list(csv.DictReader(self.progress.read_text("utf-8").splitlines()))
 
     def cpu_s(self) -> dict[int, float]:
-        """Return number of decisions before an evaluation -> processor time of learning until then (s).
+        """Return the processor time of learning (s) before each evaluation, by the number of decisions until then.
 
         Raises ``InvalidInput`` if ``run.json`` does not record the processor time.
         """

@@ -255,8 +255,8 @@ def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[st
 def save(callback: RunCallback, status: RunStatus, reason: str | None) -> None:
     """Save the best policy and the last policy whose weights are finite; record in ``run.json`` how the run ended.
 
-    The checkpoints of a finished run are deleted. ``reason`` says why the run was interrupted or failed, and is
-    recorded unless it is None.
+    The checkpoints of a finished run are deleted. ``reason`` says why the run was interrupted or failed; None: there is
+    no reason to record.
     """
     run, training, course = callback.run, callback.learner.training, callback.course
     for policy, folder in ((course.chosen, run.policy), (course.policy, run.last_policy)):

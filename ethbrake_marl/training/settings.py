@@ -48,8 +48,7 @@ class Settings(NamedTuple):
 def read_settings(
     texts: Sequence[str] | None, recipes: Sequence[TrainingRecipe] = (), *, of_agents: Sequence[str] = ()
 ) -> Settings:
-    """Parse the settings ``KEY=VALUE`` of a command, and sort them by whether they belong to scenario, recipe or
-    agents.
+    """Parse the settings of a command, and sort them by whether they belong to scenario, recipe or agents.
 
     For instance, ``mass_t=40`` and ``scenario.mass_t=40`` belong to the scenario, ``gamma=0.9`` to a recipe.
     ``of_agents`` has the names of the settings of agents that the command allows, such as ``harm_count``. Raises
