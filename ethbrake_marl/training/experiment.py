@@ -117,30 +117,21 @@ def run_experiment(
 ) -> ExperimentResult:
     """Train the learners, compare them (with and without a shield) with the baselines, and write results and reports.
 
-    All compared agents minimise the count of harm that the learners are trained for (``reward.harm_count`` of the
-    recipe). Installed extensions write reports about the results.
+    Several learners are trained as a team, with the recipe's scheme. All compared agents minimise the count of harm
+    that the learners are trained for (``reward.harm_count`` of the recipe). Installed extensions write reports about
+    the results.
 
     Ctrl-C during the training stops the training after the current update, and the policy trained so far is evaluated.
     A second Ctrl-C, or Ctrl-C during the evaluation, raises ``KeyboardInterrupt``; the folder still contains the
     policy. Ctrl-C while a report trains further policies stops their training, and the report is written without these
     policies (``ExperimentResult.interrupted``). ``run.json`` records how the run ended.
 
-    Args:
-        scenario: scenario with at least one learner. Several learners are trained as a team, with the recipe's scheme.
-        directory: the new folder of the run.
-        recipe: recipe of the training run, which also defines the reward.
-        steps: number of decisions of all learners together in the training; None: the recipe's number.
-        seed: seed of the training run; None: the recipe's seed.
-        episodes: number of worlds of the evaluation list.
-        list_seed: seed of the evaluation list.
-        force: whether to replace an earlier run in ``directory``.
-        settings: settings ``KEY=VALUE`` by which recipe and scenario differ from their files; ``config.json`` records
-            them.
-        on_progress: function that is called with the progress of training, evaluation and reports.
+    ``episodes`` is the number of worlds of the evaluation list, and ``list_seed`` its seed. ``on_progress`` is called
+    with the progress of training, evaluation and reports. For ``directory``, ``steps``, ``seed``, ``force`` and
+    ``settings``, see ``train``.
 
     Raises the errors of ``train`` and ``evaluate``, and ``AlreadyExists`` before the training if ``directory`` exists
     and ``force`` is false.
-
     """
     started = time.monotonic()
     tell = on_progress or (lambda progress: None)

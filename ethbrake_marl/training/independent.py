@@ -25,16 +25,10 @@ from torch import Tensor, nn
 class SeparatePolicies(BasePolicy):
     """One actor-critic policy and one optimiser for each learner, together with the interface of a single policy.
 
-    Learners whose numbers are in ``resting`` do not explore: they take the mean action.
-
-    Args:
-        observation_space: space of an observation row.
-        action_space: space of one learner's action.
-        lr_schedule: learning rate as a function of the fraction of the training that remains.
-        use_sde: whether to use state-dependent exploration.
-        columns: for each learner, front to rear, the columns of an observation row that the learner observes.
-        network: further keyword arguments of Stable-Baselines3's ``ActorCriticPolicy``, for each learner's policy.
-
+    Learners whose numbers are in ``resting`` do not explore: they take the mean action. ``columns`` has, for each
+    learner, front to rear, the columns of an observation row that the learner observes. ``network`` has further keyword
+    arguments of Stable-Baselines3's ``ActorCriticPolicy``, for each learner's policy; the other arguments are the same
+    as there.
     """
 
     def __init__(
@@ -100,17 +94,13 @@ class SeparatePolicies(BasePolicy):
 class IndependentPPO(PPO):
     """PPO with a separate policy for each learner.
 
-    If ``turns`` is None, all learners learn in every update. If ``turns`` is a number, only one learner learns at a
-    time, and the other learners take their mean actions. The learner that learns changes from turn to turn, and all
-    turns have about the same number of updates. The columns of the log have names such as ``vehicle_2/loss``.
+    If ``turns`` is None, all learners learn in every update. If ``turns`` is a number, each learner has this number of
+    turns: only one learner learns at a time, and the other learners take their mean actions. The learner that learns
+    changes from turn to turn, and all turns have about the same number of updates. The columns of the log have names
+    such as ``vehicle_2/loss``.
 
-    Args:
-        env: vectorised environment whose observation rows end with the number of the learner.
-        names: names of the learners, front to rear.
-        turns: number of turns of each learner during the training, or None.
-        columns: for each learner, front to rear, the columns of an observation row that the learner observes.
-        settings: further keyword arguments of Stable-Baselines3's ``PPO``.
-
+    ``names`` are the names of the learners, front to rear. For ``columns``, see ``SeparatePolicies``. ``settings`` has
+    further keyword arguments of Stable-Baselines3's ``PPO``.
     """
 
     policy: SeparatePolicies  # type: ignore[assignment]  # has the parts of an actor-critic policy that PPO uses
