@@ -3,8 +3,8 @@
 Importing the package registers ``EthBrake-v1`` with Gymnasium and ``ethbrake/ethbrake-v1`` with PettingZoo. Each public
 name is imported when it is first used, so torch and matplotlib are loaded only if they are needed.
 
-The ``if TYPE_CHECKING`` block below lists every public name once. Type checkers read this block as imports. At run time
-the package reads the names from this file and imports each name when it is first used.
+The ``if TYPE_CHECKING`` block below lists every public name once. Type checkers read this block as imports; at run time
+the package reads the names from it.
 """
 
 from __future__ import annotations

@@ -66,7 +66,7 @@ def plain_text(text: str, keep: str = "") -> str:
 def one_line(text: str) -> str:
     """Return ``text`` as one line of ``plain_text``; text longer than ``LINE_LIMIT`` is shortened in the middle.
 
-    If the message is shortened, its beginning (what is wrong, and where) and its end (what would be right) are kept.
+    The beginning (what is wrong, and where) and the end (what would be right) are kept.
     """
     blanks = text if len(text) <= 2 * LINE_LIMIT else text[:LINE_LIMIT] + text[-LINE_LIMIT:]
     line = plain_text(blanks)
@@ -76,19 +76,15 @@ def one_line(text: str) -> str:
 
 
 def count_of(n: int, thing: str) -> str:
-    """Return the number ``n`` and its noun as text, for example ``1 world`` or ``10,000 worlds``.
-
-    ``thing``: the noun in the singular, for example ``world``.
-    """
+    """Return a number and its noun (``thing``, in the singular) as text, such as ``1 world`` or ``10,000 worlds``."""
     return f"{n:,} {thing}{'' if n == 1 else 's'}"
 
 
 def describe_error(error: BaseException, path: str | None = None) -> str:
     """Describe an exception from the user's code in a few words, with the number of the line of code that raised it.
 
-    ``path``: the user's file; the last line of this file in the traceback is reported. If ``path`` is None, the
-    innermost line of the traceback is reported. If the exception is an error of this package, the description is only
-    its message.
+    The last line of the user's file ``path`` in the traceback is reported; if ``path`` is None, the innermost line. If
+    the exception is an error of this package, the description is only its message.
     """
     text = str(error) if isinstance(error, EthBrakeError) else f"{type(error).__name__}: {error}"
     frames = traceback.extract_tb(error.__traceback__)
@@ -188,12 +184,9 @@ def _missing(package: str) -> MissingExtra:
 class PhysicsError(EthBrakeError, ArithmeticError):
     """Some worlds of a batch could not be simulated. The cause is a defect of the physics kernel, never of the input.
 
-    The failure does not affect the other worlds of the batch, so a caller may compute the batch again without the
-    failed worlds (``physics.left_out.leaving_out_failed``).
-
-    Args:
-        worlds: mapping from the row (in the batch) of each failed world to the reason of its failure.
-
+    A caller may compute the batch again without the failed worlds, which do not affect the others
+    (``physics.left_out.leaving_out_failed``). ``worlds`` maps the row (in the batch) of each failed world to the
+    reason.
     """
 
     def __init__(self, worlds: Mapping[int, str]) -> None:
@@ -213,11 +206,8 @@ class PhysicsError(EthBrakeError, ArithmeticError):
 class AgentFailed(InvalidInput):
     """An agent of the user raised an exception or returned no valid actions; the message names agent, world and step.
 
-    Args:
-        agent: name of the agent that failed.
-        row: row of the world in the batch in which the agent failed; None if the row is unknown.
-        reason: what the agent did wrong, and at which step.
-
+    ``row`` is the row of the world in the batch; None if it is unknown. ``reason`` says what the agent did wrong, and
+    at which step.
     """
 
     def __init__(self, agent: str, row: int | None, reason: str) -> None:
@@ -237,7 +227,7 @@ class AgentFailed(InvalidInput):
     def naming(name: str, others: Collection[str] = ()) -> Iterator[None]:
         """Context manager: if the block raises ``AgentFailed``, replace the agent's name in the error by ``name``.
 
-        ``others``: names of the agents of the other vehicles; an error of one of these agents keeps the agent's name.
+        An error of one of the agents ``others`` keeps the agent's name.
         """
         try:
             yield
@@ -255,8 +245,7 @@ class Unfamiliar(UserWarning):
 def renumbered(rows: Sequence[int] | NDArray[np.int64]) -> Iterator[None]:
     """Context manager: change the row numbers in a ``PhysicsError`` or ``AgentFailed`` that is raised in the block.
 
-    Use this context manager for a block that works on a part of a batch: world k of the part is row ``rows[k]`` of the
-    whole batch.
+    The block works on a part of a batch: world k of the part is row ``rows[k]`` of the whole batch.
     """
     try:
         yield
@@ -271,7 +260,7 @@ class UncertifiedStep(EthBrakeError):
 def new_name(name: object, known: Collection[str]) -> str | None:
     """Return the new name if ``name`` was renamed and the new name is in ``known``; otherwise None.
 
-    If ``name`` contains colons, each of the words between the colons is looked up separately.
+    Each of the words between colons in ``name`` is looked up separately.
     """
     new = ":".join(RENAMED.get(word, word) for word in name.split(":")) if isinstance(name, str) else None
     return new if new != name and new in known else None
@@ -280,13 +269,8 @@ def new_name(name: object, known: Collection[str]) -> str | None:
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
     """Return the error for an unknown name; its message shows the new name, a similar name, or all known names.
 
-    Args:
-        kind: kind of thing that the unknown name should denote, for example ``scenario``.
-        name: the unknown name.
-        known: all existing names of this kind, from which the message suggests a similar name.
-        may_be_own: True: users can register names of this kind. If ``may_be_own`` is true, the message says that a name
-            of the user's own must first be registered or installed.
-
+    ``kind`` says what the name should denote, for example ``scenario``. ``may_be_own`` means that users can register
+    names of this kind; the message then says that such a name must first be registered or installed.
     """
     names = sorted(known)
     if new := new_name(name, names):
@@ -300,7 +284,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
 def refuse_shipped_path(path: str, agent: str = "") -> None:
     """Raise ``UnknownName`` if ``path`` is ``shipped`` or ``shipped/NAME``, the former way to name a shipped policy.
 
-    ``agent``: the name before the ``@``, in ``agent@path``; empty if there is no ``@``.
+    ``agent`` is the name before the ``@`` in ``agent@path``; empty if there is no ``@``.
     """
     folder, _, name = path.partition("/")
     if folder == "shipped":
@@ -309,10 +293,9 @@ def refuse_shipped_path(path: str, agent: str = "") -> None:
 
 
 def check_whole_number(what: str, value: object, least: int, most: int | None = None) -> None:
-    """Raise ``InvalidInput`` unless ``value`` is a whole number from ``least`` to ``most``; None as ``most``: no upper
-    limit.
+    """Raise ``InvalidInput`` unless ``value`` is a whole number from ``least`` to ``most`` (None: no upper limit).
 
-    ``what``: name of the value; the error message begins with this name.
+    The error message begins with ``what``, the name of the value.
     """
     whole = isinstance(value, Integral) and not isinstance(value, bool)
     if not (whole and least <= value and (most is None or value <= most)):  # type: ignore[operator]  # whole
@@ -321,14 +304,7 @@ def check_whole_number(what: str, value: object, least: int, most: int | None = 
 
 
 def check_one_learner(scenario: str, learners: Sequence[str], advice: str) -> None:
-    """Raise ``InvalidInput``, with ``advice`` at the end of the message, unless the scenario has exactly one learner.
-
-    Args:
-        scenario: name of the scenario.
-        learners: names of the scenario's learners.
-        advice: what the user can do; the error message ends with this text.
-
-    """
+    """Raise ``InvalidInput``, whose message ends with ``advice``, unless the scenario has exactly one learner."""
     if len(learners) != 1:
         raise InvalidInput(
             f"scenario {scenario!r} has {len(learners)} learners ({', '.join(learners) or 'none'}); {advice}"

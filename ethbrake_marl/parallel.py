@@ -44,12 +44,12 @@ def run_each(calls: Iterable[Call], jobs: int | None = None, ray: str | None = N
     """Run function calls in parallel and yield their results in the order of the calls.
 
     Args:
-        calls: tuples (function, argument, ...) with module-level functions. If ``calls`` is a generator, each tuple is
-            taken from it shortly before the call starts.
-        jobs: number of calls that run at once. If ``jobs`` is None, the number of calls at once is 1 without Ray, and
-            the number of cores with Ray. With one call at a time and without Ray, the calls run in this process.
-        ray: ``local`` to start Ray on this machine, or the address of a Ray cluster. If ``ray`` is None, the calls run
-            in processes of joblib.
+        calls: tuples (function, argument, ...) with module-level functions. From a generator, each tuple is taken
+            shortly before the call starts.
+        jobs: number of calls that run at once; None: 1 without Ray, and the number of cores with Ray. With one call at
+            a time and without Ray, the calls run in this process.
+        ray: ``local`` to start Ray on this machine, or the address of a Ray cluster; None: the calls run in processes
+            of joblib.
 
     Raises the error that a call raised, or ``WorkerLost`` if a worker process of joblib is killed (Ray repeats the call
     instead). Raises ``MissingExtra`` if joblib or Ray is not installed, and ``InvalidInput`` if no cluster answers at
@@ -85,9 +85,8 @@ def run_each(calls: Iterable[Call], jobs: int | None = None, ray: str | None = N
 
 
 def _answer(call: bytes) -> Any:
-    """Run the pickled call ``(function, argument, ...)`` in a worker and return its result.
-
-    Text that the call prints goes to stderr.
+    """Run the pickled call ``(function, argument, ...)`` in a worker and return its result; printed text goes to
+    stderr.
     """
     _end_with_parent()
     with redirect_stdout(sys.stderr):
@@ -125,9 +124,8 @@ def _sigterm_as_ctrl_c() -> Iterator[None]:
 def own_signals() -> Iterator[None]:
     """Context manager: restore the caller's handlers of Ctrl-C, SIGTERM and SIGUSR1 after the block.
 
-    Ray and Ray Tune set their own handlers of signals and do not restore the caller's handlers. The handler of Ray Tune
-    would swallow the caller's next Ctrl-C. Outside the main thread, where no handler can be set, this function does
-    nothing.
+    Ray and Ray Tune set their own handlers and do not restore the caller's. The handler of Ray Tune would swallow the
+    caller's next Ctrl-C. Outside the main thread, where no handler can be set, this function does nothing.
     """
     in_main = threading.current_thread() is threading.main_thread()
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1) if in_main else ()
@@ -142,10 +140,7 @@ def own_signals() -> Iterator[None]:
 
 @contextmanager
 def _backend(ray: str | None, jobs: int | None) -> Iterator[tuple[dict[str, Any], int]]:
-    """Context manager: start joblib's backend; yield the backend's settings and the number of calls that run at once.
-
-    ``ray`` and ``jobs`` have the same meaning as in ``run_each``.
-    """
+    """Context manager: start joblib's backend; yield its settings and the number of calls that run at once."""
     if ray is None:
         yield {"backend": "loky", "inner_max_num_threads": 1}, jobs or 1
         return
@@ -165,14 +160,12 @@ def _backend(ray: str | None, jobs: int | None) -> Iterator[tuple[dict[str, Any]
 def connect_ray(address: str, cores: int | None = None) -> Any:
     """Connect to Ray and return the module ``ray``.
 
-    Args:
-        address: address of a running cluster in Ray's own format, or ``local`` to start Ray on this machine, on
-            loopback sockets and without a dashboard.
-        cores: number of cores for ``local``; None: all cores that this process may use.
+    ``address`` is the address of a running cluster in Ray's own format, or ``local`` to start Ray on this machine, on
+    loopback sockets and without a dashboard. ``cores`` is the number of cores for ``local``; None: all cores that this
+    process may use.
 
     Raises ``MissingExtra`` if Ray is not installed, and ``InvalidInput`` if Ray cannot be started or no cluster answers
     at the address.
-
     """
     os.environ |= _DRIVER
     if address == LOCAL:

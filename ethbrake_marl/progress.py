@@ -42,7 +42,7 @@ class Progress:
     def listener(told: Told) -> OnProgress | None:
         """Return the function to call with each ``Progress``, or None if progress is not reported.
 
-        ``told`` is a function that receives each ``Progress``, or ``"show"`` to print progress on stderr, or None.
+        ``told`` is this function, ``"show"`` to print progress on stderr, or None.
         """
         return ShownProgress() if told == "show" else told
 
@@ -56,8 +56,8 @@ Told = OnProgress | Literal["show"] | None
 class ShownProgress:
     """Prints progress on stderr.
 
-    On a terminal, one line of text is updated in place. If stderr is not a terminal, a new line is printed for each
-    tenth of the work and for each evaluation.
+    On a terminal, one line of text is updated in place. Otherwise, a new line is printed for each tenth of the work and
+    for each evaluation.
     """
 
     def __init__(self) -> None:

@@ -1,8 +1,7 @@
 """Registries of agents, shields, measures, features, objectives, algorithms and commands, by name.
 
-Each registry contains all objects of one kind, for example all agents. A running program adds an object with a
-``register_...`` function. An installed package adds an object with an entry point in its ``pyproject.toml``, as this
-package does for its extensions:
+Each registry contains all objects of one kind. A running program adds an object with a ``register_...`` function. An
+installed package adds an object with an entry point in its ``pyproject.toml``, as this package does for its extensions:
 
     [project.entry-points."ethbrake_marl.agents"]
     gentle = "my_package.agents:make_gentle"
@@ -39,8 +38,8 @@ class Part:
     """Value of an entry point: all arguments of a ``register_...`` function except the name.
 
     The ``register_...`` function registers the object under the name of the entry point. For example, an entry point in
-    the group ``ethbrake_marl.measures`` with the value ``part`` below has the same effect as ``register_measure(name,
-    closing, unit="m/s")``.
+    the group ``ethbrake_marl.measures`` with the value ``part`` below has the same effect as
+    ``register_measure(name, closing, unit="m/s")``.
 
     >>> import ethbrake_marl as eb
     >>> def closing(episodes):
@@ -56,9 +55,7 @@ class Part:
 def points(group: str) -> dict[str, list[EntryPoint]]:
     """Return the entry points of a group by name; several packages may define an entry point with the same name.
 
-    In the result, names defined by this package come before names defined by other packages.
-
-    ``group``: name of the group without the prefix ``ethbrake_marl.``, for example ``agents``.
+    Names defined by this package come first. ``group`` lacks the prefix ``ethbrake_marl.``: for example ``agents``.
     """
     by_name: dict[str, list[EntryPoint]] = {}
     in_order = sorted(entry_points(group=f"ethbrake_marl.{group}"), key=lambda each: (giver(each) != OURS, each.name))
@@ -75,18 +72,17 @@ def giver(point: EntryPoint) -> str:
 def versions_used() -> dict[str, str]:
     """Return name -> version of the other packages that have added agents or other objects to this process.
 
-    A package is in the dictionary only if at least one of the package's entry points has been loaded.
+    A package is listed only if at least one of its entry points has been loaded.
     """
     return dict(sorted(_VERSIONS.items()))
 
 
 class Registry(Mapping[str, T]):
-    """Mapping name -> object for all objects of one kind, for example all agents. An object is loaded when its name is
-    first looked up.
+    """Mapping name -> object for all objects of one kind. An object is loaded when its name is first looked up.
 
     Neither the test whether a name exists nor an iteration over the names loads an object. Looking up a name raises
-    ``UnknownName`` if the registry has no object of this name. Looking up a name raises ``InvalidInput`` if the object
-    cannot be loaded or if two installed packages define it, and ``MissingExtra`` if a package of an extra is missing.
+    ``UnknownName`` if the registry has no object of this name, ``InvalidInput`` if the object cannot be loaded or if
+    two installed packages define it, and ``MissingExtra`` if a package of an extra is missing.
 
     Args:
         kind: noun for one object of the registry in messages, for example ``agent``.
@@ -125,11 +121,10 @@ class Registry(Mapping[str, T]):
         return self.loaded[name]
 
     def load(self, name: str) -> list[str]:
-        """Load the object (such as an agent) called ``name`` if needed; return all names that its entry point defines.
+        """Load the object called ``name`` if needed; return all names that its entry point defines.
 
-        An entry point defines several objects if its value is a dictionary, and otherwise one object. Raises
-        ``UnknownName`` if the registry has no object of this name, and ``InvalidInput`` or ``MissingExtra`` if the
-        object cannot be loaded.
+        An entry point defines several objects if its value is a dictionary, and otherwise one object. Raises the same
+        errors as looking up the name.
         """
         candidates = points(self.group).get(name, [])
         givers = [OURS] * (name in self._built_in) + [giver(point) for point in candidates]
@@ -170,7 +165,7 @@ class Registry(Mapping[str, T]):
         return list(parts)
 
     def add(self, name: str, part: T, is_same: Callable[[T], bool]) -> None:
-        """Add ``part`` (such as an agent) under ``name``; raise ``AlreadyExists`` if another object has the name.
+        """Add ``part`` under ``name``; raise ``AlreadyExists`` if another object has the name.
 
         ``is_same`` is called with the object that is registered under ``name``, and returns whether it equals ``part``;
         an equal object is not added again.
@@ -185,13 +180,11 @@ class Registry(Mapping[str, T]):
             )
 
     def usable(self) -> dict[str, T]:
-        """Load all objects of this kind (such as all agents); return those that could be loaded: name -> object."""
+        """Load all objects; return those that could be loaded: name -> object."""
         return {name: self.loaded[name] for name in self if self.why_not(name) is None and name in self.loaded}
 
     def why_not(self, name: str) -> str | None:
-        """Load the object (such as an agent) called ``name``; return the error message if this fails, otherwise
-        None.
-        """
+        """Load the object called ``name``; return the error message if this fails, otherwise None."""
         try:
             self.load(name)
         except (InvalidInput, MissingExtra) as error:
@@ -201,7 +194,7 @@ class Registry(Mapping[str, T]):
     def unknown(self, name: object, known: Iterable[str] | None = None) -> UnknownName:
         """Return the error for a ``name`` that is not in this registry.
 
-        ``known``: names to suggest or list; None: all names of this registry.
+        ``known`` has the names to suggest or list; None: all names of this registry.
         """
         if not points("agents"):
             return UnknownName(

@@ -2,6 +2,11 @@
 
 Action -1 means full braking, 0 coasting and +1 full driving. The command is linear in the action from -1 to 0 and from
 0 to 1.
+
+Arguments that several functions share: ``names`` are the names of the vehicles that act, for error messages. ``count``
+is the number of discrete actions, whose indices (``index_to_action``) take the place of the actions; None: the actions
+are continuous. ``vehicle`` is an index (0 = front). ``braking`` is the largest deceleration of a vehicle, and
+``driving`` its largest forward acceleration, m/s2.
 """
 
 from __future__ import annotations
@@ -25,13 +30,6 @@ def checked_action(action: ArrayLike, shape: tuple[int, ...], names: str, count:
 
     Axes of length 1 may be missing or added: a single action may be a number, [1] or [1, 1]. Values outside [-1, 1] are
     invalid; only the next float32 number above 1 or below -1 is accepted, and clipped.
-
-    Args:
-        action: the actions of the vehicles; if ``count`` is given, indices of discrete actions (``index_to_action``).
-        shape: required shape.
-        names: names of the vehicles that act, for error messages.
-        count: number of discrete actions; None: the actions are continuous.
-
     """
     number = _numbers(action, names) if count is None else index_to_action(action, count, names)
     if number.shape != shape and _longer_axes(number.shape) != _longer_axes(shape):
@@ -49,12 +47,6 @@ def own_actions(actions: ArrayLike, names: str, count: int | None = None) -> NDA
 
     A NumPy array is copied without checks. Raises ``InvalidInput`` if a list or tensor contains values that are not
     numbers or, if ``count`` is given, invalid indices.
-
-    Args:
-        actions: the actions of the vehicles; if ``count`` is given, indices of discrete actions.
-        names: names of the vehicles that act, for error messages.
-        count: number of discrete actions; None: the actions are continuous.
-
     """
     if isinstance(actions, np.ndarray):
         return actions.copy()
@@ -73,14 +65,7 @@ def _longer_axes(shape: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def action_to_command(action: Floats, vehicles: Vehicles, vehicle: int) -> Floats:
-    """Return the commanded acceleration of a vehicle for its action in every world, [n] m/s2.
-
-    Args:
-        action: action of the vehicle in each world, [n] in [-1, 1].
-        vehicles: parameters of the vehicles in n worlds, among them the capacities.
-        vehicle: index of the vehicle (0 = front).
-
-    """
+    """Return the commanded acceleration of a vehicle, [n] m/s2, for its action in every world, [n] in [-1, 1]."""
     braking, driving = vehicles.braking_capacity_mps2[:, vehicle], vehicles.driving_capacity_mps2[:, vehicle]
     return commands_of(np.ascontiguousarray(action, np.float64), braking, driving)
 
@@ -89,12 +74,6 @@ def command_to_action(command_mps2: Floats, vehicles: Vehicles, vehicle: int) ->
     """Return the action that corresponds to a vehicle's command in each world, [n], clipped to [-1, 1].
 
     The action is 0 if the vehicle has no capacity in the direction of the command (braking or driving).
-
-    Args:
-        command_mps2: commanded acceleration of the vehicle in each world, [n] m/s2.
-        vehicles: parameters of the vehicles in n worlds, among them the capacities.
-        vehicle: index of the vehicle (0 = front).
-
     """
     braking, driving = vehicles.braking_capacity_mps2[:, vehicle], vehicles.driving_capacity_mps2[:, vehicle]
     return _actions(np.ascontiguousarray(command_mps2, np.float64), braking, driving)
@@ -102,10 +81,7 @@ def command_to_action(command_mps2: Floats, vehicles: Vehicles, vehicle: int) ->
 
 @compiled
 def command_of(action: float, braking: float, driving: float) -> float:
-    """Return the commanded acceleration (m/s2) for an action in [-1, 1].
-
-    ``braking`` is the largest deceleration of the vehicle, and ``driving`` its largest forward acceleration (m/s2).
-    """
+    """Return the commanded acceleration (m/s2) for an action in [-1, 1]."""
     return action * braking if action < 0.0 else action * driving
 
 
@@ -113,8 +89,7 @@ def command_of(action: float, braking: float, driving: float) -> float:
 def action_of(command: float, braking: float, driving: float) -> float:
     """Return the action for a command (m/s2), clipped to [-1, 1]; 0 if the needed capacity is 0.
 
-    The needed capacity is the braking capacity for a command below 0, otherwise the driving capacity. ``braking`` is
-    the largest deceleration of the vehicle, and ``driving`` its largest forward acceleration (m/s2).
+    The needed capacity is the braking capacity for a command below 0, otherwise the driving capacity.
     """
     capacity = braking if command < 0.0 else driving
     return min(max(command / capacity, -1.0), 1.0) if capacity > 0.0 else 0.0
@@ -122,11 +97,7 @@ def action_of(command: float, braking: float, driving: float) -> float:
 
 @compiled
 def commands_of(action: Floats, braking: Floats, driving: Floats) -> Floats:
-    """Return the commanded acceleration of a vehicle for its action in every world, [n] m/s2.
-
-    ``action``: the vehicle's action in each world, from -1 to 1, [n]. ``braking``: the vehicle's largest deceleration,
-    [n] m/s2. ``driving``: the vehicle's largest forward acceleration, [n] m/s2.
-    """
+    """Return the commanded acceleration of a vehicle for its action in every world, [n] m/s2; all arguments are [n]."""
     command = np.empty(action.shape[0])
     for k in range(action.shape[0]):
         command[k] = command_of(action[k], braking[k], driving[k])

@@ -1,9 +1,14 @@
 """Contact features: a vehicle forecasts its next impacts for its own full braking, coasting and full driving.
 
-A forecast covers only the vehicles that the observer knows. In the forecast, the observer's own command takes effect
-after the observer's latency. In the forecast, every other vehicle keeps its present acceleration, with two exceptions.
-A vehicle without a command in force is assumed to brake fully after its latency. A braking vehicle whose brakes build
-up gradually is also assumed to brake fully, because its present deceleration does not show its command.
+A forecast covers only the vehicles that the observer knows. The observer's own command takes effect after the
+observer's latency. Every other vehicle keeps its present acceleration, with two exceptions. A vehicle without a command
+in force is assumed to brake fully after its latency. A braking vehicle whose brakes build up gradually is also assumed
+to brake fully, because its present deceleration does not show its command.
+
+Arguments that several functions share: ``state`` has time, motion and harm, and ``params`` the parameters of the
+vehicles, with one row per world (layout: ``physics.columns``). ``table`` has one world with one column per vehicle
+(layout: ``physics.rows``) and, if there is an obstacle, column 0 for the obstacle. ``time_step`` is the time between
+two decisions, s.
 """
 
 from __future__ import annotations
@@ -35,7 +40,7 @@ _FAR = len(CONTACT_SIDES) + _HARMS  # number of contact_far features per command
 
 
 class Contacts(NamedTuple):
-    """Arguments of ``observe_contacts``, which computes contact features: time step, commands and scaling."""
+    """Arguments of ``observe_contacts``."""
 
     time_step_s: float  # time between two decisions (s)
     commands: Ints  # commands to forecast, as indices into CONTACT_COMMANDS
@@ -50,18 +55,9 @@ def observe_contacts(
 ) -> None:  # fmt: skip
     """Write the contact features of each observer into ``out``; set ``failed`` for worlds in which a forecast failed.
 
-    Args:
-        state: time, motion and harm of the worlds, one row per world, [n, S] (layout: ``physics.columns``).
-        params: parameters of the vehicles, one row per world (layout: ``physics.columns``).
-        observers: indices of the observing vehicles (0 = front).
-        time_step: time between two decisions of a vehicle, s.
-        commands: the observer's own commands for which to forecast, as indices into CONTACT_COMMANDS.
-        features: scaling of the features: three rows (``1 / scale``, ``low``, ``high``) with one column per feature.
-            There are 30 features, or 42 with the group contact_far.
-        out: array that receives the result, [n, observers, features]. Features of commands that are not in ``commands``
-            do not change.
-        failed: mask [n] that is set to True for each world in which a check of the physics failed.
-
+    ``observers`` are indices of vehicles (0 = front). For ``commands`` and ``features``, see ``Contacts``. In ``out``,
+    [n, observers, features], the features of commands that are not in ``commands`` do not change. ``failed`` [n]
+    becomes True for each world in which a check of the physics failed.
     """
     of = columns(state)
     N, at = (
@@ -101,20 +97,12 @@ def observe_contacts(
 
 @compiled
 def _place_known(table: Floats, state: Floats, params: Floats, k: int, i: int, at: int) -> tuple[int, int]:
-    """Write one world into ``table`` as vehicle ``i`` knows it; return the first and last column of the known vehicles.
+    """Write world ``k`` into ``table`` as vehicle ``i`` knows it; return the first and last column of the known
+    vehicles.
 
     A vehicle is placed far away if vehicle ``i`` does not know this vehicle, or lacks data of this vehicle that a
-    forecast needs. A known obstacle is placed in the same way as a known vehicle.
-
-    Args:
-        table: array to fill, [rows, N + at] (layout: ``physics.rows``), with one column per vehicle and, if there is
-            an obstacle, column 0 for the obstacle.
-        state: time, motion and harm of the worlds, one row per world, [n, S] (layout: ``physics.columns``).
-        params: parameters of the vehicles, one row per world (layout: ``physics.columns``).
-        k: index of the world.
-        i: index of the observing vehicle (0 = front).
-        at: 1 if the worlds have an obstacle, which is then in column 0 of ``table``; 0 if not.
-
+    forecast needs. A known obstacle is placed in the same way as a known vehicle. ``at`` is 1 if ``table`` has a column
+    for an obstacle, otherwise 0.
     """
     of = columns(state)
     N, speed, command, gap, obstacle = of.vehicles, of.speed, of.command, of.gap, of.obstacle
@@ -163,15 +151,9 @@ def _write_features(
     The features of the observer and a neighbour are 0 if the neighbour is unknown or does not exist. An impact exactly
     at the end of a time step belongs to this time step, as in the engine.
 
-    Args:
-        table: one world at the end of the forecast, one column per vehicle (layout: ``physics.rows``).
-        found: forecast of the next impact of each pair, as ``forecast_contacts`` returns it.
-        own: column of the observing vehicle in ``table``.
-        first: first column, in ``table``, of a vehicle that the observer knows.
-        last: last column, in ``table``, of a vehicle that the observer knows.
-        time_step: time between two decisions of a vehicle, s.
-        value: array that receives the result, one number per feature.
-
+    ``table`` has the world at the end of the forecast; the observer has the column ``own``, and the vehicles that it
+    knows have the columns ``first`` to ``last``. ``found`` is the next impact of each pair, as ``forecast_contacts``
+    returns it.
     """
     for side in range(2):
         p, at = own - 1 + side, side * _OF_PAIR

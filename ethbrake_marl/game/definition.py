@@ -10,7 +10,7 @@ from ethbrake_marl.physics.state import Worlds
 
 
 class Drawn(Protocol):
-    """Result of ``Game.sample``: an object with the drawn worlds in its attribute ``worlds``, such as a ``Sample``."""
+    """Result of ``Game.sample``, such as a ``Sample``."""
 
     @property
     def worlds(self) -> Worlds:
@@ -65,9 +65,8 @@ class Game(Protocol):
 
     @property
     def by_link(self) -> bool:
-        """Whether each link between two vehicles has its own delays and losses.
-
-        If no link has delays or losses, a vehicle knows everything after its latency.
+        """Whether each link between two vehicles has its own delays and losses; if not, a vehicle knows everything
+        after its latency.
         """
 
     @property
@@ -77,6 +76,5 @@ class Game(Protocol):
     def sample(self, n: int, seed: int, *, first: int = 0, channel: Literal["list", "training"] = "list") -> Drawn:
         """Draw the worlds with the numbers ``first`` to ``first + n - 1`` from the endless list of worlds of ``seed``.
 
-        ``channel`` selects one of two independent lists of worlds: ``"list"`` for evaluation, ``"training"`` for
-        training.
+        ``channel`` selects one of two independent lists: ``"list"`` for evaluation, ``"training"`` for training.
         """

@@ -1,4 +1,8 @@
-"""The features that an observation can have: built-in features in groups, and registered features."""
+"""The features that an observation can have: built-in features in groups, and registered features.
+
+In all functions, ``vehicle`` (the observer) and ``neighbour`` are indices of vehicles (0 = front). If ``neighbour`` may
+be None, None means the feature of ``vehicle`` itself.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +30,7 @@ Of = Literal["own", "neighbour"]
 
 @dataclass(frozen=True, slots=True)
 class Feature:
-    """A feature: one number of an observation. A vehicle observes the number ``clip(value / scale, low, high)``."""
+    """One number of an observation. A vehicle observes the number ``clip(value / scale, low, high)``."""
 
     name: str  # full name, such as ``own.speed``, or name inside a group, such as ``speed``
     unit: str  # unit of the value
@@ -165,7 +169,7 @@ class RegisteredFeature:
     reads: tuple[Piece, ...] | None = None  # data of the neighbour that the function reads; None: not specified
 
     def scaled(self, value: Floats) -> Floats:
-        """Return the observed number ``clip(value / scale, low, high)`` for a ``value`` in the feature's unit."""
+        """Return the observed number for a ``value`` in the feature's unit."""
         feature = self.feature
         return np.clip(value * (1.0 / feature.scale), feature.low, feature.high)
 
@@ -173,16 +177,9 @@ class RegisteredFeature:
         """Compute the feature in n worlds and return the scaled and clipped values, [n].
 
         Raises ``InvalidInput``, which names the feature, if the function returns an array of a wrong shape or a value
-        that is not finite.
-
-        Args:
-            worlds: the n worlds in which to compute the feature.
-            vehicle: index of the observing vehicle (0 = front).
-            neighbour: index of the neighbour; None for a feature of the vehicle itself.
-            counts: mask [n] (or one truth value for all worlds), True for each world in which the function's value is
-                used. Where ``counts`` is False, the feature has the value ``unknown``.
-            steps: number of steps that each episode has taken, [n], for error messages; None: not known.
-
+        that is not finite. ``counts`` is a mask [n] (or one truth value for all worlds): where it is False, the feature
+        has the value ``unknown``. ``steps``, the number of steps that each episode has taken, [n], appears in error
+        messages; None: not known.
         """
         name = self.feature.name
         arguments = (worlds, vehicle) if neighbour is None else (worlds, vehicle, neighbour)
@@ -206,8 +203,7 @@ class RegisteredFeature:
 def age(worlds: Worlds, vehicle: int, neighbour: int) -> Floats:
     """Return the age of the newest state that ``vehicle`` has received from ``neighbour``, [n] s.
 
-    The age is 0 if ``vehicle`` knows the present state of ``neighbour``. ``vehicle`` and ``neighbour`` are indices (0 =
-    front).
+    The age is 0 if ``vehicle`` knows the present state of ``neighbour``.
     """
     ages = Messages.of(worlds).age_s(worlds.time_s)[:, vehicle, neighbour]
     return np.where(np.isfinite(ages), ages, 0.0)
@@ -219,35 +215,26 @@ def intent(worlds: Worlds, vehicle: int, neighbour: int) -> Floats:
 
 
 def build_up_time(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> Floats:
-    """Return the time in which the brakes of a vehicle build up from 0 to full, [n] s; 0 for brakes that act at once.
-
-    The result is about ``neighbour`` or, if ``neighbour`` is None, about ``vehicle`` (indices, 0 = front).
-    """
+    """Return the time in which the brakes of a vehicle build up from 0 to full, [n] s; 0 if brakes act at once."""
     i, v = vehicle if neighbour is None else neighbour, worlds.vehicles
     return v.braking_capacity_mps2[:, i] / v.brake_rate_mps3[:, i]
 
 
 def release_time(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> Floats:
-    """Return the time that a vehicle needs to release fully applied brakes, [n] s; 0 if brakes are released at once.
-
-    The result is about ``neighbour`` or, if ``neighbour`` is None, about ``vehicle`` (indices, 0 = front).
-    """
+    """Return the time that a vehicle needs to release fully applied brakes, [n] s; 0 if brakes are released at once."""
     i, v = vehicle if neighbour is None else neighbour, worlds.vehicles
     return v.braking_capacity_mps2[:, i] / v.release_rate_mps3[:, i]
 
 
 def harm_weight(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> Floats:
-    """Return the weight of a vehicle's harm in the objective ``preference``, divided by the sum of all weights, [n].
-
-    The result is about ``neighbour`` or, if ``neighbour`` is None, about ``vehicle`` (indices, 0 = front).
-    """
+    """Return the weight of a vehicle's harm in the objective ``preference``, divided by the sum of all weights, [n]."""
     weight = worlds.vehicles.harm_weight
     share: Floats = weight[:, vehicle if neighbour is None else neighbour] / weight.sum(axis=1)
     return share
 
 
 def place(worlds: Worlds, vehicle: int) -> Floats:
-    """Return the number of vehicles ahead of ``vehicle`` (index, 0 = front) in the line, [n].
+    """Return the number of vehicles ahead of ``vehicle`` in the line, [n].
 
     If several vehicles share a policy, this feature shows the policy which vehicle it drives.
     """
@@ -365,7 +352,7 @@ _BUILT_IN: dict[str, RegisteredFeature] = {
 
 
 def listed_features(listed: object) -> tuple[str, ...]:
-    """Replace each group in a list of groups and features by the features of this group; return all full names.
+    """Replace each group in a list of groups and features by its features; return all full names.
 
     For ``["own", "front_1.gap"]`` the result is ``("own.speed", ..., "front_1.gap")``. Raises ``UnknownName`` with a
     suggestion for an unknown name, and ``InvalidInput`` if ``listed`` is not a list, is empty, or contains a feature
@@ -418,7 +405,7 @@ def side_of(name: str) -> tuple[str, int] | None:
 def registered_in(names: Iterable[str]) -> dict[str, RegisteredFeature]:
     """Return those features in ``names`` (full names) that have a function of their own, as a dictionary.
 
-    A key of the dictionary does not contain the neighbour: for ``front_1.age`` the key is ``age``.
+    The keys do not contain the neighbour: for ``front_1.age`` the key is ``age``.
     """
     own = [name.partition(".")[2] or name for name in names]
     return {name: FEATURES[name] for name in own if name in FEATURES}
@@ -427,7 +414,7 @@ def registered_in(names: Iterable[str]) -> dict[str, RegisteredFeature]:
 def choices(sides: Iterable[str] = ("front_1", "rear_1")) -> list[str]:
     """Return the names that an ``observation:`` list may contain: groups first, then single features.
 
-    ``sides``: neighbours, such as ``front_1``, whose features the result contains.
+    ``sides`` are the neighbours whose features the result contains.
     """
     groups = ["own", *sides, "role", "obstacle", "contact", "contact_far"]
     single = [f"{group}.{feature.name}" for group in groups for feature in _group(group)]
@@ -493,18 +480,18 @@ def register_feature(
     function, called for test worlds, fails or returns a wrong shape or number.
 
     Args:
-        name: name of the feature, 1 to 64 characters ``a-z``, ``0-9`` and ``_``, beginning with a letter. An
-            observation lists a feature of the vehicle itself as ``name``, a feature of a neighbour as ``front_1.name``.
+        name: 1 to 64 characters ``a-z``, ``0-9`` and ``_``, beginning with a letter. An observation lists a feature of
+            the vehicle itself as ``name``, a feature of a neighbour as ``front_1.name``.
         function: ``function(worlds, vehicle)``, or ``function(worlds, vehicle, neighbour)`` for a feature of a
             neighbour, where ``vehicle`` and ``neighbour`` are indices (0 = front). The function returns the value of
-            the feature in each world, [n], in ``unit``. The function must work for any number of vehicles, and its
-            result must depend only on its arguments.
+            the feature in each world, [n], in ``unit``. It must work for any number of vehicles, and its result must
+            depend only on its arguments.
         unit: unit of the value that the function returns.
         scale: number above 0; the observed number is ``clip(value / scale, low, high)``.
         low: smallest number that a vehicle can observe.
         high: largest number that a vehicle can observe, above ``low``.
-        of: which vehicle the feature describes: ``own``, the observing vehicle, or ``neighbour``, a neighbour. The
-            observing vehicle observes the value for a neighbour only if it knows this neighbour.
+        of: vehicle that the feature describes: ``own``, the observing vehicle, or ``neighbour``. The value for a
+            neighbour is observed only if the observing vehicle knows this neighbour.
         unknown: value for an unknown neighbour, in ``unit``; must be 0 if ``of`` is ``own``.
         reads: data in the neighbour's messages that the function needs (the names in ``v2x: tells``). If the observer
             does not know all these data, the feature has the value ``unknown``. If ``reads`` is None, the feature

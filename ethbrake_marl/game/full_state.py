@@ -32,9 +32,8 @@ _PAIR_FEATURES = tuple(replace(f, meaning=_PAIR_MEANING[f.name]) for f in GROUPS
 def state_features(scenario: Game) -> tuple[Feature, ...]:
     """Return the features of the full state in order: own features of each vehicle, features of each pair, and time.
 
-    The features of a pair are its gap and its hit flag (1 after an impact of the pair, otherwise 0). If the scenario
-    has an obstacle ahead, two more features follow: the gap from Vehicle 1 to the obstacle, and the hit flag of the
-    obstacle.
+    The features of a pair are its gap and its hit flag (1 after an impact of the pair, otherwise 0). With an obstacle
+    ahead, the gap from Vehicle 1 to the obstacle and the hit flag of the obstacle follow.
     """
     vehicles = [replace(f, name=f"{name}.{f.name}") for name in scenario.vehicle_names for f in GROUPS.own]
     pairs = [replace(f, name=f"pair_{p}.{f.name}") for p in range(1, scenario.vehicles) for f in _PAIR_FEATURES]
@@ -46,8 +45,7 @@ def state_features(scenario: Game) -> tuple[Feature, ...]:
 def full_state(worlds: Worlds, scenario: Game) -> Observations:
     """Return the full state of every world, [n, S] float32.
 
-    For N vehicles and P = N - 1 pairs, there are S = 7 N + 2 P + 1 features, and two more if there is an obstacle
-    ahead.
+    There are S = 7 N + 2 P + 1 features, and two more if there is an obstacle ahead.
     """
     latency = worlds.vehicles.latency_s  # includes the delays of the channel
     whole_latency = replace(worlds.vehicles, own_latency_s=latency, known_from_s=Vehicles.known_at_once(latency))
@@ -65,14 +63,8 @@ def full_state(worlds: Worlds, scenario: Game) -> Observations:
 def row_features(own: tuple[Feature, ...], appended: Appended | None, scenario: Game) -> tuple[Feature, ...]:
     """Return the features that a learner's network receives, in order: ``own``, then the appended features.
 
-    Raises ``InvalidInput`` for an invalid value of ``appended``.
-
-    Args:
-        own: features of the learner's own observation.
-        appended: which features are appended to ``own``. ``"number"``: the position of the learner among all learners,
-            from 0; ``"state"``: the full state; None: no features.
-        scenario: the scenario, which determines the features of the full state.
-
+    ``appended`` is ``"number"`` (the position of the learner among all learners, from 0), ``"state"`` (the full state),
+    or None (no features). Raises ``InvalidInput`` for any other value.
     """
     if appended not in (None, *get_args(Appended)):
         raise InvalidInput(f"appended = {appended!r}: must be {', '.join(map(repr, get_args(Appended)))} or None")

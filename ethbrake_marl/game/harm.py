@@ -5,10 +5,12 @@ The harm of an impact of pair (i, i + 1) with closing speed ``w`` is ``w^2`` (m2
 ``H_i = w^2 * m_{i+1} / (m_i + m_{i+1})`` and ``H_{i+1} = w^2 - H_i``.
 
 An impact of Vehicle 1 with an immovable obstacle ahead has the harm ``v_1^2``, where ``v_1`` is the speed of Vehicle 1.
-Vehicle 1 bears all harm of an impact with the obstacle.
+Vehicle 1 bears all of this harm.
 
 *First-impact harm* counts only the first impact of each pair, as the paper does. *Total harm* counts every impact. An
-agent can exploit first-impact harm: after a light early impact, a harder impact of the same pair costs nothing.
+agent can exploit first-impact harm: after a light early impact, a harder impact of the same pair costs nothing. The
+argument ``harm_count`` of several functions selects the harm: ``"first"`` or ``"total"``; any other value raises
+``InvalidInput``.
 """
 
 from __future__ import annotations
@@ -84,33 +86,23 @@ class Ledger:
         return replace(self, **{name: getattr(self, name) - getattr(before, name) for name in names})
 
     def take(self, rows: Ints | Bools | Sequence[int]) -> Ledger:
-        """Return a ledger that contains only the worlds selected by ``rows`` (indices, or a mask [n])."""
+        """Return a ledger of only the worlds ``rows`` (indices, or a mask [n])."""
         return Ledger(*(getattr(self, column.name)[rows] for column in fields(self)))
 
     def pair_harm(self, harm_count: HarmCount) -> Floats:
-        """Return the harm of each pair of vehicles since the start of the episode, [n, P] m2/s2.
-
-        ``harm_count`` selects the harm: ``"first"`` for first-impact harm, ``"total"`` for total harm. Raises
-        ``InvalidInput`` for any other ``harm_count``.
-        """
+        """Return the harm of each pair of vehicles, [n, P] m2/s2."""
         check_harm_count(harm_count)
         return self.first_impact_harm if harm_count == "first" else self.total_harm
 
     def obstacle_harm(self, harm_count: HarmCount) -> Floats:
-        """Return the harm of impacts of Vehicle 1 with the obstacle ahead, [n] m2/s2.
-
-        ``harm_count`` selects the harm: ``"first"`` for first-impact harm, ``"total"`` for total harm. Raises
-        ``InvalidInput`` for any other ``harm_count``.
-        """
+        """Return the harm of impacts of Vehicle 1 with the obstacle ahead, [n] m2/s2."""
         check_harm_count(harm_count)
         return self.obstacle_first_harm if harm_count == "first" else self.obstacle_total_harm
 
     def vehicle_harm(self, harm_count: HarmCount) -> Floats:
-        """Return the harm that each vehicle bears, [n, N] m2/s2.
+        """Return the harm that each vehicle bears, [n, N] m2/s2: its parts (``split``) of the harm of its pairs.
 
-        A vehicle bears a part (``split``) of the harm of its impacts with the vehicle in front and with the vehicle
-        behind. Vehicle 1 also bears the harm of impacts with the obstacle. ``harm_count`` selects the harm: ``"first"``
-        for first-impact harm, ``"total"`` for total harm.
+        Vehicle 1 also bears the harm of impacts with the obstacle.
         """
         harm = split(self.pair_harm(harm_count), self.mass_t)
         harm[:, 0] += self.obstacle_harm(harm_count)
@@ -121,8 +113,7 @@ class Ledger:
 
         The changes of speed are computed from each pair's harm, as if a single impact of the pair had caused all of its
         harm. The result is exact for a first impact in which no third vehicle takes part. If the harm comes from
-        several impacts of the pair, the result is larger than the change of speed in the hardest impact. ``harm_count``
-        selects the harm: ``"first"`` for first-impact harm, ``"total"`` for total harm.
+        several impacts of the pair, the result is larger than the change of speed in the hardest impact.
         """
         with_obstacle = np.concatenate([self.obstacle_harm(harm_count)[:, np.newaxis], self.pair_harm(harm_count)], 1)
         rebound = (1.0 + self.restitution[:, np.newaxis]) * np.sqrt(with_obstacle)
@@ -133,11 +124,7 @@ class Ledger:
         return front, rear
 
     def world_harm(self, harm_count: HarmCount) -> Floats:
-        """Return the harm of each world, summed over all vehicles, [n] m2/s2.
-
-        The order of summation is fixed: first the obstacle, then the pairs from front to rear. ``harm_count`` selects
-        the harm: ``"first"`` for first-impact harm, ``"total"`` for total harm.
-        """
+        """Return the harm of each world, summed over the obstacle and all pairs (``line_sum``), [n] m2/s2."""
         return line_sum(self.pair_harm(harm_count), self.obstacle_harm(harm_count))
 
     @property
@@ -148,7 +135,7 @@ class Ledger:
 
     @property
     def collided(self) -> Bools:
-        """For each world, whether it has had at least one impact, [n]."""
+        """Whether each world has had at least one impact, [n]."""
         return self.impacts > 0
 
 
@@ -156,8 +143,8 @@ class Ledger:
 def line_sum(pair_values: Floats, obstacle_values: Floats) -> Floats:
     """Return the sum of ``obstacle_values`` [n] and all pairs of ``pair_values`` [n, P] in each world, [n].
 
-    The order of summation is fixed: first the obstacle, then the pairs from front to rear. The fixed order makes the
-    sum of a world independent of the other worlds, to the last bit.
+    The order of summation is fixed: first the obstacle, then the pairs from front to rear. This order makes the sum of
+    a world independent of the other worlds, to the last bit.
     """
     n, pairs = pair_values.shape
     total = np.zeros(n)
@@ -180,8 +167,7 @@ def empty_ledger(worlds: Worlds) -> Ledger:
 def split(pair_harm: Floats, mass_t: Floats) -> Floats:
     """Divide the harm of each pair between its two vehicles; return the harm that each vehicle bears, [n, N] m2/s2.
 
-    The lighter vehicle of a pair bears the larger part of the pair's harm. ``pair_harm``: harm of each pair, [n, P]
-    m2/s2. ``mass_t``: mass of each vehicle, [n, N] t.
+    The lighter vehicle of a pair bears the larger part. ``pair_harm`` is the harm of each pair, [n, P] m2/s2.
     """
     n, vehicles = mass_t.shape
     harm = np.zeros((n, vehicles))
@@ -195,12 +181,12 @@ def split(pair_harm: Floats, mass_t: Floats) -> Floats:
 
 @compiled
 def front_share(harm: float, front_mass: float, rear_mass: float) -> float:
-    """Return the part of a pair's ``harm`` that the front vehicle bears.
+    """Return the part of a pair's ``harm`` that the front vehicle bears:
+    ``harm * rear_mass / (front_mass + rear_mass)``.
 
-    The front vehicle bears ``harm * rear_mass / (front_mass + rear_mass)``. If the rear vehicle bears the larger part,
-    the function computes the rear vehicle's part and subtracts it from ``harm``. The subtraction is exact, so the parts
-    of the two vehicles add up to ``harm`` without rounding error. The two masses must have the same unit. The result
-    has the unit of ``harm``.
+    If the rear vehicle bears the larger part, the function computes the rear vehicle's part and subtracts it from
+    ``harm``. The subtraction is exact, so the parts of the two vehicles add up to ``harm`` without rounding error. The
+    two masses must have the same unit. The result has the unit of ``harm``.
     """
     if front_mass <= rear_mass:
         return rear_mass / (front_mass + rear_mass) * harm
@@ -254,13 +240,9 @@ def injury_probability(speed_change_mps: Floats, side: Literal["front", "rear"],
     For the logistic curves ``lr4s`` and ``gidas`` this probability is above 0 even if the change of speed is 0, so do
     not use them for a vehicle that was not hit.
 
-    Args:
-        speed_change_mps: change of the vehicle's speed in each impact, [k] m/s; the sign is ignored.
-        side: side at which the vehicle is hit: ``"front"`` for the striking vehicle, ``"rear"`` for the struck vehicle.
-        curve: name of the curve, a key of ``INJURY_CURVES``.
-
-    Raises ``UnknownName`` for an unknown side or curve.
-
+    ``speed_change_mps`` is the change of the vehicle's speed in each impact, [k] m/s; the sign is ignored. ``side`` is
+    the side at which the vehicle is hit: ``"front"`` for the striking vehicle, ``"rear"`` for the struck vehicle.
+    ``curve`` is a key of ``INJURY_CURVES``. Raises ``UnknownName`` for an unknown side or curve.
     """
     if curve not in INJURY_CURVES:
         raise unknown_name("injury curve", curve, INJURY_CURVES)

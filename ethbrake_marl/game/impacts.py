@@ -32,8 +32,7 @@ class EpisodeImpacts:
     def of(cls, worlds: Worlds, parts: Sequence[ImpactRows] = ()) -> EpisodeImpacts:
         """Return all impacts of the episodes that began in the states ``worlds``.
 
-        ``parts``: the impacts of the episodes that began in ``worlds``, one item for each of several consecutive time
-        intervals.
+        ``parts`` has the impacts of these episodes, one item for each of several consecutive time intervals.
         """
         whole = [np.concatenate([getattr(rows, name) for rows in (_NO_ROWS, *parts)]) for name in _OF_ROWS]
         order = np.argsort(whole[0], kind="stable")
@@ -46,7 +45,7 @@ class EpisodeImpacts:
     def largest_speed_change_mps(self) -> Floats:
         """Largest change of speed of each vehicle in a single impact (delta-v), [n, N] m/s; 0 without an impact.
 
-        A push by a vehicle that is already in contact is not an impact, so a change of speed by a push is not included.
+        A push by a vehicle that is already in contact is not an impact and is not included.
         """
         rows, change = self.rows, np.zeros(self.worlds.speeds_mps.shape)
         np.maximum.at(change, (rows.world, rows.pair + 1), np.abs(rows.rear_speed_change_mps))
@@ -57,12 +56,9 @@ class EpisodeImpacts:
     def and_then(self, way: Iterable[tuple[Worlds, Floats, Floats]], some: Bools) -> EpisodeImpacts:
         """Return the impacts of this object together with the impacts in the next segments of the same episodes.
 
-        Args:
-            way: consecutive segments from ``Engine.segments``. Each segment (time interval) is a tuple: the worlds at
-                the start of the segment, the constant commands [n, N] m/s2, and the times [n] s at which the segment
-                ends.
-            some: mask [n], True for each world whose new impacts are added.
-
+        ``way`` has consecutive segments (time intervals) from ``Engine.segments``. Each segment is a tuple: the worlds
+        at its start, the constant commands [n, N] m/s2, and the times [n] s at which it ends. New impacts are added
+        only in worlds for which the mask ``some`` [n] is True.
         """
         parts, blocks = list(way), [self.rows]
         for k, (before, command_mps2, until_s) in enumerate(parts, 1):
@@ -75,7 +71,7 @@ class EpisodeImpacts:
     def renewed(self, rows: Ints, alert: Worlds) -> EpisodeImpacts:
         """Return a copy in which new episodes, still without impacts, replace the episodes with the indices ``rows``.
 
-        ``alert``: the worlds of the new episodes at the alert, one for each index in ``rows``.
+        ``alert`` has the worlds of the new episodes at the alert.
         """
         others = ~np.isin(self.rows.world, rows)
         return EpisodeImpacts.of(self.worlds.assign(rows, alert), [_some(self.rows, others)])
@@ -127,14 +123,8 @@ def _some(rows: ImpactRows, index: NDArray[Any]) -> ImpactRows:
 def impacts_within(before: Worlds, command_mps2: Floats, until_s: Floats, rows: Ints) -> ImpactRows:
     """Return every impact in the worlds ``rows`` during a segment (a time interval with constant commands).
 
-    In the result, ``ImpactRows.world`` is the index of the impact's world in ``before``.
-
-    Args:
-        before: n worlds at the start of the segment.
-        command_mps2: the vehicles' commands during the segment, [n, N] m/s2.
-        until_s: end of the segment in each world, [n] s.
-        rows: indices of the worlds to simulate, [k].
-
+    The segment begins in the states ``before`` and ends at the times ``until_s``, [n] s. In the result,
+    ``ImpactRows.world`` is the index of the impact's world in ``before``.
     """
     impacts = advance(before.take(rows), command_mps2[rows], until_s=until_s[rows], record=True)[1].rows
     assert impacts is not None  # because of record=True

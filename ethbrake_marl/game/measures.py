@@ -39,7 +39,7 @@ MeasureFunction = Callable[[Any], Any]  # maps a ``StepOutcome`` or ``EpisodeImp
 
 @dataclass(frozen=True, slots=True)
 class NamedMeasure:
-    """A measure, with its name, unit and function. Evaluations can show a measure, and rewards can use it as a term."""
+    """A measure, with its name, unit and function."""
 
     name: str  # name of the measure, and key of its weight in a reward
     meaning: str  # what it measures, in words
@@ -50,11 +50,7 @@ class NamedMeasure:
     form: str = ""  # kind of a registered function's result: ``a number per vehicle``, ``a truth value per world``, ...
 
     def built_in(self, step: StepOutcome, params: Any) -> Floats:
-        """Return the value of a built-in measure in one step, [n] or [n, N].
-
-        ``params`` is the reward. ``settings`` names the fields of ``params`` that the measure's function needs as
-        arguments.
-        """
+        """Return the value of a built-in measure in one step, [n] or [n, N]; ``params`` is the reward."""
         assert self.function is not None
         value: Floats = self.function(step, *(getattr(params, name) for name in self.settings))
         return value
@@ -62,15 +58,9 @@ class NamedMeasure:
     def of(self, given: StepOutcome | EpisodeImpacts, counts: Bools | None = None, steps: Ints | None = None) -> Any:
         """Return the value of a registered measure: [n] for one number per world, [n, N] for one number per vehicle.
 
-        Raises ``InvalidInput``, which names the measure, if a value is not finite or the result has a wrong shape or
-        type.
-
-        Args:
-            given: the data from which the measure is computed: a step, or the impacts of an episode.
-            counts: mask [n], True for each world in which the value is used; in the other worlds the result is 0. If
-                ``counts`` is None, the value is used in all worlds.
-            steps: number of steps that each episode has taken, [n], for error messages.
-
+        The value is 0 in worlds where the mask ``counts`` [n] is False; None: all worlds count. ``steps``, the number
+        of steps that each episode has taken, [n], appears in error messages. Raises ``InvalidInput``, which names the
+        measure, if a value is not finite or the result has a wrong shape or type.
         """
         if isinstance(given, StepOutcome):
             given.protect()
@@ -124,8 +114,8 @@ class NamedMeasure:
     def change(self, before: EpisodeImpacts, after: EpisodeImpacts, steps: Ints) -> Floats:
         """Return how much a measure with ``by="impacts"`` has changed during a step, [n] or [n, N].
 
-        ``before``: impacts of the episodes up to the beginning of the step. ``after``: impacts of the same episodes up
-        to the end of the step. ``steps``: number of steps that each episode has taken, [n], for error messages.
+        ``before`` and ``after`` have the impacts of the same episodes up to the beginning and to the end of the step.
+        ``steps`` is the number of steps that each episode has taken, [n], for error messages.
         """
         if len(before.rows.world) == len(after.rows.world):
             return np.zeros(after.worlds.speeds_mps.shape[: 2 if self.form.endswith("vehicle") else 1])
@@ -144,14 +134,14 @@ def register_measure(name: str, function: MeasureFunction, *, unit: str = "1", b
     shape or number.
 
     Args:
-        name: name of the measure, 1 to 64 characters ``a-z``, ``0-9`` and ``_``, beginning with a letter. The name must
-            not end in ``_interval``, ``_low``, ``_high``, or ``_`` and a number. The measure appears under NAME in a
-            reward, as ``metric_NAME`` in results, and as ``reward_NAME`` in the infos of a step.
-        function: function of one argument: an ``EpisodeImpacts`` (``by="impacts"``) or a ``StepOutcome``
-            (``by="step"``). The function returns one number per world, [n], or per vehicle, [n, N]; with ``by="step"``
-            it may also return one number per learner, [n, L]. The function must work for any number of vehicles. The
-            docstring of the function describes the measure. If a function with ``by="impacts"`` returns truth values,
-            evaluations show the share of worlds (or vehicles) with the value True.
+        name: 1 to 64 characters ``a-z``, ``0-9`` and ``_``, beginning with a letter, and not ending in ``_interval``,
+            ``_low``, ``_high``, or ``_`` and a number. The measure appears under NAME in a reward, as ``metric_NAME``
+            in results, and as ``reward_NAME`` in the infos of a step.
+        function: function of an ``EpisodeImpacts`` (``by="impacts"``) or a ``StepOutcome`` (``by="step"``). The
+            function returns one number per world, [n], or per vehicle, [n, N]; with ``by="step"`` it may also return
+            one number per learner, [n, L]. It must work for any number of vehicles. Its docstring describes the
+            measure. If a function with ``by="impacts"`` returns truth values, evaluations show the share of worlds (or
+            vehicles) with the value True.
         unit: unit of the numbers that the function returns.
         by: from which data the measure is computed: ``impacts``, all impacts of an episode, or ``step``, each single
             step.

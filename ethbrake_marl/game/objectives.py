@@ -18,6 +18,10 @@ preference          the formula of ``weighted``, with the weights ``harm_weight`
 injury:curve        expected injuries in 1,000 lines; a vehicle's injury risk is the risk by impacts at its front or the
                     risk by impacts at its rear, whichever is larger (``Ledger.speed_changes``)
 ==================  ================================================================================================
+
+Arguments that several functions share: ``ledger`` has the harm in n worlds since the start of the episode.
+``harm_count`` selects first-impact harm (``"first"``) or total harm (``"total"``). ``objectives`` has the objective of
+each of the N vehicles, front to rear.
 """
 
 from __future__ import annotations
@@ -55,7 +59,7 @@ class Objective(NamedTuple):
 
 
 class HarmSoFar(NamedTuple):
-    """Data from which an objective computes the amount that a vehicle should minimise, in n worlds of N vehicles."""
+    """Data from which an objective computes its amount, in n worlds of N vehicles."""
 
     borne: Floats  # [n, N] harm that each vehicle bears, m2/s2
     whole: Floats  # [n] harm of all vehicles, m2/s2
@@ -81,7 +85,7 @@ ObjectiveFunction = Callable[[HarmSoFar, int], Floats]
 
 
 class Kind(NamedTuple):
-    """A kind of objective, built in or registered; the docstring of this module lists the built-in kinds."""
+    """A kind of objective, built in or registered."""
 
     form: str  # how a scenario writes the objective, such as ``social:ANGLE``; without ":" it takes no argument
     about: str  # meaning of the objective, in words
@@ -124,7 +128,7 @@ def parse_objective(text: str) -> Objective:
 def check_declared(declared: object) -> None:
     """Raise ``InvalidInput`` unless ``declared`` is the text of an objective, such as ``own``, or a list of such texts.
 
-    The function does not check whether the list has one text per vehicle.
+    The number of texts is not checked.
     """
     each = [declared] if isinstance(declared, str) else declared
     if not isinstance(each, list | tuple) or not all(isinstance(text, str) for text in each):
@@ -139,7 +143,6 @@ def check_declared(declared: object) -> None:
 def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
     """Return the parsed objective of each vehicle, front to rear.
 
-    ``declared``: the text of one objective for all vehicles, or one text per vehicle. ``vehicles``: number of vehicles.
     Raises ``InvalidInput`` for an invalid objective, or if the number of texts or of weights is not ``vehicles``.
     """
     check_declared(declared)
@@ -158,16 +161,7 @@ def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
 
 
 def objective_harm(ledger: Ledger, harm_count: HarmCount, objectives: Sequence[Objective]) -> Floats:
-    """Return the amount that each vehicle should minimise, computed from the harm so far, [n, N].
-
-    The unit is m2/s2, or injuries in 1,000 lines for the objective ``injury``.
-
-    Args:
-        ledger: harm in n worlds since the start of the episode.
-        harm_count: ``"first"``: use first-impact harm; ``"total"``: use total harm.
-        objectives: objective of each of the N vehicles, front to rear.
-
-    """
+    """Return the amount that each vehicle should minimise, [n, N] m2/s2, or injuries in 1,000 lines for ``injury``."""
     harms = ledger.vehicle_harm(harm_count), ledger.world_harm(harm_count)
     # only objectives that are not weighted sums may use changes of speed
     no_sums = any(OBJECTIVES[each.kind].weights is None for each in objectives)
@@ -181,14 +175,8 @@ def added_harm(before: Ledger, after: Ledger, harm_count: HarmCount, objectives:
     """Return how much a step changes the amount that each vehicle should minimise, [n, N].
 
     For an objective that is a weighted sum of the vehicles' harms, the change is the weighted sum of the harms in this
-    step. For any other objective, the change is the amount after the step minus the amount before the step.
-
-    Args:
-        before: harm from the start of the episode to the beginning of the step.
-        after: harm from the start of the episode to the end of the step.
-        harm_count: ``"first"``: use first-impact harm; ``"total"``: use total harm.
-        objectives: objective of each of the N vehicles, front to rear.
-
+    step. For any other objective, the change is the amount after the step minus the amount before the step. ``before``
+    and ``after`` are the ledgers at the beginning and at the end of the step.
     """
     sums = [OBJECTIVES[each.kind].weights is not None for each in objectives]
     harm = objective_harm(after.since(before), harm_count, objectives) if any(sums) else 0.0
@@ -202,15 +190,8 @@ def aim_of(objective: Objective, line: Weighed, vehicle: int) -> tuple[Floats, b
     """Return the weight of each vehicle's harm in an objective, [n, N], and how the weighted harms are combined.
 
     The second result is False if the objective is the sum of the weighted harms, and True if it is the largest weighted
-    harm.
-
-    Args:
-        objective: the objective.
-        line: masses and weights of the vehicles in n worlds: a ``Vehicles`` or a ``Ledger``.
-        vehicle: index of the vehicle that has this objective (0 = front).
-
-    Raises ``InvalidInput`` for an objective such as ``injury``, which is neither a sum nor a maximum of weighted harms.
-
+    harm. ``vehicle`` is the index of the vehicle that has this objective (0 = front). Raises ``InvalidInput`` for an
+    objective such as ``injury``, which is neither a sum nor a maximum of weighted harms.
     """
     weights = OBJECTIVES[objective.kind].weights
     if objective.kind == "maximin":
@@ -238,11 +219,10 @@ def register_objective(name: str, function: ObjectiveFunction) -> None:
     belongs to another objective, and ``InvalidInput`` for an invalid name or a function without a docstring.
 
     Args:
-        name: name of the objective, 1 to 64 characters ``a-z``, ``0-9``, ``-`` and ``_``, beginning with a letter or
-            digit.
-        function: ``function(harm, vehicle)`` returns the amount that vehicle number ``vehicle`` (0 = front) should
-            minimise, [n] m2/s2. The argument ``harm`` of this function is a ``HarmSoFar``. The docstring of
-            ``function`` is shown as the description of the objective.
+        name: 1 to 64 characters ``a-z``, ``0-9``, ``-`` and ``_``, beginning with a letter or digit.
+        function: ``function(harm, vehicle)`` takes a ``HarmSoFar`` and the index of a vehicle (0 = front), and returns
+            the amount that this vehicle should minimise, [n] m2/s2. The docstring of ``function`` is shown as the
+            description of the objective.
 
     """
     if not isinstance(name, str) or _NAME.fullmatch(name) is None:
@@ -284,14 +264,8 @@ def scored(ledger: Ledger, harm_count: HarmCount, declared: Sequence[Declared] |
     All amounts are computed from the same harm, so a policy can be evaluated under objectives for which it was not
     trained. Amounts are in m2/s2, or injuries in 1,000 lines for the objective ``injury``; less is better.
 
-    Args:
-        ledger: harm in n worlds since the start of the episode.
-        harm_count: ``"first"``: use first-impact harm; ``"total"``: use total harm.
-        declared: list of objectives. Each item is the text of one objective for all vehicles, or a tuple with one text
-            per vehicle. If ``declared`` is None, the objectives are those that ``standard_objectives`` returns.
-
-    Raises ``InvalidInput`` if ``declared`` is a single text instead of a list.
-
+    Each item of ``declared`` is the text of one objective for all vehicles, or a tuple with one text per vehicle. None
+    means ``standard_objectives()``. Raises ``InvalidInput`` if ``declared`` is a single text instead of a list.
     """
     if isinstance(declared, str):
         raise InvalidInput(f"scored = {declared!r}: must be a list of objectives, for instance [{declared!r}]")
@@ -316,9 +290,8 @@ def _social(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
 def _social_weights(angle_deg: float) -> tuple[float, float]:
     """Return the weight of own harm, cos(angle), and the weight of the other vehicles' harm, sin(angle).
 
-    At 90 degrees the weight of own harm is exactly 0, and the weight of the other vehicles' harm is exactly 1. The
-    power series of cosine and sine are summed in exact fractions and rounded once, because results of the C library
-    differ between processors in the last bits.
+    At 90 degrees the weights are exactly 0 and 1. The power series of cosine and sine are summed in exact fractions and
+    rounded once, because results of the C library differ between processors in the last bits.
     """
     if angle_deg == 90.0:
         return 0.0, 1.0
@@ -332,9 +305,9 @@ def _social_weights(angle_deg: float) -> tuple[float, float]:
 def _injured(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
     """Return how many injuries are expected in 1,000 lines of vehicles, [n]; the number does not depend on ``vehicle``.
 
-    For a vehicle that is hit at its front and at its rear, the larger of the two injury risks is used. The same change
-    of speed leads to different injury risks at the front and at the rear of a vehicle. If the risk of the larger change
-    of speed were used instead, a further impact could lower the number of injuries.
+    For a vehicle that is hit at its front and at its rear, the larger of the two injury risks is used. If the risk of
+    the larger change of speed were used instead, a further impact could lower the number of injuries, because the same
+    change of speed leads to different risks at the front and at the rear.
     """
     del vehicle
     front, rear = harm.front_change_mps, harm.rear_change_mps
@@ -349,7 +322,7 @@ def _injured(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
 def weighted_harm(borne: Floats, weights: Floats) -> Floats:
     """Return ``N (sum_j w_j H_j) / (sum_j w_j)``, [n] m2/s2. Each sum over j runs over the vehicles from front to rear.
 
-    ``borne``: harm H_j that each vehicle j bears, [n, N] m2/s2. ``weights``: weight w_j of each vehicle j, [n, N].
+    ``borne`` has the harm H_j that each vehicle bears, [n, N] m2/s2; ``weights`` has the weights w_j, [n, N].
     """
     n, vehicles = borne.shape
     harm, whole = np.zeros(n), np.zeros(n)

@@ -1,4 +1,9 @@
-"""Observations: choose the features that a vehicle observes, and compute their values in a batch of worlds."""
+"""Observations: choose the features that a vehicle observes, and compute their values in a batch of worlds.
+
+Arguments that several functions share: ``state`` has time, motion and harm, and ``params`` the parameters of the
+vehicles, with one row per world (layout: ``physics.columns``). ``vehicles`` or ``observers`` are the indices of the
+observing vehicles (0 = front). ``steps`` is the number of steps that each episode has taken, [n], for error messages.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +51,7 @@ from ethbrake_marl.physics.state import Floats, Ints, Worlds
 
 @dataclass(frozen=True, slots=True)
 class ObservationSpec:
-    """Specification of the features that a vehicle observes.
+    """The features that a vehicle observes.
 
     A vehicle observes its own features, features of neighbours and, optionally, its place in the line, the obstacle and
     forecast impacts. If ``chosen`` is not empty, it lists exactly the observed features, in order; to make such a
@@ -58,7 +63,6 @@ class ObservationSpec:
     (27, 'front_1.known')
     >>> eb.choose_observation(["own", "front_1.gap"]).size
     8
-
     """
 
     front: int = 1  # number of observed neighbours ahead, 0 to 64
@@ -95,8 +99,8 @@ class ObservationSpec:
     def sides(self) -> tuple[tuple[str, int], ...]:
         """Observed neighbours as pairs (prefix, offset): ``("front_1", -1)`` is the next vehicle ahead.
 
-        The offset is the neighbour's index in the line minus the observer's index. Neighbours ahead are listed before
-        neighbours behind, the nearest first.
+        The offset is the neighbour's index minus the observer's index. Neighbours ahead are listed before neighbours
+        behind, the nearest first.
         """
         fronts = tuple((f"front_{k}", -k) for k in range(1, self.front + 1))
         return fronts + tuple((f"rear_{k}", k) for k in range(1, self.rear + 1))
@@ -118,7 +122,7 @@ class ObservationSpec:
 
     @property
     def far(self) -> bool:
-        """Whether the observation has features of ``GROUPS.contact_far``: forecasts of late or hard impacts."""
+        """Whether the observation has features of ``GROUPS.contact_far``."""
         return any(name.startswith("contact_far.") for name in self.chosen)
 
     @property
@@ -128,10 +132,9 @@ class ObservationSpec:
 
     @property
     def plan(self) -> Plan:
-        """The ``Plan`` object that computes this observation from worlds.
+        """The cached ``Plan`` that computes this observation from worlds; do not change it.
 
-        The object is cached, so do not change it. Raises ``InvalidInput`` if the observation has contact features and
-        ``time_step_s`` is None.
+        Raises ``InvalidInput`` if the observation has contact features and ``time_step_s`` is None.
         """
         return _plan(self, tuple(registered_in(self.chosen).items()) if self.chosen else ())
 
@@ -149,8 +152,8 @@ def choose_observation(listed: Observation, time_step_s: float | None = None) ->
 
     ``listed`` is a list of groups and features, such as ``["own", "front_1", "rear_1.gap"]``, a mapping with the fields
     of an ``ObservationSpec``, or an ``ObservationSpec``. ``time_step_s`` is the time between two decisions (s), which
-    you must give for contact features outside an environment. Raises ``UnknownName`` with a suggestion for an unknown
-    name, and ``InvalidInput`` for an invalid list.
+    contact features need outside an environment. Raises ``UnknownName`` with a suggestion for an unknown name, and
+    ``InvalidInput`` for an invalid list.
     """
     if isinstance(listed, ObservationSpec):
         spec = listed
@@ -190,7 +193,7 @@ _ROLE, _OBSTACLE = len(GROUPS.role), len(GROUPS.obstacle)
 def observe(worlds: Worlds, vehicle: int, spec: ObservationSpec) -> Observations:
     """Return the observation of ``vehicle`` (index, 0 = front) in every world, a new array [n, F] float32.
 
-    ``spec`` specifies the F features to observe. Raises ``InvalidInput`` if no vehicle has the index ``vehicle``.
+    Raises ``InvalidInput`` if no vehicle has the index ``vehicle``.
     """
     if not 0 <= vehicle < worlds.N:
         raise InvalidInput(f"observe: vehicle = {vehicle}: must be an index from 0 to {worlds.N - 1}")
@@ -248,13 +251,6 @@ class Plan(NamedTuple):
 
         If vehicles send periodic messages, a vehicle observes its own estimate of each world (``physics.estimates``).
         Raises ``PhysicsError``, which lists the worlds in which a forecast of impacts failed.
-
-        Args:
-            state: time, motion and harm of the worlds, one row per world, [n, S] (layout: ``physics.columns``).
-            params: parameters of the vehicles, one row per world (layout: ``physics.columns``).
-            vehicles: indices of the observing vehicles (0 = front).
-            steps: number of steps that each episode has taken, [n], for error messages.
-
         """
         packed = Packed(state, params)
         if not packed.has_messages:
@@ -338,7 +334,7 @@ def _plan(spec: ObservationSpec, registered: tuple[tuple[str, RegisteredFeature]
 
 
 def _scales(features: Sequence[Feature]) -> Floats:
-    """Return the scaling of the features, [3, F]: rows ``1 / scale``, ``low`` and ``high``; one column per feature."""
+    """Return ``Scaling.features`` for ``features``, [3, F]."""
     return np.array([[1.0 / f.scale for f in features], [f.low for f in features], [f.high for f in features]])
 
 
@@ -347,21 +343,10 @@ def _observe_rows(
     state: Floats, params: Floats, observers: Ints, offsets: Ints, role: bool, with_obstacle: bool, features: Floats,
     out: Observations,
 ) -> None:  # fmt: skip
-    """Write the features that each observer observes into ``out``, group by group.
+    """Write the features of each observer into ``out``, [n, observers, F], group by group.
 
-    The function is one long loop, because it was four times slower when the loop called smaller functions.
-
-    Args:
-        state: time, motion and harm of the worlds, one row per world, [n, S] (layout: ``physics.columns``).
-        params: parameters of the vehicles, one row per world (layout: ``physics.columns``).
-        observers: indices of the observing vehicles (0 = front).
-        offsets: index of each observed neighbour minus index of the observer; -1 is the next vehicle ahead.
-        role: whether vehicles observe their own place in the line (``GROUPS.role``).
-        with_obstacle: whether vehicles observe the obstacle ahead (``GROUPS.obstacle``).
-        features: scaling of the features, [3, F]: the rows ``1 / scale``, ``low`` and ``high``, with one column per
-            feature.
-        out: array that receives the result, [n, observers, F].
-
+    The function is one long loop, because it was four times slower when the loop called smaller functions. For the
+    arguments from ``offsets`` to ``features``, see ``Scaling``.
     """
     of = columns(state)
     N, speed, command, gap_column, hit, obstacle = of.vehicles, of.speed, of.command, of.gap, of.hit, of.obstacle
@@ -464,17 +449,12 @@ def _hide_untold(
 
 @compiled
 def _fitting_deceleration(speed: float, latency_left: float, room: float) -> float:
-    """Return the deceleration (m/s2) with which a vehicle stops after the distance ``room``: ``v^2 / (2 b)``.
+    """Return the deceleration (m/s2) with which a vehicle stops after the distance ``room`` (m): ``v^2 / (2 b)``.
 
-    Here ``b = room - v tau`` is the distance that is left when the vehicle begins to brake. If b is below 1 mm, 1 mm is
-    used instead. If b is below 1 mm, the result is at least 20 m/s2, the largest value that a vehicle can observe,
-    unless the speed is below 0.2 m/s. For a vehicle at rest the result is 0.
-
-    Args:
-        speed: present speed v of the vehicle, m/s.
-        latency_left: time tau until the vehicle's brakes act, s.
-        room: distance after which the vehicle must stop, m.
-
+    Here ``b = room - v tau`` is the distance that is left when the vehicle begins to brake, v is its ``speed`` (m/s)
+    and tau the time ``latency_left`` until its brakes act (s). If b is below 1 mm, 1 mm is used instead, and the result
+    is at least 20 m/s2, the largest value that a vehicle can observe, unless the speed is below 0.2 m/s. For a vehicle
+    at rest the result is 0.
     """
     speed = max(speed, 0.0)
     left = max(room - speed * latency_left, 1e-3)

@@ -27,14 +27,9 @@ def observation_for(scenario: Game, vehicle: str | None = None) -> ObservationSp
 def observations_of(scenario: Game, given: Observation | None = None) -> tuple[ObservationSpec, ...]:
     """Return the observation of each of the N vehicles, front to rear.
 
-    Raises ``UnknownName`` for an unknown vehicle, and the same errors as ``choose_observation``.
-
-    Args:
-        scenario: the scenario, which may declare observations.
-        given: observations that replace the observations of the scenario: one observation for all vehicles, or a
-            mapping for some vehicles, such as ``{"vehicle_2": ["own", "front_1"]}``. If ``given`` is None, no
-            observation is replaced.
-
+    The observations of the scenario are replaced by ``given``: one observation for all vehicles, or a mapping for some
+    vehicles, such as ``{"vehicle_2": ["own", "front_1"]}``; None: no observation is replaced. Raises ``UnknownName``
+    for an unknown vehicle, and the same errors as ``choose_observation``.
     """
     names, step_s, said = scenario.vehicle_names, scenario.time_step_s, scenario.observation
     usual = ObservationSpec(role=scenario.has_obstacle, obstacle=scenario.has_obstacle)
@@ -56,8 +51,7 @@ def observations_of(scenario: Game, given: Observation | None = None) -> tuple[O
 def common_observation(observations: tuple[ObservationSpec, ...], scenario: Game) -> ObservationSpec:
     """Return the observation that all learners share or, without learners, the observation that all vehicles share.
 
-    Raises ``InvalidInput``, which names two vehicles, if the observations of these vehicles differ. ``observations``:
-    observation of each vehicle, front to rear.
+    Raises ``InvalidInput``, which names two vehicles, if the observations of these vehicles differ.
     """
     first, *others = scenario.learners or range(scenario.vehicles)
     for other in others:

@@ -34,14 +34,9 @@ VEHICLES = "vehicles"  # stands for the components harm_1 to harm_N
 def components_of(vector: RewardVector, params: RewardParams, vehicles: int) -> tuple[str, ...]:
     """Return the names of the components of a vector reward.
 
-    Args:
-        vector: ``vehicles`` (one component for the harm of each vehicle), or a list of names of components, without
-            repetition.
-        params: the reward; each of its terms whose weight is not 0 can be a component.
-        vehicles: number of vehicles in the line.
-
-    Raises ``InvalidInput`` for an empty list or a repeated name, and ``UnknownName`` for an unknown name.
-
+    ``vector`` is ``vehicles`` (one component for the harm of each vehicle), or a list of names of components. Each term
+    of the reward ``params`` whose weight is not 0 can be a component. Raises ``InvalidInput`` for an empty list or a
+    repeated name, and ``UnknownName`` for an unknown name.
     """
     each = [f"harm_{k + 1}" for k in range(vehicles)]
     if isinstance(vector, str) and vector == VEHICLES:
@@ -62,12 +57,8 @@ def components_of(vector: RewardVector, params: RewardParams, vehicles: int) -> 
 def vector_of(names: Sequence[str], harm: Ledger, harm_count: HarmCount, terms: Mapping[str, Floats]) -> Floats:
     """Return the vector reward of every vehicle in one step, [n, N, K].
 
-    Args:
-        names: names of the K components.
-        harm: harm of the step in n worlds of N vehicles.
-        harm_count: ``"first"``: use first-impact harm; ``"total"``: use total harm.
-        terms: dictionary from the name of a reward term to its values before weighting, [n] or [n, N].
-
+    ``names`` are the names of the K components, and ``harm`` is the harm of the step. ``terms`` maps the name of a
+    reward term to its values before weighting, [n] or [n, N].
     """
     borne, pairs = harm.vehicle_harm(harm_count), harm.pair_harm(harm_count)
     parts = {f"harm_{k + 1}": 0.0 - borne[:, k] for k in range(borne.shape[1])}

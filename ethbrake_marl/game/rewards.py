@@ -65,10 +65,10 @@ class RewardParams(FileModel):
     """Weights and constants of the terms of a reward. A term with weight 0 is not computed.
 
     Args:
-        harm, collision, risk, jerk, terminal, shaping: weights of the built-in terms, at least 0. The docstring of the
-            module ``game.rewards`` shows the formula of each term. If you give a weight for any term other than harm,
-            you must also give the weight of harm.
-        harm_count: ``first``: the term harm uses first-impact harm; ``total``: the term harm uses total harm.
+        harm, collision, risk, jerk, terminal, shaping: weights of the built-in terms, at least 0; the module
+            ``game.rewards`` has the formulas. If you give a weight for any term other than harm, you must also give the
+            weight of harm.
+        harm_count: ``first``: the term harm uses first-impact harm; ``total``: total harm.
         objective: objective of all vehicles, or a list with one objective per vehicle; None: the objective of the
             scenario.
         shaping_discount: discount in the shaping term, in (0, 1]; it should equal the learner's own discount.
@@ -77,8 +77,7 @@ class RewardParams(FileModel):
         safety_buffer_m: distance d_safe that is subtracted from the gap in the risk term, m.
         target_gap_m: gap d_target below which the second part of the risk term exceeds 1/2, m.
         distance_slope_per_m: steepness k_d of the second part of the risk term, 1/m.
-        terms: dictionary from the name of a registered measure to its weight; use a negative weight for a measure that
-            should become small.
+        terms: name of a registered measure -> weight; use a negative weight for a measure that should become small.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.EthBrakeEnv("paper-random", reward=eb.RewardParams(harm=0.05, terminal=1.0))
@@ -140,11 +139,11 @@ class RewardParams(FileModel):
 
     @model_validator(mode="after")
     def _harm_is_meant(self) -> Self:
-        """Raise an error if weights are given without the weight of harm, or if an objective is given although
-        harm has weight 0.
+        """Raise an error if weights are given without the weight of harm, or if an objective is given although harm has
+        weight 0.
 
-        If the weight of harm is not given, it is 1. If this were no error, a user who gives only the weights of other
-        terms would get a reward that also includes harm.
+        The weight of harm is 1 by default, so a user who gives only the weights of other terms would unknowingly get a
+        reward that also includes harm.
         """
         names = {*self.model_fields_set, *(self.terms if "terms" in self.model_fields_set else ())}
         beside = [name for name, weight in self.weights.items() if weight != 0.0 and name in names]
@@ -178,10 +177,8 @@ class RewardParams(FileModel):
         A term with weight 0 is left out. If there is an objective, the term harm is also left out, because each vehicle
         has its own value of this term.
 
-        Args:
-            harm: harm of the step in m2/s2, for n worlds [n] or as one number for a single world.
-            safe_end: 1 if the episode ended in this step without any collision, else 0; of the same shape as ``harm``.
-
+        ``harm`` is the harm of the step in m2/s2, for n worlds [n] or as one number for a single world. ``safe_end``
+        has the same shape, and is 1 if the episode ended in this step without any collision, else 0.
         """
         terms = {}
         if self.harm > 0.0 and self.objective is None:
@@ -193,8 +190,7 @@ class RewardParams(FileModel):
     def weighted_sum(self, terms: Mapping[str, Floats], shape: tuple[int, ...]) -> Floats:
         """Return the reward of every vehicle, [n, N]: the sum of weight times value over all ``terms``.
 
-        ``terms``: dictionary from the name of a term to its values, [n] or [n, N]. ``shape``: shape (n, N) of the
-        result.
+        ``terms`` maps names to values, [n] or [n, N]. ``shape`` is the shape (n, N) of the result.
         """
         total = np.zeros(shape)
         for name, term in terms.items():
@@ -204,17 +200,11 @@ class RewardParams(FileModel):
     def settled(self, of_scenario: Declared, vehicles: int) -> tuple[RewardParams, tuple[Objective, ...]]:
         """Return a copy of this reward whose ``objective`` is the one in use, and the parsed objective of each vehicle.
 
-        The objective comes from the reward or, if the reward has none, from the scenario. If all vehicles have the
-        objective ``total``, or if harm has weight 0, ``objective`` becomes None and the tuple of parsed objectives is
-        empty. If harm has weight 0 and the scenario has another objective than ``total``, a warning (``WithoutEffect``)
-        says that this objective has no effect.
-
-        Args:
-            of_scenario: objective that the scenario declares.
-            vehicles: number of vehicles in the line.
-
-        Raises ``InvalidInput`` if the objective of the reward contains texts or weights for another number of vehicles.
-
+        The objective comes from the reward or, if the reward has none, from the scenario (``of_scenario``). If all
+        vehicles have the objective ``total``, or if harm has weight 0, ``objective`` becomes None and the tuple of
+        parsed objectives is empty. If harm has weight 0 and the scenario has another objective than ``total``, a
+        warning (``WithoutEffect``) says that this objective has no effect. Raises ``InvalidInput`` if the objective of
+        the reward contains texts or weights for another number than ``vehicles``.
         """
         declared = of_scenario if self.objective is None else self.objective
         try:
@@ -234,16 +224,12 @@ class RewardParams(FileModel):
     def potential(self, worlds: Worlds, learners: Sequence[int], horizon_s: float) -> Floats:
         """Return the potential of the shaping term, [n] m2/s2: minus the least harm with constant braking from now on.
 
-        For the potential, each learner is assumed to brake with a constant deceleration, and all other vehicles fully.
-        For each learner nine decelerations are tried, from 0 to the learner's braking capacity in equal steps. A single
-        learner takes the deceleration with the least harm. Several learners begin with full braking and choose their
-        decelerations one after the other, front to rear, in two rounds; all learners get the same potential.
+        Each learner is assumed to brake with a constant deceleration, and all other vehicles fully. For each learner
+        nine decelerations are tried, from 0 to the learner's braking capacity in equal steps. A single learner takes
+        the deceleration with the least harm. Several learners begin with full braking and choose their decelerations
+        one after the other, front to rear, in two rounds; all learners get the same potential.
 
-        Args:
-            worlds: n worlds of N vehicles.
-            learners: indices of the learners (0 = front).
-            horizon_s: time after the alert at which the episode ends, s; harm after this time is not included.
-
+        ``learners`` are indices (0 = front). Harm later than ``horizon_s`` (s after the alert) is not included.
         """
         braking = worlds.vehicles.braking_capacity_mps2
         command, least = -braking, np.zeros(worlds.n)

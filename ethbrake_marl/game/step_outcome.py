@@ -14,8 +14,8 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints
 class StepOutcome:
     """Result of one step in n worlds of N vehicles (P pairs), from which measures can be computed.
 
-    Do not change the arrays of this object. In arrays [n, N], column 0 belongs to the front vehicle. In arrays [n, P],
-    column 0 belongs to the front vehicle and the vehicle behind it.
+    Do not change the arrays of this object. Column 0 belongs to the front vehicle in arrays [n, N], and to the front
+    vehicle and the vehicle behind it in arrays [n, P].
     """
 
     first_impact_harm: Floats  # [n] first-impact harm of the line in this step, m2/s2
@@ -60,13 +60,8 @@ def risk(
     gap and TTC the time to collision: ``TTC = max(d - d_safe, 0) / closing speed``. If the vehicles of the pair do not
     approach each other, the first summand of the risk is 0.
 
-    Args:
-        step: result of the step.
-        ttc_scale_s: time tau by which the time to collision is divided, s.
-        safety_buffer_m: distance d_safe that is subtracted from the gap d, m.
-        target_gap_m: gap d_target at which the second summand of the risk is 1/2, m.
-        distance_slope_per_m: steepness k_d of the second summand of the risk, 1/m.
-
+    The arguments are tau (``ttc_scale_s``, s), d_safe (``safety_buffer_m``, m), d_target (``target_gap_m``, m), at
+    which the second summand is 1/2, and k_d (``distance_slope_per_m``, 1/m).
     """
     closing = step.speeds_mps[:, 1:] - step.speeds_mps[:, :-1]
     room = np.maximum(step.gaps_m - safety_buffer_m, 0.0)

@@ -24,8 +24,8 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 def shipped_folder(folder: Literal["scenarios", "train"] = "scenarios") -> Path:
     """Return the folder of the shipped scenarios, or of the shipped recipes if ``folder`` is ``"train"``.
 
-    The folder is part of the source checkout or of the installed package. Raises ``InvalidInput`` if neither the source
-    checkout nor the installed package contains the folder.
+    The folder is part of the source checkout or of the installed package. Raises ``InvalidInput`` if neither contains
+    it.
     """
     checkout, installed = _PACKAGE.parent / folder, _PACKAGE / "_data" / folder
     if (_PACKAGE.parent / "pyproject.toml").is_file() and checkout.is_dir():
@@ -54,7 +54,6 @@ class CatalogueEntry:
 
     @property
     def shipped(self) -> bool:
-        """Whether the scenario ships with this package."""
         return self.origin == "shipped"
 
 
@@ -62,7 +61,7 @@ def register_scenarios(folder: str | os.PathLike[str]) -> None:
     """Register the scenarios of a folder by name: a file ``my-name.yaml`` in it becomes ``--scenario my-name``.
 
     Subfolders are ignored. A scenario file is checked only when its scenario is used. Registering the same folder again
-    changes nothing. Raises ``InvalidInput`` if the folder does not exist or has no ``.yaml`` file. Raises
+    changes nothing. Raises ``InvalidInput`` if the folder does not exist or has no ``.yaml`` file, and
     ``AlreadyExists`` if a shipped scenario, or a scenario of another registered folder, has the same name as a scenario
     of this folder.
     """
@@ -84,10 +83,9 @@ def register_scenarios(folder: str | os.PathLike[str]) -> None:
 def load_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> Scenario:
     """Load a scenario by name, by path of its file, or from a mapping with the content of such a file.
 
-    A ``Scenario`` is returned unchanged. The docstring of ``scenario_path`` explains how the file is found.
-
-    Raises ``UnknownName`` with a suggestion for an unknown name. Raises ``InvalidInput``, which names file, line, key
-    and value, if the file is not a valid scenario, or if its key ``name`` differs from the name of the file.
+    A ``Scenario`` is returned unchanged. The docstring of ``scenario_path`` explains how the file is found. Raises
+    ``UnknownName`` with a suggestion for an unknown name. Raises ``InvalidInput``, which names file, line, key and
+    value, if the file is not a valid scenario, or if its key ``name`` differs from the name of the file.
     """
     if isinstance(scenario, Scenario):
         return scenario
@@ -132,9 +130,9 @@ BENCHMARK = (  # scenarios that ship with a table of best known harm, which the 
 
 
 def group_of_scenarios(name: str) -> list[str]:
-    """Return the names of the scenarios in a group; groups are ``benchmark`` and folders of shipped scenarios.
+    """Return the names of the scenarios in a group: ``benchmark``, or a folder of shipped scenarios.
 
-    The list is empty if ``name`` is not the name of a group.
+    The list is empty if there is no group ``name``.
     """
     if name == "benchmark":
         return list(BENCHMARK)
@@ -153,10 +151,7 @@ def list_scenarios() -> list[CatalogueEntry]:
 
 
 def _known_paths() -> dict[str, Path]:
-    """Return the file of every shipped and registered scenario, by name.
-
-    Raise ``AlreadyExists`` if two scenarios have the same name.
-    """
+    """Return the file of every shipped and registered scenario by name; raise ``AlreadyExists`` for a repeated name."""
     shipped = _shipped_paths()
     known = dict(shipped)
     for folder in FOLDERS.values():
@@ -208,14 +203,10 @@ def _with_members(document: Document, folder: Path) -> Document:
 
 
 def _with_rows(document: Document, at: YamlPath, content: Any, folder: Path) -> Any:
-    """Return the content of one scenario, with the rows of its table read from the table's file.
+    """Return ``content``, the content of one scenario, with the rows of its table read from the table's file.
 
-    Args:
-        document: file that contains the scenario, for error messages.
-        at: keys and indices that lead to the scenario inside the document; ``()``: the whole document is the scenario.
-        content: content of the scenario as plain data.
-        folder: folder to which the path of the table's file is relative.
-
+    The path of this file is relative to ``folder``. Error messages name ``document`` and the place ``at`` of the
+    scenario in it (keys and indices; ``()``: the whole document is the scenario).
     """
     table = content.get("table") if isinstance(content, dict) else None
     if not (isinstance(table, dict) and isinstance(table.get("file"), str)) or "rows" in table:
@@ -252,10 +243,7 @@ _HEAD = """\
 
 
 def check_file_name(kind: str, name: str) -> None:
-    """Raise ``InvalidInput`` unless ``name`` is a valid name of a scenario or recipe and of its file.
-
-    ``kind``: ``"scenario"`` or ``"recipe"``, for the error message.
-    """
+    """Raise ``InvalidInput`` unless ``name`` is a valid name of a scenario or recipe (``kind``) and of its file."""
     if re.fullmatch(NAME_PATTERN, name) is None:
         raise InvalidInput(
             f"{kind} name {name!r}: must be 1 to 64 lower case letters, digits, - and _, beginning with a letter or"

@@ -9,23 +9,26 @@ of vehicle j from the time ``tau_ij`` (in s after the alert) on:
 T is the message period, and ``U(0, T)`` the random wait for the next message. L_radio is the time of transmission,
 t_proc the time until the message is processed, and t_act the time until the brakes respond. ``k`` is the number of
 message periods during which a burst of losses destroys every message. In each period, a burst begins with probability
-p, and an ongoing burst ends with probability r. In the stationary state of this Gilbert-Elliott channel, ``P(k >= m) =
-(p / (p + r)) (1 - r)^(m - 1)`` for m = 1, 2, ... With probability ``lost`` no message ever arrives on a link. A
-vehicle's sensors see its direct neighbours after a delay, called a *hop*, which is drawn from the range ``sensing_s``.
-Vehicle i can react to the emergency from the time ``latency_i`` (in s after the alert) on:
+p, and an ongoing burst ends with probability r. In the stationary state of this Gilbert-Elliott channel,
+``P(k >= m) = (p / (p + r)) (1 - r)^(m - 1)`` for m = 1, 2, ... With probability ``lost`` no message ever arrives on a
+link. A vehicle's sensors see its direct neighbours after a delay, called a *hop*, which is drawn from the range
+``sensing_s``. Vehicle i can react to the emergency from the time ``latency_i`` (in s after the alert) on:
 
     latency_i = max(own latency_i, min(tau_i1, latency_(i-1) + hop_(i, i-1)))
 
-At the time ``latency_i``, vehicle i's own latency has elapsed, and vehicle i has either received the message of Vehicle
-1 or seen the vehicle ahead brake. Vehicle i knows the state of vehicle j from ``max(latency_i, tau_ij)`` on. If vehicle
-i also sees vehicle j, it knows the state of vehicle j from ``max(latency_i, min(tau_ij, hop_ij))`` on. If a vehicle
-observes another vehicle's latency, it observes the *own* latency of that vehicle, which does not include delays of the
-channel. Under the preset ``paper`` a vehicle knows the state of every vehicle as soon as its own latency has elapsed.
+At this time, vehicle i's own latency has elapsed, and vehicle i has either received the message of Vehicle 1 or seen
+the vehicle ahead brake. Vehicle i knows the state of vehicle j from ``max(latency_i, tau_ij)`` on, or from
+``max(latency_i, min(tau_ij, hop_ij))`` on if it also sees vehicle j. If a vehicle observes another vehicle's latency,
+it observes the *own* latency of that vehicle, which does not include delays of the channel. Under the preset ``paper``
+a vehicle knows the state of every vehicle as soon as its own latency has elapsed.
 
-With ``persistence: first``, vehicle i knows the present state of vehicle j after the first message. With ``persistence:
-periodic``, vehicle j sends a message in every message period T, and each message may be lost in a burst of the link's
-Gilbert-Elliott channel. Vehicle i then knows the state of vehicle j that is contained in the newest message that has
-arrived (``physics.messages``).
+With ``persistence: first``, vehicle i knows the present state of vehicle j after the first message. With
+``persistence: periodic``, vehicle j sends a message in every period T, and each message may be lost in a burst. Vehicle
+i then knows the state that is contained in the newest message that has arrived (``physics.messages``).
+
+Arguments that several functions share: ``u`` has the uniform numbers in [0, 1) that draw the random values of all
+links, [n, N * N * PER_LINK]. ``equipped`` is the V2X equipment, one row per world or one row for all worlds.
+``time_step_s`` is the time between two decisions, s.
 """
 
 from __future__ import annotations
@@ -100,7 +103,7 @@ class Equipped(NamedTuple):
 
 
 class Channel(NamedTuple):
-    """All settings that determine what each vehicle knows, and when. The module docstring explains tau, T and p."""
+    """All settings that determine what each vehicle knows, and when."""
 
     # how the delay tau of a link arises: "latency": tau is the receiver's own latency; "fixed": tau is link_latency_s;
     # "messages": tau is drawn with the settings of messages and losses below
@@ -120,9 +123,10 @@ class Channel(NamedTuple):
     tells: Tells | None = None  # items of PIECES that a message contains; None: USUAL_PIECES
 
     def contents(self, vehicles: int) -> Bools | None:
-        """Return a mask [N, len(PIECES)]: True where the messages of a vehicle contain an item of ``PIECES``.
+        """Return a mask [N, len(PIECES)]: True where a vehicle's messages contain an item; None if ``tells`` is not
+        given.
 
-        If ``tells`` is not given, return None; messages then contain the items in ``USUAL_PIECES``.
+        Without ``tells``, messages contain the items in ``USUAL_PIECES``.
         """
         if self.tells is None:
             return None
@@ -139,9 +143,9 @@ class Channel(NamedTuple):
         return self.link_latency_s if self.timing == "fixed" else math.inf
 
     def samples(self, time_step_s: float) -> int:
-        """Return how many samples of its own state a vehicle stores for its messages; 0 without periodic messages.
+        """Return how many samples of its own state a vehicle stores for its messages, one sample per decision.
 
-        ``time_step_s``: time between two decisions (s); a vehicle stores one sample of its state at each decision.
+        The result is 0 without periodic messages.
         """
         return Messages.ring_length(self.delay_s, time_step_s) if self.persistence == "periodic" else 0
 
@@ -182,11 +186,7 @@ Preset = Annotated[str, AfterValidator(_known_preset), _PresetSchema]
 
 
 def _pieces(value: Any) -> Tells | None:
-    """Check the value of the key ``tells`` (what messages contain); return its items in the order of ``PIECES``.
-
-    ``value``: list of the items that messages contain (for all vehicles), or a mapping from vehicle names to such
-    lists.
-    """
+    """Check the value of the key ``tells``; return its items in the order of ``PIECES``."""
     if value is None:
         return None
     by_name = isinstance(value, Mapping)
@@ -298,10 +298,7 @@ class V2X(FileModel):
         return self
 
     def _leave_out(self, names: tuple[str, ...], why: str) -> None:
-        """Raise an error if one of the keys ``names`` is in the settings although it has no effect.
-
-        ``why``: reason why the key has no effect, for the error message.
-        """
+        """Raise an error, with the reason ``why``, if one of the keys ``names`` is set although it has no effect."""
         for name in names:
             self._require(getattr(self, name) is None, name, f"has no effect, because {why}; leave it out")
 
@@ -311,13 +308,13 @@ class V2X(FileModel):
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        """Return the JSON schema: the name of a preset, or a mapping."""
+        """JSON schema: the name of a preset, or a mapping."""
         mapping = handler(core)
         return {"anyOf": [{"enum": list(CHANNELS), "type": "string"}, mapping]}
 
     @property
     def channel(self) -> Channel:
-        """The channel that ``v2x`` describes: the values of the preset, except where ``v2x`` gives another value."""
+        """The values of the preset, except where ``v2x`` gives another value."""
         values = {name: getattr(self, name) for name in Channel._fields[1:] if getattr(self, name) is not None}
         base = CHANNELS[self.preset]
         return base._replace(timing="fixed" if self.link_latency_s is not None else base.timing, **values)
@@ -334,7 +331,7 @@ class V2X(FileModel):
 
     @property
     def drawn(self) -> bool:
-        """True if random numbers determine what vehicles know, or when they know it."""
+        """Whether random numbers determine what vehicles know, or when they know it."""
         channel = self.channel
         low, high = channel.sensing_s
         by_messages = channel.timing == "messages" and channel.hears != "none"
@@ -345,10 +342,8 @@ class V2X(FileModel):
     def latest_reaction_s(self, own_latency_s: Floats, equipped: Equipped) -> Floats:
         """Return, for each vehicle, an upper bound of the time from which the vehicle can react, [N] s.
 
-        Args:
-            own_latency_s: upper bounds of the vehicles' own latencies, without delays of the channel, [N] s.
-            equipped: for each vehicle, the least V2X equipment that the vehicle has in any world, [1, N].
-
+        ``own_latency_s`` has upper bounds of the own latencies, [N] s. ``equipped`` has one row: the least equipment
+        that each vehicle has in any world.
         """
         channel, latest = self.channel, own_latency_s.copy()
         if channel.timing == "latency":
@@ -368,14 +363,8 @@ class V2X(FileModel):
     def with_news(self, vehicles: Vehicles, u: Floats, equipped: Equipped) -> Vehicles:
         """Return ``vehicles`` with the channel's delays in the latencies, and times from which each knows the others.
 
-        The argument ``vehicles`` must contain latencies that do not include delays of a channel; these latencies become
-        ``own_latency_s`` of the result.
-
-        Args:
-            vehicles: parameters of the vehicles in n worlds.
-            u: uniform numbers in [0, 1) that draw the random values of all links, [n, N * N * PER_LINK].
-            equipped: V2X equipment, one row per world or one row for all worlds.
-
+        The latencies in the argument ``vehicles`` must not include delays of a channel; they become ``own_latency_s``
+        of the result.
         """
         (N, channel), (heard, seen) = (vehicles.latency_s.shape[1], self.channel), self.heard_and_seen(u, equipped)
         latency = vehicles.latency_s.copy()
@@ -390,13 +379,7 @@ class V2X(FileModel):
     def heard_and_seen(self, u: Floats, equipped: Equipped) -> tuple[Floats, Floats]:
         """Return (heard, seen): time from which vehicle i can use the first message of j, and delay until i sees j.
 
-        Here i and j are vehicles; ``heard`` and ``seen`` have the shape [n, N, N] (world, i, j) and the unit s.
-        Infinite means never.
-
-        Args:
-            u: uniform numbers in [0, 1) that draw the random values of all links, [n, N * N * PER_LINK].
-            equipped: V2X equipment, one row per world or one row for all worlds.
-
+        Both arrays have the shape [n, N, N] (world, i, j) and the unit s. Infinite means never.
         """
         N = equipped.sends.shape[1]
         channel, links = self.channel, u.reshape(len(u), N, N, PER_LINK)
@@ -413,14 +396,8 @@ class V2X(FileModel):
     def with_channel(self, worlds: Worlds, u: Floats, key: Floats, time_step_s: float, equipped: Equipped) -> Worlds:
         """Return ``worlds`` with the times from which each vehicle knows every other, and with the periodic messages.
 
-        Args:
-            worlds: worlds at the alert (time 0) that do not yet contain delays or messages of a channel.
-            u: uniform numbers in [0, 1) that draw the random values of all links, [n, N * N * PER_LINK].
-            key: number in [0, 1) for each world, [n], from which the random losses of all messages after the first one
-                are computed.
-            time_step_s: time between two decisions (s); vehicles sample their states at each decision.
-            equipped: V2X equipment, one row per world or one row for all worlds.
-
+        ``worlds`` are at the alert and do not yet contain delays or messages of a channel. The random losses of all
+        messages after the first one are computed from ``key``, which has a number in [0, 1) for each world, [n].
         """
         channel, contents = self.channel, self.channel.contents(worlds.N)
         worlds = replace(worlds, vehicles=self.with_news(worlds.vehicles, u, equipped))
@@ -438,13 +415,8 @@ class V2X(FileModel):
     def with_fixed_news(self, worlds: Worlds, time_step_s: float, where: str, equipped: Equipped | None) -> Worlds:
         """Return the user's ``worlds`` with this channel's data added; raise ``InvalidInput`` if the channel is random.
 
-        Args:
-            worlds: worlds that do not yet contain delays or messages of a channel.
-            time_step_s: time between two decisions (s).
-            where: beginning of the error message, which says where the user gave the worlds.
-            equipped: V2X equipment of the vehicles, in one row for all worlds; None if the equipment differs randomly
-                between worlds.
-
+        ``worlds`` do not yet contain delays or messages of a channel. ``equipped`` is None if the equipment differs
+        randomly between worlds. The error message begins with ``where``, which says where the user gave the worlds.
         """
         if not self.by_link:
             return worlds
@@ -459,17 +431,11 @@ class V2X(FileModel):
 
 
 def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
-    """Return the number k of message periods that a burst of losses lasts, in the shape of ``u``.
+    """Return the number k of message periods that a burst of losses lasts, in the shape of ``u`` (any shape).
 
-    For m = 1, 2, ..., the result k is at least m exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``. This rule is the
-    inverse of the distribution function of k in the stationary Gilbert-Elliott channel. The number k is
-    computed without logarithms, so every machine gets the same k.
-
-    Args:
-        u: uniform numbers in [0, 1); from each of them one number k is computed.
-        loss_begins: probability p per message period that a burst of losses begins.
-        loss_ends: probability r that an ongoing burst of losses ends in one message period.
-
+    For m = 1, 2, ..., the result k is at least m exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``, where p is
+    ``loss_begins`` and r is ``loss_ends``. This rule is the inverse of the distribution function of k in the stationary
+    Gilbert-Elliott channel. The number k is computed without logarithms, so every machine gets the same k.
     """
     bound = loss_begins / (loss_begins + loss_ends)
     bounds = []
@@ -482,14 +448,10 @@ def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
 
 
 def link_delays(channel: Channel, u: Floats) -> Floats:
-    """Return the delay tau of the first message on each link in s, [...]; infinite if no message arrives.
+    """Return the delay tau of the first message on each link in s, [...], for uniform numbers ``u``, [..., PER_LINK].
 
-    With the timing ``latency`` the delay is minus infinity: a vehicle knows everything after its own latency.
-
-    Args:
-        channel: settings of the V2X channel.
-        u: uniform numbers in [0, 1) for each link, [..., PER_LINK].
-
+    The delay is infinite if no message arrives. With the timing ``latency`` the delay is minus infinity: a vehicle
+    knows everything after its own latency.
     """
     delay = np.full(u.shape[:-1], -np.inf if channel.timing == "latency" else channel.link_latency_s)
     if channel.timing == "messages":

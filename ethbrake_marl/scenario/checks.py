@@ -24,7 +24,7 @@ MOST_SAMPLES = 1_000  # largest number of samples that a vehicle may have to sto
 
 
 def check_whole(scenario: ScenarioFields) -> None:
-    """Check the fields of a scenario that depend on each other; raise a pydantic error for the first mistake.
+    """Check the fields of a scenario that depend on each other.
 
     The checks concern time step, horizon, latencies, channel, speeds, gaps, obstacle, scripts, and quantities that are
     declared twice.

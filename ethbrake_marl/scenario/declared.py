@@ -39,7 +39,7 @@ from ethbrake_marl.scenario.vehicle_types import (
 
 
 class ScenarioFields(FileModel):
-    """The fields of a scenario file, their checks, and properties derived from them. Base class of ``Scenario``."""
+    """The fields of a scenario file; base class of ``Scenario``."""
 
     name: str = Field(pattern=NAME_PATTERN, description="name of the scenario: the file's name without .yaml")
     title: str = Field(default="", description="one-line title for lists and figures")
@@ -168,7 +168,7 @@ class ScenarioFields(FileModel):
     )
     @classmethod
     def _given(cls, value: Any) -> Any:
-        """Raise an error for ``null`` as the value of a quantity; the key must be left out instead."""
+        """Raise an error for ``null`` as the value of a quantity."""
         require(value is not None, (), value, LEAVE_OUT)
         return value
 
@@ -177,8 +177,8 @@ class ScenarioFields(FileModel):
     def _needed(cls, value: Any, info: ValidationInfo) -> Any:
         """Raise an error if a quantity has neither a value nor a default.
 
-        The scenario needs no value of a quantity if every vehicle type, or the table, declares the quantity, or if the
-        scenario is a mixture.
+        The value may be missing if every vehicle type, or the table, declares the quantity, or if the scenario is a
+        mixture.
         """
         key, data = str(info.field_name), info.data
         kinds = data.get("vehicle_types")
@@ -243,9 +243,7 @@ class ScenarioFields(FileModel):
     @field_validator(*QUANTITY.declared)
     @classmethod
     def _entries(cls, value: Any, info: ValidationInfo) -> Any:
-        """Check that all possible values of a quantity are in range, and that a list has one value per vehicle or
-        pair.
-        """
+        """Check that all values of a quantity are in range, and that a list has one value per vehicle or pair."""
         rule, vehicles = QUANTITY.declared[str(info.field_name)], info.data.get("vehicles")
         if value is None:
             return value
@@ -306,7 +304,7 @@ class ScenarioFields(FileModel):
 
     @property
     def members(self) -> tuple[ScenarioFields, ...]:
-        """The scenarios of a mixture; an empty tuple for a scenario that is not a mixture."""
+        """The scenarios of a mixture; empty for a scenario that is not a mixture."""
         return self._members
 
     @cached_property
@@ -321,14 +319,14 @@ class ScenarioFields(FileModel):
 
     @property
     def scripts(self) -> dict[int, str]:
-        """Scripts of the vehicles that do not learn: index of the vehicle (from 0) -> name of its script."""
+        """Index of each vehicle that does not learn (from 0) -> name of its script."""
         roles = [self.roles[name] for name in self.vehicle_names]
         return {i: role for i, role in enumerate(roles) if role != LEARNER}
 
     def play_pieces(self, worlds: Worlds, driven: Sequence[int] = ()) -> Worlds:
         """Return ``worlds`` with the accelerations over time of each vehicle that follows a ``profile`` script.
 
-        ``driven``: indices (from 0) of controlled vehicles, which follow no script.
+        The controlled vehicles ``driven`` (indices from 0) follow no script.
         """
         return worlds.play_pieces({i: ScriptSpec.parse(s).pieces for i, s in self.scripts.items() if i not in driven})
 
@@ -353,8 +351,8 @@ class ScenarioFields(FileModel):
     def declares(self, field: str) -> bool:
         """Return whether the scenario declares the quantity ``field``, for example ``"mass_t"``.
 
-        A quantity may be declared by its key in the scenario, by its key in a vehicle type, or by columns of the table
-        for all vehicles.
+        A quantity may be declared by its key in the scenario or in a vehicle type, or by columns of the table for all
+        vehicles.
         """
         kinds = (self.vehicle_types or {}).values() if field in QUANTITY.of_a_type else ()
         return (
@@ -377,7 +375,7 @@ class ScenarioFields(FileModel):
     def by_link(self) -> bool:
         """Whether ``v2x`` differs from the paper's rule (a vehicle knows everything once its own latency has elapsed).
 
-        For a mixture: whether ``v2x`` differs from the paper's rule in at least one of the scenarios.
+        For a mixture: in at least one of its scenarios.
         """
         return any(member.by_link for member in self.members) or self.v2x.by_link
 
@@ -389,8 +387,8 @@ class ScenarioFields(FileModel):
     def equipped(self, types: Ints | None = None) -> Equipped:
         """Return the V2X equipment of vehicles with the types ``types`` (indices of vehicle types, [n, N]).
 
-        If ``types`` is None, the result has one row, [1, N]: for each vehicle the least equipment among all its
-        possible types.
+        If ``types`` is None, the result has one row, [1, N]: the least equipment among all possible types of each
+        vehicle.
         """
         line, each = self.types_of_line, []
         own = self.v2x.vehicles or {}
@@ -410,10 +408,9 @@ class ScenarioFields(FileModel):
     def possible_quantities(self, field: str) -> tuple[dict[int, AnyTypeQuantity], ...]:
         """Return for each vehicle, pair or world a mapping from vehicle type to the declaration of the quantity.
 
-        An example is ``({0: 2.0, 1: 9.5}, ...)`` for ``mass_t``. The keys of a mapping are the indices of the vehicle's
-        possible types; without vehicle types the only key is 0. If a vehicle type does not declare the quantity, the
-        mapping has the scenario's declaration outside ``vehicle_types`` for this type. Raises the same errors as the
-        method ``quantities``.
+        An example is ``({0: 2.0, 1: 9.5}, ...)`` for ``mass_t``. The keys are the indices of the vehicle's possible
+        types; without vehicle types the only key is 0. If a type does not declare the quantity, the scenario's
+        declaration outside ``vehicle_types`` applies to it. Raises the same errors as ``quantities``.
         """
         line = self.types_of_line
         if line is None or field not in QUANTITY.of_a_type:
@@ -462,10 +459,8 @@ class ScenarioFields(FileModel):
     def bounds(self, field: str, *, dry: bool = False) -> tuple[tuple[float, float], ...]:
         """Return (smallest, largest) possible value of a declared or derived quantity for each vehicle, pair or world.
 
-        Args:
-            field: key of a quantity that every world has: ``gaps_m``, ``speeds_mps``, ``mass_t``, ...
-            dry: True: do not limit braking and driving capacities by the friction of the road.
-
+        ``field`` is the key of a quantity that every world has, such as ``gaps_m``. With ``dry``, the friction of the
+        road does not limit the braking and driving capacities.
         """
         bounds = [world_quantities(member, _supports_of(member)) for member in self.members or (self,)]
         at_once = np.full((2, self.vehicles), QUANTITY.declared[field].high)  # for members that declare no brake rate
@@ -488,12 +483,8 @@ def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]
 
     Derived quantities are ``speed = line speed + own deviation``, ``gap = time gap x speed of the pair's rear vehicle``
     and ``latency = own latency + time of the alert``. Every derived quantity increases if a declared quantity
-    increases, so bounds of the declared quantities give bounds of the derived quantities.
-
-    Args:
-        scenario: the scenario that declares the quantities.
-        declared: function that maps a key such as ``"time_gaps_s"`` to its values in the k worlds, [k, entries].
-
+    increases, so bounds of the declared quantities give bounds of the derived quantities. The function ``declared``
+    maps a key such as ``"time_gaps_s"`` to its values in the k worlds, [k, entries].
     """
     other = {"gaps_m": scenario.time_gaps_s, "speeds_mps": scenario.line_speed_mps}
     quantities = {key: declared(key) for key in QUANTITY.usual if other.get(key) is None}
@@ -510,10 +501,9 @@ def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]
 
 
 def on_road(found: Mapping[str, Floats]) -> dict[str, Floats]:
-    """Return the quantities ``found``, with all braking and driving capacities limited to friction times gravity.
+    """Return the quantities ``found`` with all braking and driving capacities limited to friction times gravity.
 
-    ``found`` maps keys such as ``"friction"`` and ``"braking_capacity_mps2"`` to values, [k, entries]. If ``found`` has
-    no key ``"friction"``, the capacities are not limited.
+    ``found`` maps keys to values, [k, entries]. Without the key ``"friction"``, the capacities are not limited.
     """
     return as_road_allows(found, found["friction"]) if "friction" in found else dict(found)
 
@@ -523,15 +513,12 @@ def obstacle_gap(
 ) -> Floats | None:
     """Return the distance from Vehicle 1 to the obstacle ahead in k worlds, [k] m; None without an obstacle.
 
-    A scenario declares either the distance to the obstacle, or a margin: the distance between the obstacle and the
-    point where Vehicle 1 stops by full braking. If a margin is declared, ``distance = margin + v_1 tau_1 + v_1^2 / (2
-    a_1)``. Vehicle 1 has the speed v_1, the latency tau_1 and the braking capacity a_1, and its brakes act at once.
+    A scenario declares either this distance, or a margin: the distance between the obstacle and the point where Vehicle
+    1 stops by full braking. If a margin is declared, ``distance = margin + v_1 tau_1 + v_1^2 / (2 a_1)``. Vehicle 1 has
+    the speed v_1, the latency tau_1 and the braking capacity a_1, and its brakes act at once.
 
-    Args:
-        scenario: the scenario that declares the obstacle.
-        found: all quantities of the k worlds except the distance to the obstacle: key -> values, [k, entries].
-        declared: function that maps ``"obstacle_gap_m"`` or ``"obstacle_margin_m"`` to its value in each world, [k].
-
+    ``found`` has all other quantities of the k worlds: key -> values, [k, entries]. The function ``declared`` maps
+    ``"obstacle_gap_m"`` or ``"obstacle_margin_m"`` to its value in each world, [k].
     """
     if scenario.declares("obstacle_gap_m"):
         return declared("obstacle_gap_m")
@@ -548,7 +535,7 @@ def _supports_of(scenario: ScenarioFields) -> Callable[[str], Floats]:
 
 
 def undeclared_by_type(key: str, kind: object) -> str:
-    """Return the error message for a quantity ``key`` that the vehicle type named ``kind`` does not declare."""
+    """Return the error message for a quantity ``key`` that the vehicle type ``kind`` does not declare."""
     return (
         f"vehicle type {kind} does not declare {key}; declare {key} in this type, or outside vehicle_types for all"
         " types without it"

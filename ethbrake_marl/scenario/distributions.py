@@ -1,7 +1,8 @@
 """Quantities of a scenario: a quantity is a fixed number or a distribution.
 
 Every distribution turns one uniform number ``u`` in [0, 1) into a value, by its inverse cumulative distribution
-function.
+function. The method ``value`` takes an array of such numbers and returns values in the same shape. The property
+``support`` is the smallest and largest value that can be drawn.
 """
 
 from __future__ import annotations
@@ -37,8 +38,7 @@ Numbers = Annotated[tuple[Number, ...], Field(strict=False, min_length=1)]
 class _Distribution(FileModel):
     """Base class of the distributions that a quantity in a scenario file may have, such as ``Uniform``.
 
-    A subclass declares its parameters as fields. A subclass also defines the property ``support``, the smallest and
-    largest possible value, and the method ``value(u)``, which turns uniform numbers ``u`` in [0, 1) into values.
+    A subclass declares its parameters as fields, and defines ``support`` and ``value``.
     """
 
 
@@ -54,11 +54,10 @@ class Uniform(_Distribution):
 
     @property
     def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
         return self.uniform
 
     def value(self, u: Floats) -> Floats:
-        """Turn uniform ``u`` in [0, 1) into values of this distribution, in the same shape: ``low + (high - low) u``.
+        """Return ``low + (high - low) u``.
 
         No value is above high. Because u is at most 1 - 2^-53, the rounded product (high - low) u is below the rounded
         difference high - low.
@@ -84,11 +83,10 @@ class LogUniform(_Distribution):
 
     @property
     def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
         return self.loguniform
 
     def value(self, u: Floats) -> Floats:
-        """Turn uniform ``u`` in [0, 1) into values of this distribution, in the same shape: ``low (high / low)^u``."""
+        """Return ``low (high / low)^u``."""
         low, high = self.loguniform
         return np.clip(low * exp_each((u * log(high / low)).ravel()).reshape(u.shape), low, high)
 
@@ -117,24 +115,20 @@ class Normal(_Distribution):
         return self
 
     def _bounds(self) -> tuple[float, float]:
-        """Return the probabilities that a value of the untruncated distribution is below ``low``, and below
-        ``high``.
-        """
+        """Return the probabilities that a value before truncation is below ``low``, and below ``high``."""
         shape = self.normal
         low, high = (normal_probability((end - shape.mean) / shape.sd) for end in (shape.low, shape.high))
         return low, high
 
     @property
     def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
         return self.normal.low, self.normal.high
 
     def value(self, u: Floats) -> Floats:
-        """Turn uniform ``u`` in [0, 1) into values of this distribution, in the same shape.
+        """Return ``mean + sd Q(p_low + (p_high - p_low) u)``, where Q is the quantile function of the standard normal
+        distribution.
 
-        A value is ``mean + sd Q(p_low + (p_high - p_low) u)``, where Q is the quantile function of the standard normal
-        distribution. The numbers p_low and p_high are the probabilities that a value of the untruncated normal
-        distribution is below ``low``, and below ``high``.
+        The numbers p_low and p_high are the two probabilities that ``_bounds`` returns.
         """
         shape = self.normal
         below, above = self._bounds()
@@ -172,14 +166,10 @@ class LogNormal(_Distribution):
 
     @property
     def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
         return self.lognormal.low, self.lognormal.high
 
     def value(self, u: Floats) -> Floats:
-        """Turn uniform ``u`` in [0, 1) into values of this distribution, in the same shape.
-
-        A value is ``exp(x)``, where x has a normal distribution truncated to [log(low), log(high)].
-        """
+        """Return ``exp(x)``, where x has a normal distribution truncated to [log(low), log(high)]."""
         drawn = exp_each(self._of_logarithm.value(u).ravel()).reshape(u.shape)
         return np.clip(drawn, *self.support)
 
@@ -201,15 +191,10 @@ class Choice(_Distribution):
 
     @property
     def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
         return min(self.choice), max(self.choice)
 
     def value(self, u: Floats) -> Floats:
-        """Turn uniform ``u`` in [0, 1) into values of this distribution, in the same shape.
-
-        The value for ``u`` is the first entry of ``choice`` whose cumulative weight, normalised to a total of 1, is
-        above ``u``.
-        """
+        """Return the first entry of ``choice`` whose cumulative weight, normalised to a total of 1, is above ``u``."""
         cumulative = np.cumsum(np.asarray(self.weights or (1.0,) * len(self.choice)))
         cumulative /= cumulative[-1]
         return np.asarray(self.choice)[np.searchsorted(cumulative, u, side="right")]
@@ -228,7 +213,6 @@ class TableColumn:
 
     @property
     def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
         return float(self.rows.min()), float(self.rows.max())
 
     @property
@@ -239,10 +223,7 @@ class TableColumn:
         return replace(self, rows=self.rows[order][[np.searchsorted(shares, 0.5)]], cumulative=np.ones(1))
 
     def value(self, u: Floats) -> NDArray[Any]:
-        """Turn uniform ``u`` in [0, 1) into values of this distribution, in the same shape.
-
-        The value for ``u`` stands in the first row whose cumulative weight, normalised to a total of 1, is above ``u``.
-        """
+        """Return the entry of the first row whose cumulative weight, normalised to a total of 1, is above ``u``."""
         return self.rows[np.searchsorted(self.cumulative, u, side="right")]
 
 
@@ -292,15 +273,13 @@ class WithLoad(_Distribution):
 
     @property
     def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
         low, high = support(self.spread)
         return min(self.with_load) + low, max(self.with_load) + high
 
     def value(self, load: Floats, u: Floats) -> Floats:
         """Return ``empty + (full - empty) load``, plus the value of the distribution ``spread`` for ``u``.
 
-        The array ``load`` (loads in [0, 1]), the array ``u`` (uniform numbers in [0, 1)) and the result have the same
-        shape.
+        The loads are in [0, 1]; ``load`` and ``u`` have the same shape.
         """
         empty, full = self.with_load
         moved = np.clip(empty + (full - empty) * load, min(self.with_load), max(self.with_load))
@@ -313,7 +292,7 @@ AnyTypeQuantity = AnyQuantity | WithLoad
 
 
 def support(quantity: AnyTypeQuantity) -> tuple[float, float]:
-    """Return the smallest and the largest value that ``quantity``, a number or distribution, can have."""
+    """Return the smallest and the largest value that ``quantity`` can have."""
     return (quantity, quantity) if isinstance(quantity, float) else quantity.support
 
 

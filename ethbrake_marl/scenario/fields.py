@@ -58,7 +58,7 @@ class QuantityRule:
 
     @property
     def symbol(self) -> str:
-        """Symbol of the unit, for example ``m/s2``; an empty text for a plain number."""
+        """Symbol of the unit, for example ``m/s2``; empty for a plain number."""
         return {"mps": "m/s", "mps2": "m/s2", "mps3": "m/s3"}.get(self.unit, self.unit)
 
     @property
@@ -83,9 +83,7 @@ class QuantityRule:
         return {"vehicle": vehicles, "pair": vehicles - 1, "world": 1}[self.per]
 
     def place(self, index: int) -> Place:
-        """Return which random number draws the value of vehicle or pair ``index`` (from 0): (stream, column of the
-        stream).
-        """
+        """Return which random number draws the value of vehicle or pair ``index`` (from 0): (stream, column)."""
         return self.stream, BLOCK * (self.block + index) + self.slot
 
     def column_of(self, index: int) -> str:
@@ -95,7 +93,7 @@ class QuantityRule:
     def owner(self, index: int) -> str:
         """Return the name of vehicle or pair ``index`` (from 0): ``vehicle_1``, or ``vehicle_1 to vehicle_2``.
 
-        The returned name is empty for a quantity with one value per world.
+        The name is empty for a quantity with one value per world.
         """
         front = f"vehicle_{index + 1}"
         return {"vehicle": front, "pair": f"{front} to vehicle_{index + 2}", "world": ""}[self.per]
@@ -103,8 +101,8 @@ class QuantityRule:
     def of(self, worlds: Worlds) -> Floats:
         """Return the values of this quantity in ``worlds``, [n, entries]: one entry per vehicle, pair or world.
 
-        If every world has a friction, the returned capacities are the declared ones, not limited by the friction. The
-        distance to the obstacle is NaN in a world without an obstacle.
+        If every world has a friction, capacities are the declared ones, not limited by the friction. The distance to
+        the obstacle is NaN in a world without an obstacle.
         """
         of_vehicles = hasattr(worlds.vehicles, self.name)
         values: Floats = getattr(worlds.vehicles if of_vehicles else worlds, self.name)
@@ -271,12 +269,7 @@ Entry = tuple[str, int]  # quantity and index (from 0) of the vehicle or pair
 def columns_of_table(rules: Mapping[str, QuantityRule], vehicles: int) -> dict[str, Entry]:
     """Return the columns of a table of the quantities ``rules``: name -> (key of quantity, index of vehicle or pair).
 
-    An example is ``{"gap_1_m": ("gaps_m", 0), ...}``.
-
-    Args:
-        rules: ``QuantityRule`` of each quantity, by key.
-        vehicles: number of vehicles in the line.
-
+    An example is ``{"gap_1_m": ("gaps_m", 0), ...}``. ``vehicles`` is the number of vehicles in the line.
     """
     named = {key: rule for key, rule in rules.items() if rule.column}
     return {rule.column_of(i): (key, i) for key, rule in named.items() for i in range(rule.count(vehicles))}
@@ -285,8 +278,7 @@ def columns_of_table(rules: Mapping[str, QuantityRule], vehicles: int) -> dict[s
 def is_tabled(data: Mapping[str, Any], key: str) -> bool:
     """Return whether a scenario's table has columns of the quantity ``key`` for every vehicle, pair or world.
 
-    ``data``: scenario fields that have been checked already: name of the field -> value; only ``table`` and
-    ``vehicles`` are used.
+    ``data`` has the scenario fields that have been checked already; only ``table`` and ``vehicles`` are used.
     """
     table, rule = data.get("table"), QUANTITY.declared[key]
     if table is None or "vehicles" not in data or not rule.column:

@@ -31,15 +31,10 @@ class Follower(FileModel):
 def with_follower(document: Document, build: Callable[[Document], Any]) -> Document:
     """Return the document with the follower as one more vehicle of the line, and without the key ``follower``.
 
-    In the returned document, the table and all lists also have entries for the follower. If the follower is invalid,
-    the document is returned unchanged, and the schema rejects the document later. Raises ``InvalidInput`` if the line
-    of vehicles is invalid, if vehicle types are declared, or if the speed of the last vehicle is random and not a
-    column of the table.
-
-    Args:
-        document: parsed file with a key ``follower``.
-        build: function that builds a scenario from a document (the parsed content of a file).
-
+    The table and all lists also get entries for the follower. ``build`` builds a scenario from a document (the parsed
+    content of a file). If the follower is invalid, the document is returned unchanged, and the schema rejects the
+    document later. Raises ``InvalidInput`` if the line of vehicles is invalid, if vehicle types are declared, or if the
+    speed of the last vehicle is random and not a column of the table.
     """
     content, where = dict(document.content), f"{document.where(('follower',))}: follower"
     try:

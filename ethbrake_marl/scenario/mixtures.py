@@ -40,16 +40,12 @@ def build_members(
 ) -> tuple[Document, tuple[AnyScenario, ...]]:
     """Build the scenarios listed under the key ``mixture``; return the completed document and these scenarios.
 
-    Keys that stand beside ``mixture`` in the file replace the same keys in every listed scenario. If all scenarios have
-    the same value of a setting such as ``vehicles`` or ``v2x``, this value is added to the document. If the list under
-    ``mixture`` is invalid, the function returns the unchanged document and no scenarios, and the schema rejects the
-    document later. Raises ``InvalidInput`` if one of the scenarios is invalid, or if the scenarios have different
-    values for a key that they must share; the message names the scenario or the key.
-
-    Args:
-        document: parsed file with a key ``mixture``.
-        build: function that builds one scenario from a document (the parsed content of a file).
-
+    ``build`` builds one scenario from a document (the parsed content of a file). Keys that stand beside ``mixture`` in
+    the file replace the same keys in every listed scenario. If all scenarios have the same value of a setting such as
+    ``vehicles`` or ``v2x``, this value is added to the document. If the list under ``mixture`` is invalid, the function
+    returns the unchanged document and no scenarios, and the schema rejects the document later. Raises ``InvalidInput``
+    if one of the scenarios is invalid, or if the scenarios have different values for a key that they must share; the
+    message names the scenario or the key.
     """
     listed, content = document.content["mixture"], document.content
     if not (isinstance(listed, list | tuple) and listed and all(_is_whole(entry) for entry in listed)):
@@ -81,14 +77,10 @@ def member_content(member: ScenarioFields) -> dict[str, Any]:
 
 
 def _member_document(document: Document, i: int, entry: Mapping[str, Any], beside: Mapping[str, Any]) -> Document:
-    """Return one scenario of a mixture as a document, without title, description and source.
+    """Return scenario ``i`` (from 0) of a mixture as a document, without title, description and source.
 
-    Args:
-        document: parsed file of the mixture.
-        i: position of the scenario in the list ``mixture``, from 0.
-        entry: content of this entry of the list ``mixture``.
-        beside: keys and values that stand beside ``mixture`` in the file; they replace the same keys of the scenario.
-
+    ``entry`` is the scenario's entry in the list ``mixture``. The keys in ``beside``, which stand beside ``mixture`` in
+    the file, replace the same keys of the scenario.
     """
     own = {key: value for key, value in entry["scenario"].items() if key not in WORDS}
     inside = {path[3:]: line for path, line in document.lines.items() if path[:3] == ("mixture", i, "scenario")}
@@ -102,8 +94,7 @@ def _check_members(document: Document, members: Sequence[ScenarioFields]) -> Non
     """Raise ``InvalidInput`` if the scenarios ``members`` of a mixture cannot be drawn together.
 
     No scenario of a mixture may itself be a mixture, the names of the scenarios must differ, and all scenarios must
-    have the same number of vehicles, time step, horizon, roles, objective and observation. ``document``: the mixture's
-    file, for error messages.
+    have the same number of vehicles, time step, horizon, roles, objective and observation.
     """
     where = f"{document.where(('mixture',))}: mixture"
     first = members[0]

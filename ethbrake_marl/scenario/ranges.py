@@ -39,12 +39,9 @@ class Ranges:
     def sample(self, points: Floats) -> tuple[Sample, Bools]:
         """Return the worlds at ``points`` of the unit cube, and whether the scenario accepts each world, [n].
 
-        A world is not accepted if the scenario says ``early_impacts: reject`` and an impact happens in this world
-        before the first learner can act.
-
-        Args:
-            points: coordinates of n points in [0, 1), in the order of ``names``, [n, coordinates].
-
+        The coordinates of the points, [n, coordinates], are in [0, 1) and in the order of ``names``. A world is not
+        accepted if the scenario says ``early_impacts: reject`` and an impact happens in this world before the first
+        learner can act.
         """
         n, vehicles = len(points), self.scenario.vehicles
         widths = {(): BLOCK * vehicles, TYPES: PER_TYPE * vehicles, OBSTACLE: OF_WORLD, SURROUNDINGS: OF_WORLD}
@@ -110,8 +107,8 @@ def _name(key: str, index: int) -> str:
 def ranges(scenario: ScenarioFields) -> Ranges:
     """Return the coordinates of the scenario's unit cube, one for every random number of a world.
 
-    Raises ``InvalidInput`` if the scenario has nothing random, if it is a mixture, or if its channel is not ``paper``.
-    In a mixture, or with a channel other than ``paper``, a point of the unit cube would not determine a world.
+    Raises ``InvalidInput`` if the scenario has nothing random. Also raises ``InvalidInput`` for a mixture, or a channel
+    other than ``paper``, because then a point of the unit cube would not determine a world.
     """
     if scenario.members:
         members = ", ".join(member.name for member in scenario.members)

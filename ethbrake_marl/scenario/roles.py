@@ -41,9 +41,8 @@ class ScriptSpec(NamedTuple):
     def parse(spec: str) -> ScriptSpec:
         """Parse ``spec``, a text ``name[:argument]``.
 
-        Raises ``InvalidInput`` unless the name matches ``[a-z][a-z0-9_@.-]*`` and the argument has no spaces.
-        ``InvalidInput`` is also raised if ``spec`` names a Python file, because loading somebody else's
-        scenario must not run code.
+        Raises ``InvalidInput`` unless the name matches ``[a-z][a-z0-9_@.-]*`` and the argument has no spaces, and if
+        ``spec`` names a Python file, because loading somebody else's scenario must not run code.
         """
         match = _SPEC.fullmatch(spec) if isinstance(spec, str) else None
         if match is None:
@@ -109,11 +108,10 @@ class ScriptSpec(NamedTuple):
     ) -> Floats | None:
         """Return the command (m/s2, negative for braking) of a script that does not need the state.
 
-        The returned command has the shape of ``braking_capacity_mps2``. The command is minus the braking capacity for
-        ``full_brake``, 0 for ``coast``, -a for ``constant:a``, the first command for a ``profile``, and None for any
-        other script. Raises ``InvalidInput`` if a deceleration exceeds the braking capacity of a vehicle, or if a
-        forward acceleration exceeds the driving capacity of a vehicle (checked only if ``driving_capacity_mps2`` is
-        given).
+        The command has the shape of ``braking_capacity_mps2``. It is minus the braking capacity for ``full_brake``, 0
+        for ``coast``, -a for ``constant:a``, the first command for a ``profile``, and None for any other script. Raises
+        ``InvalidInput`` if a deceleration exceeds the braking capacity of a vehicle, or a forward acceleration its
+        driving capacity (checked only if ``driving_capacity_mps2`` is given).
         """
         capacity = np.asarray(braking_capacity_mps2, dtype=np.float64)
         if not self.is_state_free():
@@ -136,7 +134,7 @@ class ScriptSpec(NamedTuple):
 def checked_pieces(given: object) -> tuple[tuple[float, float], ...]:
     """Return the intervals of a ``profile``, ((start in s, deceleration in m/s2), ...), or raise ``InvalidInput``.
 
-    ``given``: unchecked value from a file; it should be a list ``[[start, deceleration], ...]``.
+    The unchecked value ``given`` comes from a file; it should be a list ``[[start, deceleration], ...]``.
     """
     right = (
         f"a profile must be a list of 1 to {MOST_PIECES} pairs [start in s after the latency, deceleration in m/s2],"
@@ -220,7 +218,7 @@ class Roles(dict[str, str]):
 
     @staticmethod
     def complete(given: Mapping[str, str] | None, vehicles: int) -> Roles:
-        """Return the role of each of ``vehicles`` vehicles: ``learner`` or the name of a script.
+        """Return the role of each of ``vehicles`` vehicles.
 
         ``given`` maps names such as ``vehicle_2`` to roles; a vehicle without a role brakes fully. If ``given`` is
         None, vehicle_2 learns and all other vehicles brake fully.

@@ -26,11 +26,7 @@ def clusters_of(kinds: Mapping[str, _Texts], index: Ints) -> _Texts | None:
 
     Worlds of the same cluster are not statistically independent. A cluster contains all worlds from one recording, even
     if these worlds contain different vehicles. In a mixture, a world without a recording is a cluster of its own.
-
-    Args:
-        kinds: texts about each world, in the form of ``Sample.kinds``: name of the column -> texts, [n].
-        index: number of each world in its list, [n].
-
+    ``kinds`` has the form of ``Sample.kinds``, and ``index`` is the number of each world in its list, [n].
     """
     column = kinds.get(RECORDING)
     if column is None:
@@ -61,7 +57,7 @@ class Sample:
         return f"Sample({self.worlds!r}, {numbers}, {self.rejected:,} rejected)"
 
     def take(self, rows: ArrayLike) -> Sample:
-        """Return a sample of the worlds selected by ``rows`` (indices or a mask [n]), with ``rejected`` = 0."""
+        """Return a sample of the worlds ``rows`` (indices or a mask [n]), with ``rejected`` = 0."""
         some = np.asarray(rows)
         texts = (None if each is None else each[some] for each in (self.types, self.scenarios, self.recordings))
         return Sample(self.worlds.take(some), self.index[some], 0, *texts)
@@ -71,7 +67,7 @@ class Sample:
         """Join samples into one, in the order of their world numbers.
 
         Either all samples in ``parts`` have vehicle types, or no sample has; the same applies to scenarios and to
-        recordings. ``rejected``: number of rejected draws, which becomes ``Sample.rejected``.
+        recordings. ``rejected`` becomes ``Sample.rejected``.
         """
         index = np.concatenate([part.index for part in parts])
         order = np.argsort(index)
@@ -84,7 +80,7 @@ class Sample:
 
     @property
     def kinds(self) -> dict[str, _Texts]:
-        """Columns of text about the worlds: name (``scenario``, ``recording``, ``vehicle_1_type``, ...) -> texts, [n].
+        """Columns of text about the worlds: name -> texts, [n].
 
         The column ``scenario`` exists for a mixture, ``recording`` for a table that names recordings, and
         ``vehicle_1_type`` and so on for a scenario with vehicle types.
@@ -103,7 +99,7 @@ class Sample:
         """Return a text with the number of worlds for each scenario of a mixture and each vehicle type.
 
         An example is ``"; vehicle_1_type: car 7, truck 3"``. For the column ``recording``, the text contains only the
-        number of different recordings. The returned text is empty if the sample has no ``kinds``.
+        number of different recordings. The text is empty if the sample has no ``kinds``.
         """
         text = ""
         for kind, column in self.kinds.items():

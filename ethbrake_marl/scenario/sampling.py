@@ -1,4 +1,12 @@
-"""Draw worlds from a scenario. For a given seed, world k is the same, bit for bit, for any number of worlds."""
+"""Draw worlds from a scenario. For a given seed, world k is the same, bit for bit, for any number of worlds.
+
+Arguments that several functions share: ``seed`` names a list of worlds, a whole number of at least 0. ``channel`` is
+``"list"`` (worlds for evaluation) or ``"training"``; each seed has one list for evaluation and one list for training,
+and the two lists are independent. ``first`` is the number of the first world in the list, from 0, and ``n`` the number
+of worlds. ``index`` has the number of each world in its list, [n], ascending. ``numbers`` is a function (width, stream)
+that returns ``width`` uniform numbers in [0, 1) for each world, [n, width]. A stream is an independent sequence of
+random numbers, named by a tuple such as ``fields.TYPES``; ``()`` is the main stream.
+"""
 
 from __future__ import annotations
 
@@ -51,18 +59,9 @@ def sample(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, chann
     scenarios, chosen by weight, and equals world k of that scenario under the same seed, bit for bit. Results on a
     mixture can therefore be compared world by world with results on its scenarios.
 
-    Args:
-        scenario: the scenario to draw from.
-        n: number of worlds.
-        seed: seed of the list, a whole number of at least 0.
-        first: number of the first world in the list, from 0.
-        channel: ``"list"`` (worlds for evaluation) or ``"training"``. Each seed has one list for evaluation and one
-            list for training; the two lists are independent.
-
     Raises ``InvalidInput`` for a negative ``seed`` or ``first``, and for ``n < 1``. If the scenario rejects early
     impacts (impacts before the first learner can act), ``InvalidInput`` is also raised for a world that has an early
     impact in each of ``MOST_ATTEMPTS`` draws.
-
     """
     for name, value, least in (("number of worlds", n, 1), ("seed of the list", seed, 0), ("first world", first, 0)):
         check_whole_number(name, value, least)
@@ -94,7 +93,7 @@ def sample(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, chann
 def members_of(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Ints:
     """Return, for each world of a mixture, the index in ``scenario.members`` of the world's scenario, [n].
 
-    All returned indices are 0 if the scenario is not a mixture. The arguments have the same meaning as in ``sample``.
+    All indices are 0 if the scenario is not a mixture.
     """
     cumulative = np.cumsum([member.weight for member in scenario.mixture or ()] or [1.0])
     u = uniform_numbers(seed, channel, 0, first, n, OF_WORLD, of=MIXTURE)[:, 0]
@@ -111,13 +110,7 @@ def middle_world(scenario: ScenarioFields) -> Worlds:
 def sample_by(scenario: ScenarioFields, numbers: Callable[[int, tuple[int, ...]], Floats], index: Ints) -> Sample:
     """Return the worlds drawn with the random numbers that ``numbers`` returns; early impacts are not rejected.
 
-    Args:
-        scenario: the scenario to draw from; it must not be a mixture.
-        numbers: function (width, stream) that returns ``width`` uniform numbers in [0, 1) for each world, [n, width]. A
-            stream is an independent sequence of random numbers, named by a tuple such as ``fields.TYPES``; ``()`` is
-            the main stream.
-        index: number of each world in its list, [n]; becomes ``Sample.index``.
-
+    The scenario must not be a mixture. ``index`` becomes ``Sample.index``.
     """
     line, typed = scenario.types_of_line, None
     if line is not None:
@@ -148,13 +141,8 @@ def drawn_quantities(
 ) -> Callable[[str], Floats]:
     """Return a function: key of a declared quantity -> values of this quantity in n worlds, [n, entries].
 
-    A quantity has one entry per vehicle, per pair or per world; ``fields.QUANTITY`` says which.
-
-    Args:
-        scenario: the scenario that declares the quantities.
-        numbers: function that returns uniform numbers, as in ``sample_by``.
-        typed: type (index) and load of every vehicle, both [n, N]; None if the scenario has no vehicle types.
-
+    A quantity has one entry per vehicle, per pair or per world; ``fields.QUANTITY`` says which. ``typed`` has the type
+    (index) and load of every vehicle, both [n, N]; None if the scenario has no vehicle types.
     """
     streams: dict[tuple[int, ...], Floats] = {(): numbers(BLOCK * scenario.vehicles, ())}
 
@@ -187,18 +175,9 @@ def uniform_numbers(
     """Return uniform numbers in [0, 1) for worlds ``first`` to ``first + n - 1``, [n, width].
 
     Row k of the result depends only on ``seed``, ``channel``, ``attempt``, ``of``, ``width`` and the world number
-    ``first + k``. Each number is the upper 53 bits of a 64-bit integer from the Philox generator, divided by 2^53.
-
-    Args:
-        seed: seed of the list of worlds.
-        channel: ``"list"`` (worlds for evaluation) or ``"training"``.
-        attempt: number of the draw, from 0; a rejected world is drawn again with the next attempt number.
-        first: number of the first world in the list, from 0.
-        n: number of worlds.
-        width: number of uniform numbers for each world, a multiple of 4.
-        of: name of the stream (independent sequence of random numbers) to use, such as ``fields.V2X_NEWS``; ``()`` is
-            the main stream.
-
+    ``first + k``. Each number is the upper 53 bits of a 64-bit integer from the Philox generator, divided by 2^53. A
+    rejected world is drawn again with the next ``attempt`` number (from 0). ``width`` must be a multiple of 4. ``of``
+    names the stream.
     """
     sequence = np.random.SeedSequence([seed], spawn_key=(CHANNELS[channel], attempt, *of))
     key = sequence.generate_state(2, np.uint64)
@@ -209,10 +188,10 @@ def uniform_numbers(
 
 
 def _draw_numbers(scenario: ScenarioFields, index: Ints, seed: int, channel: Channel) -> Sample:
-    """Return the worlds whose numbers in the scenario's list are ``index`` (ascending, [n]).
+    """Return the worlds ``index`` of the scenario's list.
 
     Worlds in which an impact happens before the first learner can act are drawn again if the scenario says
-    ``early_impacts: reject``. ``seed`` and ``channel`` have the same meaning as in ``sample``.
+    ``early_impacts: reject``.
     """
     drawn = _draw(scenario, seed, channel, 0, index)
     if scenario.early_impacts == "keep" or not scenario.learners:
@@ -250,14 +229,7 @@ def early_impact(scenario: ScenarioFields, worlds: Worlds) -> Bools:
 def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, drawn: Sample, early: Bools) -> Sample:
     """Draw rejected worlds again, attempt by attempt, until all are accepted; return the complete sample.
 
-    Args:
-        scenario: the scenario to draw from.
-        seed: seed of the list of worlds.
-        channel: ``"list"`` (worlds for evaluation) or ``"training"``.
-        drawn: the sample of all worlds, as drawn in the first attempt.
-        early: mask [n]: True for each world in ``drawn`` that is rejected because of an early impact (an impact before
-            the first learner can act).
-
+    ``drawn`` has all worlds as drawn in the first attempt; ``early`` [n] is True for each rejected world.
     """
     parts, pending, rejected = [drawn.take(~early)], drawn.index[early], int(early.sum())
     for attempt in range(1, MOST_ATTEMPTS):
@@ -278,7 +250,7 @@ def _redraw_one(scenario: ScenarioFields, seed: int, channel: Channel, index: In
     """Raise ``InvalidInput`` if world number ``index`` [1] has an early impact in all remaining attempts to draw it.
 
     If no world of a scenario is acceptable, repeated draws of a single world show this sooner than draws of the whole
-    list. ``seed`` and ``channel`` have the same meaning as in ``sample``.
+    list.
     """
     for attempt in range(_PATIENCE, MOST_ATTEMPTS):
         if not early_impact(scenario, _draw(scenario, seed, channel, attempt, index).worlds)[0]:
@@ -296,10 +268,9 @@ def _unusable(scenario: ScenarioFields, world: int) -> InvalidInput:
 
 
 def _draw(scenario: ScenarioFields, seed: int, channel: Channel, attempt: int, index: Ints) -> Sample:
-    """Draw each world whose number is in ``index`` (ascending, [n]) once; do not reject any world for an early impact.
+    """Draw each of the worlds ``index`` once; do not reject any world for an early impact.
 
-    ``attempt``: number of earlier draws of these worlds; every attempt uses other random numbers. ``seed`` and
-    ``channel`` have the same meaning as in ``sample``.
+    ``attempt`` is the number of earlier draws of these worlds; every attempt uses other random numbers.
     """
     first, last = int(index[0]), int(index[-1])
 

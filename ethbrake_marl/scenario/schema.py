@@ -37,7 +37,7 @@ class ScenarioWording(Wording):
     def instead(self, key: str) -> str:
         """Return a hint for an unknown key that people often try: another word for friction, or the slope of the road.
 
-        For any other unknown key the hint is empty.
+        The hint is empty for any other key.
         """
         if "friction" in key or key == "mu":
             return "declare the friction of the road with the key friction, for instance friction: 0.5"
@@ -75,17 +75,16 @@ class ScenarioWording(Wording):
     def owner(self, path: YamlPath) -> str:
         """Return the vehicle or pair whose value is at ``path``, such as ``vehicle_2``; empty if there is none.
 
-        ``path``: keys and indices inside the file, for example ``("speeds_mps", 1)``.
+        An example of ``path`` is ``("speeds_mps", 1)``.
         """
         rule = QUANTITY.declared.get(str(path[0])) if len(path) > 1 else None
         return rule.owner(path[1]) if rule is not None and isinstance(path[1], int) else ""
 
     def right(self, detail: ErrorDetails) -> str:
-        """Return a text that says what would be valid instead of an invalid quantity or an invalid scenario of a
-        mixture.
+        """Return what would be valid instead of an invalid quantity or an invalid scenario of a mixture.
 
         For a misspelt distribution, the text contains a suggestion. For any other invalid value, the returned text is
-        empty. ``detail``: one mistake, as pydantic reports it.
+        empty. ``detail`` is one mistake, as pydantic reports it.
         """
         if detail["type"] == "quantity":
             return f"must be a number, {_DISTRIBUTION}{_misspelt(detail['input'])}"
@@ -106,11 +105,11 @@ def _misspelt(given: Any) -> str:
 class Scenario(ScenarioFields):
     """A line of vehicles, the distribution of each quantity, and the vehicles that learn.
 
-    A quantity is a number, ``{uniform: [low, high]}``, ``{loguniform: [low, high]}``, ``{normal: {mean, sd, low,
-    high}}``, ``{lognormal: {median, sigma, low, high}}`` or ``{choice: [...]}``. A single number or distribution
-    applies to every vehicle; from a distribution, each vehicle draws its own value. A list has one entry per vehicle,
-    or per pair for gaps. ``Scenario(...)``, ``load_scenario`` and ``replace`` raise ``InvalidInput`` for an invalid
-    value. The error message names the key and the invalid value, and says what would be valid.
+    A quantity is a number, ``{uniform: [low, high]}``, ``{loguniform: [low, high]}``,
+    ``{normal: {mean, sd, low, high}}``, ``{lognormal: {median, sigma, low, high}}`` or ``{choice: [...]}``. A single
+    number or distribution applies to every vehicle; from a distribution, each vehicle draws its own value. A list has
+    one entry per vehicle, or per pair for gaps. ``Scenario(...)``, ``load_scenario`` and ``replace`` raise
+    ``InvalidInput`` for an invalid value; the message names key and value, and says what would be valid.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random").replace(mass_t=[4.5, 5.5, 40.0])
@@ -118,7 +117,6 @@ class Scenario(ScenarioFields):
     ((4.5, 4.5), (5.5, 5.5), (40.0, 40.0))
     >>> scenario.with_learners(["vehicle_3"]).learners
     (2,)
-
     """
 
     def __init__(self, /, **data: Any) -> None:
@@ -157,9 +155,9 @@ class Scenario(ScenarioFields):
     def sample(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:
         """Return worlds ``first`` to ``first + n - 1`` of the endless list of worlds that belongs to ``seed``.
 
-        World k of the list is always the same, bit for bit. ``channel``: ``"list"`` (worlds for evaluation) or
-        ``"training"``; the two lists of worlds are independent. Raises ``InvalidInput`` for an invalid ``n``, ``seed``
-        or ``first``. See ``sampling.sample``.
+        World k of the list is always the same, bit for bit. ``channel`` selects one of two independent lists:
+        ``"list"`` (worlds for evaluation) or ``"training"``. Raises ``InvalidInput`` for an invalid ``n``, ``seed`` or
+        ``first``. See ``sampling.sample``.
         """
         return sample(self, n, seed, first=first, channel=channel)
 
@@ -190,7 +188,7 @@ class Scenario(ScenarioFields):
         return Scenario(**changed_content(self.declared(), changes))
 
     def with_learners(self, learners: Sequence[str | int]) -> Scenario:
-        """Return the scenario with exactly these learners, given by name (``vehicle_2``) or index (from 0).
+        """Return the scenario with exactly these learners, listed by name (``vehicle_2``) or index (from 0).
 
         A former learner that is not listed brakes fully; all scripts stay as they are. Raises ``InvalidInput`` for an
         unknown vehicle, or a vehicle that is listed twice.
@@ -250,14 +248,9 @@ def _reference(key: str) -> dict[str, Any]:
 
 
 def _range(key: str, low: float, high: float, positive: bool = False) -> dict[str, Any]:
-    """Return the JSON schema of a quantity; it allows only numbers in the given range, also in distributions and lists.
+    """Return the JSON schema of a quantity; its numbers, also in distributions and lists, must be in [low, high].
 
-    Args:
-        key: key of the quantity whose schema is returned.
-        low: smallest allowed value of the quantity.
-        high: largest allowed value of the quantity.
-        positive: True: the quantity must be above ``low``; False: it may also equal ``low``.
-
+    If ``positive`` is true, ``low`` itself is not allowed.
     """
     limits = {"exclusiveMinimum" if positive else "minimum": low, "maximum": high}
     above = {"exclusiveMinimum": 0}
@@ -286,7 +279,7 @@ def _build(scenario: Scenario, document: Document) -> None:
 def _plain(value: Any) -> Any:
     """Return ``value`` with numpy numbers and arrays converted to Python numbers and lists, also inside containers.
 
-    A ``Scenario`` is converted to a mapping with its content.
+    A ``Scenario`` becomes its declared values.
     """
     if isinstance(value, Scenario):
         return value.declared()

@@ -52,7 +52,7 @@ class _Naming:
 
 
 def _quantities(scenario: ScenarioFields) -> dict[str, QuantityRule]:
-    """Return the quantities that every world of this scenario has: key -> ``QuantityRule``."""
+    """Return the quantities that every world of this scenario has, by key."""
     there = {"obstacle_gap_m": scenario.has_obstacle, "friction": scenario.has_friction}
     return QUANTITY.usual | {
         key: rule for key, rule in QUANTITY.optional.items() if there.get(key, scenario.declares(key))
@@ -62,13 +62,8 @@ def _quantities(scenario: ScenarioFields) -> dict[str, QuantityRule]:
 def _worlds(given: Mapping[Entry, Floats], scenario: ScenarioFields, naming: _Naming) -> Worlds:
     """Build worlds from the columns ``given``; a quantity without a column has the scenario's value.
 
-    Raises ``InvalidInput`` for a value out of range, and for a random quantity without a column.
-
-    Args:
-        given: mapping from (key of the quantity, index of the vehicle or pair) to the values in the n worlds, [n].
-        scenario: the scenario that the worlds belong to.
-        naming: whether error messages name a value by column and row, or by key and index.
-
+    ``given`` maps (key of the quantity, index of the vehicle or pair) to the values in the n worlds, [n]. Raises
+    ``InvalidInput`` for a value out of range, and for a random quantity without a column.
     """
     if scenario.members:
         raise InvalidInput(
@@ -106,15 +101,9 @@ def _worlds(given: Mapping[Entry, Floats], scenario: ScenarioFields, naming: _Na
 def _fixed(scenario: ScenarioFields, field: str, index: int, full: Mapping[str, Floats]) -> Floats | None:
     """Return the scenario's fixed value of a quantity of one vehicle or pair, [n] or [1]; None if it is random.
 
-    If the scenario declares a time gap, the gap is computed from the speeds in ``full``. If the scenario declares a
-    margin to the obstacle, the distance to the obstacle is computed from the values of Vehicle 1 in ``full``.
-
-    Args:
-        scenario: the scenario that declares the quantity.
-        field: key of the quantity, such as ``"gaps_m"``.
-        index: index of the vehicle or pair, from 0.
-        full: quantities that are known already: key -> values in the n worlds, [n, entries].
-
+    A gap is computed from a declared time gap and the speeds in ``full``, and the distance to the obstacle from a
+    declared margin and the values of Vehicle 1 in ``full``. ``full`` has the quantities that are known already: key ->
+    values, [n, entries].
     """
     if field == "obstacle_gap_m":
         low, high = support(scenario.quantities(field if scenario.declares(field) else "obstacle_margin_m")[0])
@@ -141,13 +130,8 @@ def _check_together(full: Mapping[str, Floats], scenario: ScenarioFields, naming
 def _require_all(good: Bools, naming: _Naming, entry: Entry, column: Floats, right: str) -> None:
     """Raise ``InvalidInput`` for the first world in which ``good`` [n] is False.
 
-    Args:
-        good: mask [n]: True for each world in which the value is valid.
-        naming: whether error messages name a value by column and row, or by key and index.
-        entry: key of the quantity, and index of the vehicle or pair, to which the checked values belong.
-        column: the value of one quantity of one vehicle or pair in each world, [n].
-        right: what would be valid, for the error message.
-
+    ``column`` has the checked values, [n], and ``entry`` their quantity and vehicle or pair. ``right`` says what would
+    be valid.
     """
     if not good.all():
         row = int(np.argmin(good))
@@ -188,7 +172,7 @@ def _numbers(what: str, value: ArrayLike) -> Floats:
 
 
 def _read_csv(file: Path) -> tuple[list[str], list[list[str]], list[int]]:
-    """Return the header of a CSV file, its rows (at least one), and the line number at which each row begins.
+    """Return the header of a CSV file, its rows (at least one), and the line at which each row begins.
 
     The cells of the rows are unchecked texts.
     """
@@ -216,15 +200,8 @@ def _read_csv(file: Path) -> tuple[list[str], list[list[str]], list[int]]:
 def _cell_at(file: Path, header: list[str], row: list[str], line: int, column: str) -> float | str:
     """Return the value in one column of a CSV row: a number, or a text in the column ``recording``.
 
-    Raises ``InvalidInput`` if the row has the wrong length or the value is not a number.
-
-    Args:
-        file: path of the file, for error messages.
-        header: names of all columns of the CSV file, in order.
-        row: texts of the cells in one row of the CSV file.
-        line: number of the line on which this row begins, for error messages.
-        column: name of the column whose value is returned.
-
+    Raises ``InvalidInput`` if the row has the wrong length or the value is not a number. The error message names
+    ``file`` and ``line``.
     """
     if len(row) != len(header):
         raise InvalidInput(f"{file}, line {line}: has {len(row)} values, but the header has {len(header)} columns")
@@ -260,16 +237,12 @@ def read_worlds(scenario: ScenarioFields, path: str | Path) -> Worlds:
 
 
 def read_rows(file: Path, columns: object, weights: object) -> dict[str, Any]:
-    """Read the rows of a scenario's table, and their weights, from a CSV file.
+    """Read the rows of a scenario's table, and their weights, from a CSV file with a header line.
 
-    Returns ``{"rows": [[7.0, 8.0], ...]}``, and also ``"weights": [1.0, ...]`` unless ``weights`` is None. Raises
-    ``InvalidInput`` for an invalid file; the message names file, line and column.
-
-    Args:
-        file: path of the CSV file, which has a header line.
-        columns: names of the columns to read, as the scenario file lists them; this function checks the names.
-        weights: name of the column with the weight of each row; None: the rows have no weights.
-
+    Returns ``{"rows": [[7.0, 8.0], ...]}``, and also ``"weights": [1.0, ...]`` unless ``weights`` is None. ``columns``
+    are the names of the columns to read, as the scenario file lists them; this function checks the names. ``weights``
+    is the name of the column with the weight of each row. Raises ``InvalidInput`` for an invalid file; the message
+    names file, line and column.
     """
     header, rows, lines = _read_csv(file)
     weights_of = [] if weights is None else [weights]
@@ -304,8 +277,8 @@ def worlds_from_table(scenario: ScenarioFields, columns: Mapping[str, ArrayLike]
     Columns of gaps and speeds are required. Optional columns are ``braking_capacity_1_mps2``,
     ``driving_capacity_1_mps2``, ``latency_1_s``, ``mass_1_t``, ``speed_limit_1_mps`` and the like for each vehicle,
     ``restitution``, and ``obstacle_gap_m`` if the scenario has an obstacle. Quantities without a column have the
-    scenario's value, which must be a fixed number. Raises ``InvalidInput`` for an invalid value; the message names the
-    column and the row (from 0).
+    scenario's value, which must be a fixed number. Raises ``InvalidInput``, which names the column and the row (from
+    0), for an invalid value.
     """
     entries = _known_columns(list(columns), scenario, "initial states")
     by_entry = {
@@ -324,9 +297,9 @@ def worlds_from_table(scenario: ScenarioFields, columns: Mapping[str, ArrayLike]
 def worlds_from_state(scenario: ScenarioFields, initial_state: Mapping[str, Any]) -> Worlds:
     """Build one world (n = 1) from a state ``{"gaps_m": [7, 7], "speeds_mps": [20, 18, 20], ...}``.
 
-    The keys of a state are quantities of a scenario. A single number applies to every vehicle. Quantities without a key
-    have the scenario's value, which must be a fixed number. Raises ``InvalidInput`` for an invalid value; the message
-    names its key and its index.
+    The keys are quantities of a scenario. A single number applies to every vehicle. Quantities without a key have the
+    scenario's value, which must be a fixed number. Raises ``InvalidInput``, which names the key and the index, for an
+    invalid value.
     """
     if not isinstance(initial_state, Mapping):
         raise InvalidInput(f"initial_state = {initial_state!r}: must be a mapping such as {{'gaps_m': [7, 7]}}")

@@ -127,13 +127,9 @@ Types = Annotated[
 class TypesOfLine:
     """The possible vehicle types at each place of a line, and their weights.
 
-    Args:
-        kinds: mapping from the name of each vehicle type to its declaration; the index of a type is its position in
-            this mapping, from 0.
-        types: possible types at each place of the line, one entry per place or one entry for all places; None: every
-            type is possible at every place, in proportion to its weight.
-        vehicles: number of vehicles in the line.
-
+    ``kinds`` maps the name of each vehicle type to its declaration; the index of a type is its position in this
+    mapping, from 0. ``types`` has the possible types at each place of the line, with one entry per place or one entry
+    for all places; None: every type is possible at every place, in proportion to its weight.
     """
 
     def __init__(self, kinds: Mapping[str, VehicleType], types: Types | None, vehicles: int) -> None:
@@ -150,7 +146,7 @@ class TypesOfLine:
     def draw(self, u: Floats) -> tuple[Ints, Floats]:
         """Return the type (index) and the load (0 empty to 1 full) of every vehicle, both [n, N].
 
-        ``u``: uniform numbers in [0, 1), [n, N, 2 or more]; ``u[..., 0]`` draws the type, ``u[..., 1]`` the load.
+        ``u`` has uniform numbers in [0, 1), [n, N, 2 or more]; ``u[..., 0]`` draws the type, ``u[..., 1]`` the load.
         """
         n, vehicles = u.shape[:2]
         types, load = np.zeros((n, vehicles), np.int64), np.zeros((n, vehicles))
@@ -178,10 +174,7 @@ PerVehicle = Annotated[
 
 
 class _ObjectiveSchema:
-    """Pydantic annotation of an objective's name: the field's JSON schema lists all objectives.
-
-    The schema includes objectives that are registered before it is generated.
-    """
+    """Pydantic annotation of an objective's name: the field's JSON schema lists all objectives registered so far."""
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:

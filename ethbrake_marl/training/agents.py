@@ -21,14 +21,12 @@ from ethbrake_marl.training.team import has_policy_each, load_team
 def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
     """Return an agent that drives with a trained policy, or with a team if each learner of the run has its own policy.
 
-    Args:
-        argument: not used.
-        settings: the text that names the agent (spec), the path of its policy, and the scenario. The spec is the name
-            of a shipped policy (``universal``), or contains the path of a run or a policy bundle (``ppo@PATH``).
+    ``settings`` has the text that names the agent (spec), the path of its policy, and the scenario. The spec is the
+    name of a shipped policy (``universal``), or contains the path of a run or a policy bundle (``ppo@PATH``).
+    ``argument`` is not used.
 
     Raises ``InvalidInput`` if the spec names another algorithm than the algorithm that trained the policy. Also raises
     the errors of ``load_policy`` and ``load_team``.
-
     """
     spec, path = settings.spec, settings.policy
     name = spec.partition("@")[0]

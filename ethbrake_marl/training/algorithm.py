@@ -19,38 +19,26 @@ from ethbrake_marl.training.training import Training
 class Algorithm(ABC):
     """Base class of a learning algorithm whose model is a ``BaseAlgorithm`` of Stable-Baselines3.
 
-    A subclass must implement ``build``, which returns the model. A subclass may override ``actors`` (the policies
-    inside the model), ``tensors`` (the weights of a policy), ``optimizers`` (the model's optimisers),
-    ``learned_beside`` (what a checkpoint saves in addition to ``model.policy``) and ``log_noise`` (the exploration
-    noise). The default methods fit a model whose attribute ``policy`` has one ``optimizer``, such as PPO and A2C.
+    A subclass must implement ``build``. The other methods fit a model whose attribute ``policy`` has one ``optimizer``,
+    such as PPO and A2C; a subclass for another model overrides them.
     """
 
     @abstractmethod
     def build(self, training: Training, environment: EthBrakeVecEnv) -> BaseAlgorithm:
         """Return a new model on the CPU, whose random numbers depend on the recipe's seed only.
 
-        Args:
-            training: recipe and scenario of the training.
-            environment: vectorised environment to learn in, with one row for each learner in each world.
-
+        ``environment`` has one row for each learner in each world.
         """
 
     def actors(self, model: BaseAlgorithm) -> tuple[BasePolicy, ...]:
         """Return the policies inside the model that choose actions.
 
-        The result contains one policy for all learners or, in the scheme ``independent``, one policy for each learner
-        in the order front to rear.
+        There is one policy for all learners or, in the scheme ``independent``, one for each learner, front to rear.
         """
         return (model.policy,)
 
     def tensors(self, actor: BasePolicy, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return a copy of a policy's weights: name of a tensor in a policy bundle -> its values.
-
-        Args:
-            actor: one of the policies that ``actors`` returns.
-            network: description of the network in the policy bundle.
-
-        """
+        """Return a copy of the weights of ``actor``: name of a tensor in a policy bundle -> its values."""
         return tensors_of(actor, network)
 
     def optimizers(self, model: BaseAlgorithm) -> Mapping[str, Optimizer]:
@@ -67,7 +55,7 @@ class Algorithm(ABC):
     def log_noise(self, model: BaseAlgorithm) -> Tensor | None:
         """Return the logarithm of the model's exploration noise, or None if the model has no such noise.
 
-        If the model's exploration noise is not finite or not above 0, the training run stops with an error.
+        If the noise is not finite or not above 0, the training run stops with an error.
         """
         log_std: Tensor | None = getattr(model.policy, "log_std", None)
         return None if log_std is None else log_std.detach()

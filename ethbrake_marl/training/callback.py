@@ -39,7 +39,7 @@ StopAt = Callable[[Mapping[str, float]], str | None]
 class StopRequested(Exception):
     """Internal exception that the callback raises to leave Stable-Baselines3's training loop between two updates.
 
-    The argument of the exception is the reason that ``StopAt`` returned, or None after Ctrl-C.
+    Its argument is the reason that ``StopAt`` returned, or None after Ctrl-C.
     """
 
 
@@ -56,13 +56,7 @@ class RunCallback(BaseCallback):
     """Callback that measures policies, logs and writes checkpoints between two updates, and stops the run on request.
 
     The callback calls ``_between_updates`` before the first rollout, after each update, and at the end of the training.
-    To stop the training, the callback writes a checkpoint and raises ``StopRequested``.
-
-    Args:
-        run: folder of the run.
-        learner: the model that learns, its algorithm, and the recipe and scenario.
-        watchers: functions to measure the policies, to ask whether to stop, and to report progress.
-
+    To stop the training, it writes a checkpoint and raises ``StopRequested``.
     """
 
     model: Model  # the model that learns
@@ -158,9 +152,7 @@ class RunCallback(BaseCallback):
         return sum(float(e["r"]) for e in episodes) / len(episodes) if episodes else None
 
     def tell(self, note: str = "") -> None:
-        """Report the progress of the training to ``on_progress``. ``note`` is a message for the user, which is shown
-        only once.
-        """
+        """Report the progress of the training to ``on_progress``. The message ``note`` is shown only once."""
         if self._watchers.on_progress is None:
             return
         course = self.course
@@ -203,10 +195,7 @@ class RunCallback(BaseCallback):
         return TrainingState(numbers, arrays)
 
     def restore(self, state: TrainingState) -> None:
-        """Restore model and progress from a checkpoint, so that the training run continues from this checkpoint.
-
-        Raises ``CorruptBundle`` if the checkpoint does not fit this model.
-        """
+        """Restore model and progress from a checkpoint; raise ``CorruptBundle`` if it does not fit this model."""
         numbers, course = state.numbers, self.course
         try:
             restore_model(self.model, self.learner.algorithm, state)

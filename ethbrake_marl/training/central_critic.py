@@ -10,13 +10,9 @@ from torch import Tensor
 
 
 class CentralCriticPolicy(ActorCriticPolicy):
-    """PPO policy whose actor sees the first entries of an observation row, and whose critic sees the whole row.
+    """PPO policy whose actor sees the first ``own`` entries of an observation row, and whose critic sees the whole row.
 
-    Args:
-        arguments: positional arguments of Stable-Baselines3's ``ActorCriticPolicy``.
-        own: number of entries at the beginning of an observation row that the actor sees (the vehicle's observation).
-        settings: keyword arguments of ``ActorCriticPolicy``.
-
+    The other arguments are those of Stable-Baselines3's ``ActorCriticPolicy``.
     """
 
     def __init__(self, *arguments: Any, own: int, **settings: Any) -> None:
@@ -28,15 +24,9 @@ class CentralCriticPolicy(ActorCriticPolicy):
 
 
 class _OwnPartForTheActor(MlpExtractor):
-    """Hidden layers of an actor, which sees the first entries of an observation row, and a critic, which sees all
-    entries.
+    """Hidden layers of an actor, which sees the first ``own`` entries of an observation row, and of a critic.
 
-    Args:
-        own: number of entries that the actor sees, at the beginning of an observation row.
-        whole: number of all entries of an observation row; the critic sees all of them.
-        net_arch: sizes of the layers, as in Stable-Baselines3's ``ActorCriticPolicy``.
-        activation_fn: activation function, as in Stable-Baselines3's ``ActorCriticPolicy``.
-
+    The critic sees all ``whole`` entries. The other arguments are as in Stable-Baselines3's ``ActorCriticPolicy``.
     """
 
     def __init__(self, own: int, whole: int, net_arch: Any, activation_fn: Any) -> None:

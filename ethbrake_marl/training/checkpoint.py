@@ -64,7 +64,7 @@ def write_checkpoint(folder: Path, state: TrainingState) -> None:
 
 
 def read_checkpoint(folder: Path) -> TrainingState:
-    """Read and check the checkpoint in ``folder``, and return its state.
+    """Read and check the checkpoint in ``folder``.
 
     Raises ``CorruptBundle`` if the checkpoint is damaged, ``InvalidInput`` if it has another format.
     """

@@ -83,13 +83,7 @@ def register_run_report(name: str, make: MakeReport) -> None:
     """Register a function that writes a report into the folder of every later ``ethbrake run``.
 
     Instead of calling this function, a package can declare an entry point of the group ``ethbrake_marl.run_reports``.
-
-    Args:
-        name: name of the report, which must differ from the names of other reports.
-        make: function that writes the report about an ``Experiment``.
-
-    Raises ``AlreadyExists`` if another report has the name.
-
+    ``make`` writes the report about an ``Experiment``. Raises ``AlreadyExists`` if another report has the name.
     """
     RUN_REPORTS.add(name, make, lambda other: other is make)
 
@@ -123,30 +117,21 @@ def run_experiment(
 ) -> ExperimentResult:
     """Train the learners, compare them (with and without a shield) with the baselines, and write results and reports.
 
-    All compared agents minimise the count of harm that the learners are trained for (``reward.harm_count`` of the
-    recipe). Installed extensions write reports about the results.
+    Several learners are trained as a team, with the recipe's scheme. All compared agents minimise the count of harm
+    that the learners are trained for (``reward.harm_count`` of the recipe). Installed extensions write reports about
+    the results.
 
     Ctrl-C during the training stops the training after the current update, and the policy trained so far is evaluated.
     A second Ctrl-C, or Ctrl-C during the evaluation, raises ``KeyboardInterrupt``; the folder still contains the
-    policy. Some reports train further policies. Ctrl-C while a report trains its policies stops their training, and the
-    report is written without these policies (``ExperimentResult.interrupted``). ``run.json`` records how the run ended.
+    policy. Ctrl-C while a report trains further policies stops their training, and the report is written without these
+    policies (``ExperimentResult.interrupted``). ``run.json`` records how the run ended.
 
-    Args:
-        scenario: scenario with at least one learner. Several learners are trained as a team, with the recipe's scheme.
-        directory: the new folder of the run.
-        recipe: recipe of the training run, which also defines the reward.
-        steps: number of decisions of all learners together in the training; None: the recipe's number.
-        seed: seed of the training run; None: the recipe's seed.
-        episodes: number of worlds of the evaluation list.
-        list_seed: seed of the evaluation list.
-        force: whether to replace an earlier run in ``directory``.
-        settings: settings ``KEY=VALUE`` by which recipe and scenario differ from their files; ``config.json`` records
-            them.
-        on_progress: function that is called with the progress of training, evaluation and reports.
+    ``episodes`` is the number of worlds of the evaluation list, and ``list_seed`` its seed. ``on_progress`` is called
+    with the progress of training, evaluation and reports. For ``directory``, ``steps``, ``seed``, ``force`` and
+    ``settings``, see ``train``.
 
     Raises the errors of ``train`` and ``evaluate``, and ``AlreadyExists`` before the training if ``directory`` exists
     and ``force`` is false.
-
     """
     started = time.monotonic()
     tell = on_progress or (lambda progress: None)
@@ -205,13 +190,8 @@ def compared_agents(
     step mode. For several learners there is also a team ``all but vehicle_i`` for each learner i, in which vehicle i
     brakes fully.
 
-    Args:
-        trained: the trained policy, or one trained policy for each learner.
-        scenario: scenario whose learners the agents drive.
-        harm_count: count of harm that baselines minimise and shields bound, ``first`` or ``total``.
-        baselines: names of the baselines as on the command line; None: ``BASELINES`` for one learner,
-            ``TEAM_BASELINES`` for several learners.
-
+    ``harm_count`` is the count of harm that baselines minimise and shields bound. ``baselines`` has names as on the
+    command line; None: ``BASELINES`` for one learner, ``TEAM_BASELINES`` for several learners.
     """
     several = len(scenario.learners) > 1
     specs = (TEAM_BASELINES if several else BASELINES) if baselines is None else baselines
@@ -241,13 +221,8 @@ def write_results(
 ) -> list[dict[str, Any]]:
     """Write a results table as ``NAME.json`` and ``NAME.csv`` into ``folder``, and return the content of the JSON file.
 
-    Args:
-        folder: existing folder.
-        name: name of the two files, without their endings.
-        rows: rows of the results table, one per agent.
-        harm_count: count of harm that the agents minimise, which the JSON file records.
-        per_world: existing file with one row per world, to which the JSON file refers; None: there is no such file.
-
+    The JSON file records ``harm_count`` (the count of harm that the agents minimise) and the path ``per_world`` of an
+    existing file with one row per world; None: there is no such file.
     """
     results = results_to_json(rows, per_world=per_world, settings={"harm_count": harm_count})
     content = json.dumps(results, indent=2, allow_nan=False) + "\n"

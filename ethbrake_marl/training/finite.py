@@ -20,13 +20,7 @@ class TrainingDiverged(EthBrakeError, ArithmeticError):
 
 
 def refuse_gradients(model: BaseAlgorithm, algorithm: Algorithm) -> None:
-    """Make every optimiser of the model raise ``TrainingDiverged`` before a step with a gradient that is not finite.
-
-    Args:
-        model: the model of Stable-Baselines3 whose optimisers are changed.
-        algorithm: learning algorithm of the model, which lists the model's optimisers.
-
-    """
+    """Make every optimiser of the model raise ``TrainingDiverged`` before a step with a gradient that is not finite."""
     hint = "learning_rate or max_grad_norm" if hasattr(model, "max_grad_norm") else "learning_rate"
 
     def check(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
@@ -41,13 +35,7 @@ def refuse_gradients(model: BaseAlgorithm, algorithm: Algorithm) -> None:
 
 
 def weights_are_finite(model: BaseAlgorithm, algorithm: Algorithm) -> bool:
-    """Return True if all weights of the model are finite and its exploration noise is finite and above 0.
-
-    Args:
-        model: the model.
-        algorithm: learning algorithm of the model; its method ``log_noise`` returns the model's exploration noise.
-
-    """
+    """Return True if all weights of the model are finite and its exploration noise is finite and above 0."""
     logarithm = algorithm.log_noise(model)
     noise = torch.ones(1) if logarithm is None else torch.exp(logarithm)
     usable = torch.isfinite(noise) & (noise > 0.0)

@@ -32,7 +32,7 @@ Measure = Callable[[Training], Evaluate]  # function that returns the ``Evaluate
 
 
 def measure_on_list(training: Training) -> Evaluate:
-    """Draw the fixed list of worlds, and return a function that measures policies in the worlds of this list.
+    """Draw the fixed list of worlds, and return a function that measures policies in these worlds.
 
     The returned function takes a ``Policy`` or ``PolicyTeam``, and returns the metrics of ``measure_team``.
     """
@@ -90,8 +90,7 @@ def measure_team(training: Training, worlds: Worlds, team: Team) -> dict[str, fl
 def drive_list(worlds: Worlds, team: Team, scenario: Scenario) -> Iterator[Episodes]:
     """Let a team drive worlds from the alert in batches of at most 2,500 worlds, and yield the results of each batch.
 
-    The results do not contain worlds whose simulation fails. Raises ``PhysicsError`` if the simulation of every world
-    fails.
+    Worlds whose simulation fails are left out. Raises ``PhysicsError`` if the simulation of every world fails.
     """
     scripts = [script.name for script in script_agents(scenario, except_for=team.drivers).values()]
     failed: dict[int, str] = {}

@@ -1,6 +1,6 @@
 """Independent learners: one PPO per learner, with its own network and optimiser; all learners drive in the same worlds.
 
-The last entry of an observation row is the number of the learner that observes the row
+The last entry of an observation row is the number of the learner that observes the row, 0 = foremost
 (``make_sb3_vec_env(..., appended="number")``). Rollouts are collected for all learners together. From these rollouts,
 each learner learns from the observation rows that have the learner's number, with Stable-Baselines3's ``PPO.train``.
 """
@@ -25,17 +25,10 @@ from torch import Tensor, nn
 class SeparatePolicies(BasePolicy):
     """One actor-critic policy and one optimiser for each learner, together with the interface of a single policy.
 
-    The last entry of an observation row is the number of the learner that observes it (0 = foremost). Learners whose
-    numbers are in ``resting`` do not explore: they take the mean action.
-
-    Args:
-        observation_space: space of an observation row.
-        action_space: space of one learner's action.
-        lr_schedule: learning rate as a function of the fraction of the training that remains.
-        use_sde: whether to use state-dependent exploration.
-        columns: for each learner, front to rear, the columns of an observation row that the learner observes.
-        network: further keyword arguments of Stable-Baselines3's ``ActorCriticPolicy``, for each learner's policy.
-
+    Learners whose numbers are in ``resting`` do not explore: they take the mean action. ``columns`` has, for each
+    learner, front to rear, the columns of an observation row that the learner observes. ``network`` has further keyword
+    arguments of Stable-Baselines3's ``ActorCriticPolicy``, for each learner's policy; the other arguments are the same
+    as there.
     """
 
     def __init__(
@@ -69,12 +62,9 @@ class SeparatePolicies(BasePolicy):
         return [member for member in self.members if isinstance(member, ActorCriticPolicy)]
 
     def forward(self, observation: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-        """Return actions [n, 1], values [n, 1] and log-probabilities [n] for n observation rows.
+        """Return actions [n, 1], values [n, 1] and log-probabilities [n] for n observation rows, [n, F + 1].
 
-        Args:
-            observation: n observation rows, each with F features and the number of the learner, [n, F + 1].
-            deterministic: whether all learners take the mean action instead of exploring.
-
+        With ``deterministic``, all learners take the mean action instead of exploring.
         """
         count = len(observation)
         actions, values, likelihood = torch.empty(count, 1), torch.empty(count, 1), torch.empty(count)
@@ -84,7 +74,7 @@ class SeparatePolicies(BasePolicy):
         return actions, values, likelihood
 
     def predict_values(self, observation: Any) -> Tensor:
-        """Return the critics' values [n, 1] for n observation rows, each with F features and the learner's number."""
+        """Return the critics' values [n, 1] for n observation rows, [n, F + 1]."""
         values = torch.empty(len(observation), 1)
         for number, policy, rows in self._by_learner(observation):
             values[rows] = policy.predict_values(observation[rows][:, self.columns[number]])
@@ -102,19 +92,15 @@ class SeparatePolicies(BasePolicy):
 
 
 class IndependentPPO(PPO):
-    """PPO with a separate policy for each learner; all learners drive in the same worlds.
+    """PPO with a separate policy for each learner.
 
-    If ``turns`` is None, all learners learn in every update. If ``turns`` is a number, only one learner learns at a
-    time, and the other learners take their mean actions. The learner that learns changes from turn to turn, and all
-    turns have about the same number of updates. The columns of the log have names such as ``vehicle_2/loss``.
+    If ``turns`` is None, all learners learn in every update. If ``turns`` is a number, each learner has this number of
+    turns: only one learner learns at a time, and the other learners take their mean actions. The learner that learns
+    changes from turn to turn, and all turns have about the same number of updates. The columns of the log have names
+    such as ``vehicle_2/loss``.
 
-    Args:
-        env: vectorised environment in which the last entry of an observation row is the number of the learner.
-        names: names of the learners, front to rear.
-        turns: number of turns of each learner during the training; None: all learners learn in every update.
-        columns: for each learner, front to rear, the columns of an observation row that the learner observes.
-        settings: further keyword arguments of Stable-Baselines3's ``PPO``.
-
+    ``names`` are the names of the learners, front to rear. For ``columns``, see ``SeparatePolicies``. ``settings`` has
+    further keyword arguments of Stable-Baselines3's ``PPO``.
     """
 
     policy: SeparatePolicies  # type: ignore[assignment]  # has the parts of an actor-critic policy that PPO uses
@@ -132,8 +118,7 @@ class IndependentPPO(PPO):
     ) -> bool:
         """Collect rollouts as PPO does; only learners that learn in the next update explore.
 
-        The arguments are the same as in Stable-Baselines3's ``PPO.collect_rollouts``. Returns False if the callback
-        stopped the training.
+        The arguments and the result are the same as in Stable-Baselines3's ``PPO.collect_rollouts``.
         """
         everyone = range(len(self.names))
         self._learning = tuple(everyone) if self.turns is None else (self._whose_turn(self.turns),)
@@ -156,7 +141,7 @@ class IndependentPPO(PPO):
             self.policy, self.rollout_buffer, self._logger = joint, buffer, log
 
     def _whose_turn(self, turns: int) -> int:
-        """Return the number of the learner (0 = foremost) that learns in the next update.
+        """Return the number of the learner that learns in the next update.
 
         The result depends only on the number of decisions so far, so a resumed training run has the same turns.
         """
@@ -166,7 +151,7 @@ class IndependentPPO(PPO):
         return stretch % len(self.names)
 
     def _part(self, buffer: RolloutBuffer, number: int) -> RolloutBuffer:
-        """Return a new rollout buffer with the data of learner ``number`` (0 = foremost)."""
+        """Return a new rollout buffer with the data of learner ``number``."""
         own = self.policy.policies[number].observation_space
         count = len(self.names)
         part = RolloutBuffer(

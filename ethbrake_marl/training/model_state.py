@@ -25,12 +25,7 @@ REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "t
 def capture_model(model: Model, algorithm: Algorithm) -> tuple[dict[str, Any], Arrays]:
     """Return the state of a model between two updates, for a checkpoint.
 
-    Args:
-        model: the model of Stable-Baselines3, with its environment.
-        algorithm: learning algorithm of the model, which lists the model's optimisers and other learned tensors.
-
     Returns two dictionaries: counters and settings as plain data for JSON, and arrays by name.
-
     """
     environment: Any = model.env
     generators, random_arrays = capture_generators()
@@ -58,13 +53,8 @@ def capture_model(model: Model, algorithm: Algorithm) -> tuple[dict[str, Any], A
 def restore_model(model: Model, algorithm: Algorithm, state: TrainingState) -> None:
     """Put a state that ``capture_model`` returned into a new model of the same recipe.
 
-    Args:
-        model: the new model, which must have a logger; its state is replaced.
-        algorithm: learning algorithm of the model.
-        state: checkpoint with the dictionaries that ``capture_model`` returned.
-
-    Raises various errors of Python, NumPy and torch if the state does not fit the model.
-
+    The new model must have a logger. Raises various errors of Python, NumPy and torch if the state does not fit the
+    model.
     """
     numbers, arrays = state
     environment: Any = model.env
@@ -111,8 +101,7 @@ def _restore_weights(model: Model, algorithm: Algorithm, rates: Mapping[str, flo
 def _captured_rows(model: Model) -> Arrays:
     """Return the latest observation of every learner, and the returns and lengths of the latest episodes.
 
-    Stable-Baselines3 needs the observations to continue the rollouts; it needs the returns and lengths to log their
-    means.
+    Stable-Baselines3 needs the observations to continue the rollouts, and the returns and lengths to log their means.
     """
     observations: Any = model._last_obs
     episodes = list(model.ep_info_buffer or ())
@@ -154,13 +143,9 @@ def _restore_log(model: Model, pending: Mapping[str, Any]) -> None:
 def _restore_replay(memory: Any, place: Any, arrays: Arrays) -> None:
     """Restore the captured content of a replay buffer.
 
-    Args:
-        memory: the replay buffer of Stable-Baselines3, whose content is replaced.
-        place: the saved values (position of the replay buffer's next entry, whether the buffer is full).
-        arrays: captured arrays by name; the names of the buffer's arrays begin with ``replay.``.
-
-    Raises ``ValueError`` if the position in ``place`` is invalid, or if an array does not fit the buffer.
-
+    ``place`` has the position of the buffer's next entry, and whether the buffer is full. In ``arrays``, the names of
+    the buffer's arrays begin with ``replay.``. Raises ``ValueError`` if the position in ``place`` is invalid, or if an
+    array does not fit the buffer.
     """
     position, full = place
     if (type(position), type(full)) != (int, bool) or not 0 <= position < memory.buffer_size:
@@ -184,13 +169,9 @@ def _try_step(optimizer: torch.optim.Optimizer) -> None:
 
 
 def check_counter(name: str, value: object, kind: type) -> None:
-    """Raise ``ValueError`` unless a counter of a checkpoint has the right type and range.
+    """Raise ``ValueError`` unless a counter of a checkpoint has the type ``kind``.
 
-    Args:
-        name: name of the counter, for the error message.
-        value: the counter's value.
-        kind: required type of ``value``. If ``kind`` is ``int``, the value must be from 0 to 2^53 - 1.
-
+    A counter of type ``int`` must be from 0 to 2^53 - 1.
     """
     if type(value) is not kind or (kind is int and not 0 <= value < 1 << 53):  # type: ignore[operator]  # an int
         right = "a whole number, at least 0" if kind is int else f"of type {kind.__name__}"

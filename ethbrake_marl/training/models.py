@@ -54,13 +54,7 @@ def make_environment(training: Training) -> EthBrakeVecEnv:
 def make_model(algorithm: Algorithm, training: Training, environment: EthBrakeVecEnv) -> Model:
     """Build the model of a training run. The optimisers raise ``TrainingDiverged`` for gradients that are not finite.
 
-    Args:
-        algorithm: the learning algorithm that the recipe names.
-        training: recipe and scenario of the training.
-        environment: the environment to learn in, from ``make_environment``.
-
     Raises ``InvalidInput`` if the model normalises observations with ``VecNormalize``.
-
     """
     model = algorithm.build(training, environment)
     if getattr(model, "get_vec_normalize_env", lambda: None)() is not None:
@@ -77,12 +71,9 @@ def make_policies(
 ) -> Trained:
     """Return one policy for all learners, or one policy for each learner in the scheme ``independent``.
 
-    Args:
-        training: recipe and scenario of the training.
-        steps: number of decisions from which the weights were learned; the policies record this number.
-        tensors: function that takes the number k of a policy (0 = foremost learner) and the description of its network,
-            and returns the weights of the policy by name.
-
+    The policies record ``steps``, the number of decisions from which the weights were learned. ``tensors`` takes the
+    number k of a policy (0 = foremost learner) and the description of its network, and returns the weights of the
+    policy by name.
     """
     recipe, scenario = training.recipe, training.scenario
     names = tuple(training.drivers)

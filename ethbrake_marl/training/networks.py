@@ -15,12 +15,9 @@ ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Ta
 
 
 def tensors_of(policy: BasePolicy, spec: NetworkSpec) -> dict[str, Float32s]:
-    """Return a copy of a policy's weights: name of a tensor in a policy bundle -> its values.
+    """Return a copy of the weights of a PPO or SAC policy: name of a tensor in a policy bundle -> its values.
 
-    Args:
-        policy: policy of Stable-Baselines3's PPO or SAC.
-        spec: description of the network in the policy bundle, which must have the same layers as ``policy``.
-
+    ``spec`` is the description of the network in the policy bundle, which must have the same layers as ``policy``.
     """
     state = policy.state_dict()
     return {name: copy_of(state[theirs]) for name, theirs in sb3_names(spec).items()}
@@ -29,9 +26,8 @@ def tensors_of(policy: BasePolicy, spec: NetworkSpec) -> dict[str, Float32s]:
 def sb3_names(spec: NetworkSpec) -> dict[str, str]:
     """Return the names of a network's tensors: name in a policy bundle -> name in Stable-Baselines3's policy.
 
-    ``spec`` describes the network. The network belongs to PPO if ``spec.output`` is ``clip``, and otherwise to SAC.
-    Stable-Baselines3 also numbers the activations, so hidden layer k of a bundle has the number 2 k in
-    Stable-Baselines3.
+    The network belongs to PPO if ``spec.output`` is ``clip``, and otherwise to SAC. Stable-Baselines3 also numbers the
+    activations, so hidden layer k of a bundle has the number 2 k in Stable-Baselines3.
     """
     if spec.output == "clip":
         ours = {"policy": ("mlp_extractor.policy_net", "action_net"), "value": ("mlp_extractor.value_net", "value_net")}
@@ -51,11 +47,8 @@ def sb3_names(spec: NetworkSpec) -> dict[str, str]:
 def tensors_of_layers(name: str, layers: nn.Sequential) -> dict[str, Float32s]:
     """Return a copy of a perceptron's weights: name of a tensor in a policy bundle -> its values.
 
-    Args:
-        name: name of the network in the bundle, such as ``policy`` or ``gate``. The names of all returned tensors begin
-            with ``name``.
-        layers: linear layers, possibly with activations between them. The last linear layer is the output layer.
-
+    All names begin with ``name``, such as ``policy`` or ``gate``. The last linear layer of ``layers`` is the output
+    layer; there may be activations between the linear layers.
     """
     linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
     numbers = [*map(str, range(len(linear) - 1)), "output"]

@@ -40,19 +40,12 @@ def save_team(
 ) -> None:
     """Save the actors of several learners as a team, which the agent ``team@FOLDER`` loads.
 
-    If all learners have the same actor object, it is saved once, as a shared policy.
-
-    Args:
-        folder: folder in which the team is saved.
-        actors: actor of each learner, by the vehicle's name.
-        env: environment in which the actors were trained. The team records the scenario, observations and reward of
-            this environment.
-        seed: seed of the training run; the team records this seed.
-        steps: number of decisions of the training; the team records this number.
+    If all learners have the same actor object, it is saved once, as a shared policy. ``actors`` has the actor of each
+    learner, by the vehicle's name. The team records the scenario, observations and reward of ``env``, in which the
+    actors were trained, and the ``seed`` and number of decisions (``steps``) of the training.
 
     Raises ``InvalidInput`` if an actor is not a perceptron with ReLU or Tanh, or if learners that share an actor
     observe different features.
-
     """
     engine, names = env.unwrapped.engine, list(actors)
     scenario = engine.scenario

@@ -21,8 +21,8 @@ class Course:
     """Last policy, best policy and evaluations of a training run in progress.
 
     The best policy is the policy with the smallest mean of the learners' objectives on the fixed list of worlds. If all
-    learners have the harm of the line as objective, the best policy is the policy with the least harm of the line
-    (``harm_count`` says which impacts count). Before the first evaluation there is no best policy.
+    learners have the harm of the line as objective, it is the policy with the least harm of the line (``harm_count``
+    says which impacts count). Before the first evaluation there is no best policy.
     """
 
     harm_count: HarmCount = "first"  # count of harm by which the best policy is chosen
@@ -50,12 +50,9 @@ class Course:
     def add_evaluation(self, policy: Trained, metrics: Mapping[str, float], episode_return: float | None) -> None:
         """Record an evaluation of ``policy``, and remember the policy if it is the best so far.
 
-        Args:
-            policy: the evaluated policy, which is the policy after ``self.steps`` decisions and ``self.updates``
-                updates.
-            metrics: metrics of the policy by name, such as ``total_harm``.
-            episode_return: mean return of the latest training episodes; None if no episode has ended yet.
-
+        ``policy`` is the policy after ``self.steps`` decisions and ``self.updates`` updates. ``metrics`` are its
+        metrics by name, such as ``total_harm``. ``episode_return`` is the mean return of the latest training episodes;
+        None if no episode has ended yet.
         """
         extra = {} if episode_return is None else {RETURN: episode_return}
         self.evaluations.append({"steps": self.steps, "updates": self.updates, **metrics, **extra})
@@ -65,7 +62,7 @@ class Course:
             self.best, self.best_harm = policy, metrics[name]
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything in this object except the policies, as plain data for JSON, which ``restore`` reads."""
+        """Return everything except the policies as plain data for JSON, which ``restore`` reads."""
         return {
             "evaluations": self.evaluations,
             "best_harm": None if math.isinf(self.best_harm) else self.best_harm,
@@ -75,7 +72,7 @@ class Course:
         }
 
     def restore(self, content: Mapping[str, Any]) -> None:
-        """Set everything in this object except the policies to the values in ``content``, a result of ``to_json``."""
+        """Set everything except the policies to the values in ``content``, a result of ``to_json``."""
         self.evaluations = [dict(entry) for entry in content["evaluations"]]
         self.best_harm = math.inf if content["best_harm"] is None else float(content["best_harm"])
         self.wall_before_s = float(content["wall_s"])
@@ -86,7 +83,7 @@ class Course:
 def objective_in_words(training: Training) -> str:
     """Return the name of the quantity that the learners minimise, such as ``total harm (own)``.
 
-    The returned name is empty if all learners minimise the harm of the whole line. A weighted sum of harms is called an
+    The name is empty if all learners minimise the harm of the whole line. A weighted sum of harms is called an
     objective, not a harm.
     """
     scenario, learners = training.scenario, training.scenario.learners

@@ -52,11 +52,7 @@ def capture_generators() -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
 def restore_generators(numbers: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
     """Set the global random generators to the states that ``capture_generators`` returned.
 
-    Args:
-        numbers: plain data that ``capture_generators`` returned (the first of the two dictionaries).
-        arrays: dictionary that contains the arrays that ``capture_generators`` returned; other arrays in it are
-            ignored.
-
+    ``arrays`` may contain further arrays, which are ignored.
     """
     position, has_gauss, cached = numbers["numpy"]
     np.random.set_state(("MT19937", arrays["random.numpy"], position, has_gauss, cached))  # noqa: NPY002

@@ -70,11 +70,8 @@ class Shape(FileModel):
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
         """Return the description of the network in a policy bundle: an actor with one action in [-1, 1].
 
-        Args:
-            observation_size: number of features of an observation.
-            more: fields of the returned ``NetworkSpec`` that differ from their default values, such as
-                ``output="tanh"``.
-
+        ``observation_size`` is the number of features of an observation. ``more`` has fields of the returned
+        ``NetworkSpec`` that differ from their default values, such as ``output="tanh"``.
         """
         shape: Any = self  # subclasses declare the fields
         fields = {"policy_hidden": shape.policy, "value_hidden": (), "activation": shape.activation, "output": "clip"}
@@ -92,13 +89,7 @@ class NetworkShape(Shape):
     )
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
-        """Return the description of the network in a policy bundle: an actor and a critic.
-
-        Args:
-            observation_size: number of features of an observation.
-            more: further fields of the returned ``NetworkSpec``.
-
-        """
+        """Return the description of an actor and a critic; see ``Shape.spec``."""
         return super().spec(observation_size, value_hidden=self.value, **more)
 
 
@@ -183,9 +174,8 @@ class TrainingRecipe(FileModel):
         return self
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Return the description of the network in the policy bundle, from the recipe's key ``network``.
-
-        ``observation_size`` is the number of features of an observation.
+        """Return the description of the network in the policy bundle, for observations with ``observation_size``
+        features.
         """
         shape: Shape = vars(self)["network"]
         return shape.spec(observation_size)
@@ -201,9 +191,8 @@ class TrainingRecipe(FileModel):
         return 1
 
     def check_learners(self, learners: int) -> None:
-        """Raise ``InvalidInput`` if the recipe does not fit the number of learners.
-
-        The base class accepts every number of learners.
+        """Raise ``InvalidInput`` if the recipe does not fit the number of learners; the base class accepts every
+        number.
         """
 
     def begins(self, scenario: Scenario) -> str | None:
@@ -283,7 +272,7 @@ class TrainingRecipe(FileModel):
     def of(content: Any) -> TrainingRecipe:
         """Return the recipe whose keys and values are ``content``, a mapping such as a YAML file contains.
 
-        Raises ``InvalidInput`` if the content is invalid; the message names the key.
+        Raises ``InvalidInput``, whose message names the key, if the content is invalid.
         """
         return _checked(Document("recipe", content, {}))
 
@@ -334,8 +323,7 @@ class TrainingRecipe(FileModel):
     def json_schema() -> dict[str, Any]:
         """Return the JSON Schema of recipe files, with which editors complete and check YAML.
 
-        The schema includes registered algorithms and measures. The allowed keys depend on the value of the key
-        ``algorithm``.
+        The schema includes registered algorithms and measures. The allowed keys depend on the key ``algorithm``.
         """
         classes = {name: recipe for name, (recipe, _) in ALGORITHMS.usable().items()}
         places, whole = models_json_schema(
@@ -371,7 +359,7 @@ class TrainingRecipe(FileModel):
 
 
 def key_meanings(recipe: type[TrainingRecipe]) -> dict[str, str]:
-    """Return a dictionary: key of the recipes of class ``recipe`` -> description of this key.
+    """Return the description of each key of the recipes of class ``recipe``.
 
     If a class declares a key without a description, the description in its base class is used.
     """
@@ -392,11 +380,11 @@ def register_algorithm(name: str, recipe: type[TrainingRecipe], algorithm: type[
     ``Part`` with the recipe class and the algorithm.
 
     Args:
-        name: name of the algorithm, with 1 to 64 letters ``a-z``, digits, ``-`` and ``_``.
+        name: 1 to 64 letters ``a-z``, digits, ``-`` and ``_``.
         recipe: class of the algorithm's recipes, a subclass of ``TrainingRecipe``, which also checks their YAML files.
         algorithm: class of the algorithm, a subclass of ``training.algorithm.Algorithm``, or the text
-            ``"module:class"``. If ``algorithm`` is such a text, the module (and torch, whose import takes seconds) is
-            imported only when a training run begins.
+            ``"module:class"``. The module in such a text (and torch, whose import takes seconds) is imported only when
+            a training run begins.
 
     Raises ``InvalidInput`` for an invalid name or a class that lacks a required method, and ``AlreadyExists`` if
     another algorithm has the name.
@@ -434,9 +422,9 @@ def algorithm_names() -> tuple[str, ...]:
 def load_recipe(name_or_path: str | Path) -> TrainingRecipe:
     """Read and check a recipe.
 
-    ``name_or_path`` is the name of a shipped recipe (``ppo``), or the path of a file. An argument that contains a path
-    separator or ends in ``.yaml`` is a path. Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` for
-    invalid content; the message contains file, line, key, value and what would be right.
+    ``name_or_path`` is the name of a shipped recipe (``ppo``) or, if it contains a path separator or ends in ``.yaml``,
+    the path of a file. Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` for invalid content; the
+    message contains file, line, key, value and what would be right.
     """
     return _checked(TrainingRecipe.file(name_or_path))
 

@@ -82,13 +82,7 @@ class SquashedShape(Shape):
     activation: Activation = "relu"
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
-        """Return the description of the network in a policy bundle: an actor whose action is tanh of its output.
-
-        Args:
-            observation_size: number of features of an observation.
-            more: further fields of the returned ``NetworkSpec``.
-
-        """
+        """Return the description of an actor whose action is tanh of its output; see ``Shape.spec``."""
         return super().spec(observation_size, output="tanh", **more)
 
 

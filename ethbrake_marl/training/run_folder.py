@@ -22,10 +22,7 @@ RunStatus = Literal["running", "finished", "interrupted", "failed"]
 
 
 class RunDirectory:
-    """Folder of a run: the paths of its files, and methods that read and write these files.
-
-    ``path`` is the folder, which need not exist yet.
-    """
+    """The paths of a run's files, and methods that read and write them. The folder ``path`` need not exist yet."""
 
     # Columns of progress.csv. Columns with results of evaluations have the prefix ``eval/``.
     RETURN = "rollout/ep_rew_mean"  # mean return of the latest training episodes, which include exploration
@@ -53,15 +50,11 @@ class RunDirectory:
     def create(
         self, config: Mapping[str, Any], *, team: Mapping[str, Any] | None = None, force: bool = False
     ) -> RunDirectory:
-        """Create the folder with ``config.json`` and ``run.json`` atomically, so that the run can be resumed.
+        """Create the folder with ``config.json`` and ``run.json`` atomically, so that the run can be resumed; return
+        this object.
 
-        Args:
-            config: content of ``config.json``.
-            team: content of ``team.json``; None: the file is not written.
-            force: whether to replace an earlier run (a folder with a ``run.json``) or an empty folder.
-
-        Returns this object. Returns this ``RunDirectory``.
-
+        ``config`` and ``team`` are the contents of ``config.json`` and ``team.json``; without ``team``, ``team.json``
+        is not written. With ``force``, an earlier run (a folder with a ``run.json``) or an empty folder is replaced.
         """
         path, is_run = self.path, self.status.is_file()
         replace = force and path.is_dir() and not path.is_symlink() and (is_run or not any(path.iterdir()))
@@ -85,12 +78,8 @@ class RunDirectory:
         write_file(file, json.dumps(content, indent=2, allow_nan=False).encode() + b"\n")
 
     def write_status(self, status: RunStatus, **more: Any) -> None:
-        """Write ``run.json`` anew: status, start time of the run and, unless the status is ``running``, its end time.
-
-        Args:
-            status: status of the run to record, such as ``running``.
-            more: further entries to write into ``run.json``, by key.
-
+        """Write ``run.json`` anew: status, start time, end time (unless the status is ``running``), and the entries
+        ``more``.
         """
         now = datetime.now(UTC).isoformat(timespec="seconds")
         before = read_object(self.status) if self.status.exists() else {}
@@ -129,7 +118,6 @@ class RunDirectory:
 
     @property
     def is_finished(self) -> bool:
-        """Whether the training run in this folder has finished."""
         return self.status.is_file() and read_object(self.status).get("status") == "finished"
 
     def wait_for_others(self, longest_s: float) -> None:
@@ -141,16 +129,10 @@ class RunDirectory:
     def chosen_by(cls, evaluations: Sequence[Mapping[str, Any]], harm_count: HarmCount, prefix: str = "") -> str:
         """Return the name of the metric that is smallest for the best policy.
 
-        The metric is ``objective`` if every evaluation has an entry ``objective``. If an evaluation has no entry
-        ``objective``, the metric is the harm of the line (``first_impact_harm`` or ``total_harm``, as ``harm_count``
-        says).
-
-        Args:
-            evaluations: evaluations of a training run (``TrainResult.evaluations``), or rows of ``progress.csv``.
-            harm_count: count of harm that the training minimises.
-            prefix: prefix of the metrics' names in ``evaluations`` and in the result: ``eval/`` for rows of
-                ``progress.csv``.
-
+        The metric is ``objective`` if every evaluation has such an entry, and otherwise the harm of the line
+        (``first_impact_harm`` or ``total_harm``, as ``harm_count`` says). ``evaluations`` are evaluations of a training
+        run (``TrainResult.evaluations``), or rows of ``progress.csv``. For these rows, ``prefix`` must be ``eval/``;
+        the prefix is also part of the result.
         """
         with_objective = evaluations and all(
             entry.get(prefix + cls.OBJECTIVE) not in (None, "") for entry in evaluations
@@ -158,11 +140,11 @@ class RunDirectory:
         return prefix + (cls.OBJECTIVE if with_objective else cls.HARM[harm_count])
 
     def rows(self) -> list[dict[str, str]]:
-        """Return the rows of ``progress.csv``, each as a dictionary: name of a column -> text."""
+        """Return the rows of ``progress.csv``: name of a column -> text."""
         return list(csv.DictReader(self.progress.read_text("utf-8").splitlines()))
 
     def cpu_s(self) -> dict[int, float]:
-        """Return a dictionary: number of decisions before an evaluation -> processor time of learning until then (s).
+        """Return the processor time of learning (s) before each evaluation, by the number of decisions until then.
 
         Raises ``InvalidInput`` if ``run.json`` does not record the processor time.
         """
@@ -172,7 +154,7 @@ class RunDirectory:
         return {int(steps): float(spent) for steps, spent in recorded.items()}
 
     def column(self, name: str) -> dict[int, float]:
-        """Return a column of ``progress.csv``: number of decisions so far -> value. Rows without a value in this column
-        are omitted.
+        """Return a column of ``progress.csv``: number of decisions so far -> value, for each row with a value in this
+        column.
         """
         return {int(row["steps"]): float(row[name]) for row in self.rows() if row.get(name)}

@@ -47,7 +47,6 @@ class TrainResult:
     >>> result = eb.train(recipe, "paper-random", "runs/example", steps=128, measure=None)
     >>> result.status, result.steps, result.policy.manifest.algorithm
     ('finished', 128, 'ppo')
-
     """
 
     directory: Path  # the run's folder
@@ -119,7 +118,7 @@ def train(
 
     Args:
         recipe: a recipe, its name, or the path of its file.
-        scenario: a scenario, its name, or the path of its file. The roles in the scenario say which vehicles learn.
+        scenario: a scenario, its name, or the path of its file. Its roles say which vehicles learn.
         directory: the new folder of the run.
         scheme: how several learners train together; None: the recipe's scheme.
         turns: number of turns of each independent learner (docs/train.md); None: the recipe's number.
@@ -129,13 +128,13 @@ def train(
         force: whether to replace an earlier run in ``directory``.
         settings: settings ``KEY=VALUE`` by which recipe and scenario differ from their files; ``config.json`` records
             them.
-        measure: function that takes a ``Training`` and returns a function that measures policies; None: policies are
-            not measured. By default, policies are measured on the fixed list of worlds that the recipe defines.
-            Measurements take place before the first update, every few updates (a key of the recipe), and at the end.
+        measure: function that takes a ``Training`` and returns a function that measures policies; None: no
+            measurements. By default, policies are measured on the fixed list of worlds that the recipe defines: before
+            the first update, every few updates (a key of the recipe), and at the end.
         stop_at: function that takes an evaluation (an entry of ``TrainResult.evaluations``), and returns a reason to
             stop the training with status ``interrupted``, or None to continue.
-        on_progress: function that is called with the progress of the training; None: the progress is not reported. By
-            default, the progress is printed on stderr.
+        on_progress: function that is called with each ``Progress``; ``"show"``: print the progress on stderr; None: no
+            reports.
 
     Raises ``AlreadyExists`` for an existing directory if ``force`` is false, ``InvalidInput`` if recipe and scenario do
     not fit each other, ``TrainingDiverged`` if a number is not finite.
@@ -161,16 +160,14 @@ def resume(
     """Continue a training run that was stopped or killed. The policies are exactly the same as without the
     interruption.
 
-    The training run continues from the newest undamaged checkpoint, or from the beginning if there is no such
-    checkpoint. Log rows that were written after this checkpoint are dropped. Earlier results and reports of ``ethbrake
-    run`` are deleted.
+    The training run continues from the newest undamaged checkpoint, or from the beginning if there is none. Log rows
+    that were written after this checkpoint are dropped. Earlier results and reports of ``ethbrake run`` are deleted.
 
     Args:
         directory: the folder of the run.
-        measure: the same argument as in ``train``.
-        stop_at: the same argument as in ``train``. Evaluations that were made before the stop are not passed to
-            ``stop_at`` again.
-        on_progress: the same argument as in ``train``.
+        measure: as in ``train``.
+        stop_at: as in ``train``. Evaluations that were made before the stop are not passed to ``stop_at`` again.
+        on_progress: as in ``train``.
         other_versions: whether to accept a checkpoint that other versions of packages wrote. The resulting policies may
             then differ from the policies of an uninterrupted training run.
 
@@ -197,15 +194,8 @@ def build(
     """Context manager: build environment and model of a training run, and yield the callback for ``learn``.
 
     Inside the ``with`` block, Ctrl-C stops the training after the current update. At the end of the ``with`` block, the
-    environment is closed, and the global random generators are restored.
-
-    Args:
-        training: recipe and scenario of the training.
-        run: folder of the run, into which this function does not write yet.
-        measure: the same argument as in ``train``.
-        stop_at: the same argument as in ``train``.
-        on_progress: the same argument as in ``train``.
-
+    environment is closed, and the global random generators are restored. The function does not write into the folder of
+    the run yet. For ``measure``, ``stop_at`` and ``on_progress``, see ``train``.
     """
     evaluate = None if measure is None else measure(training)
     algorithm = training.recipe.make_algorithm()
@@ -217,14 +207,9 @@ def build(
 def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[str] = ()) -> TrainResult:
     """Train until the training ends or is stopped, save the policies, and return the result.
 
-    The policies are also saved if the training ends with an error.
-
-    Args:
-        callback: callback from ``build``, which contains the model and measures the model's policies during the
-            training.
-        state: checkpoint from which the training run continues; None: a new training run begins.
-        notes: messages for the user, passed to ``on_progress`` when the training begins.
-
+    The policies are also saved if the training ends with an error. ``callback`` comes from ``build``. ``state`` is the
+    checkpoint from which the training run continues; None: a new training run begins. ``notes`` are messages for the
+    user, passed to ``on_progress`` when the training begins.
     """
     run, (training, algorithm, model), course = callback.run, callback.learner, callback.course
     if state is not None:
@@ -270,13 +255,8 @@ def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[st
 def save(callback: RunCallback, status: RunStatus, reason: str | None) -> None:
     """Save the best policy and the last policy whose weights are finite; record in ``run.json`` how the run ended.
 
-    The checkpoints of a finished run are deleted.
-
-    Args:
-        callback: callback of the training run, which contains the best and the last policy.
-        status: how the run ended.
-        reason: why the run was interrupted or failed; None: there is no reason to record.
-
+    The checkpoints of a finished run are deleted. ``reason`` says why the run was interrupted or failed; None: there is
+    no reason to record.
     """
     run, training, course = callback.run, callback.learner.training, callback.course
     for policy, folder in ((course.chosen, run.policy), (course.policy, run.last_policy)):

@@ -27,11 +27,8 @@ class Settings(NamedTuple):
     def change(self, recipe: TrainingRecipe, tell: Callable[[str], None] | None = None) -> TrainingRecipe:
         """Return the recipe with the values that ``self.recipe`` sets; keys that the recipe does not have are ignored.
 
-        Args:
-            recipe: the recipe to change.
-            tell: function that is called with a note for the user if ``gamma`` and ``reward.shaping_discount`` differ
-                because only one of them was set (they should be equal).
-
+        ``tell`` is called with a note for the user if ``gamma`` and ``reward.shaping_discount`` differ because only one
+        of them was set (they should be equal).
         """
         own = [override for override in self.recipe if override.top in type(recipe).model_fields]
         if not own:
@@ -54,14 +51,8 @@ def read_settings(
     """Parse the settings of a command, and sort them by whether they belong to scenario, recipe or agents.
 
     For instance, ``mass_t=40`` and ``scenario.mass_t=40`` belong to the scenario, ``gamma=0.9`` to a recipe.
-
-    Args:
-        texts: settings ``KEY=VALUE`` as the user wrote them; None: there are no settings.
-        recipes: recipes that the command uses; ``texts`` may set keys of these recipes.
-        of_agents: names of the settings of agents that the command allows, such as ``harm_count``.
-
-    Raises ``UnknownName`` for an unknown key, and ``InvalidInput`` for an ambiguous key or an invalid value.
-
+    ``of_agents`` has the names of the settings of agents that the command allows, such as ``harm_count``. Raises
+    ``UnknownName`` for an unknown key, and ``InvalidInput`` for an ambiguous key or an invalid value.
     """
     known = {
         "scenario": {*Scenario.model_fields} - _NO_SETTING,

@@ -23,13 +23,7 @@ from ethbrake_marl.training.run_folder import RunDirectory
 
 
 def bundle_of(scheme: Scheme, vehicle: str) -> str:
-    """Return the folder of a learner's policy, relative to the folder of the run.
-
-    Args:
-        scheme: how the learners train together, such as ``shared`` or ``independent``.
-        vehicle: name of the learner, such as ``vehicle_2``.
-
-    """
+    """Return the folder of the policy of the learner ``vehicle``, relative to the folder of the run."""
     return f"policy/{vehicle}" if scheme == "independent" else "policy"
 
 
@@ -64,7 +58,7 @@ class TeamFile(FileModel):
 
 
 def read_team(file: Path) -> TeamFile:
-    """Read and check the file ``team.json`` of a run; raise ``CorruptBundle`` if its content is invalid."""
+    """Read and check ``team.json`` of a run; raise ``CorruptBundle`` if its content is invalid."""
     data = read_plain(file, 1 << 20)
     try:
         document = Document(str(file), parse_strict_json(data), {})
@@ -89,16 +83,10 @@ def load_team(
 ) -> Team:
     """Load the policies of a run as a team, in which each policy drives the vehicles that it was trained for.
 
-    Args:
-        folder: folder of the run.
-        scenario: scenario to drive in, or its name or path.
-        name: name of the team.
-        vehicles: indices (0 = front) of the vehicles to drive; None: the scenario's learners. The team does not contain
-            the policies of the run's other learners.
-
-    Raises ``InvalidInput`` if the folder has no ``team.json``, if the team is for a line of another length, or if the
-    team has no policy for one of the vehicles. Raises ``CorruptBundle`` if ``team.json`` is damaged.
-
+    ``vehicles`` has the indices (0 = front) of the vehicles to drive; None: the scenario's learners. The team does not
+    contain the policies of the run's other learners. Raises ``InvalidInput`` if the folder has no ``team.json``, if the
+    team is for a line of another length, or if the team has no policy for one of the vehicles. Raises ``CorruptBundle``
+    if ``team.json`` is damaged.
     """
     path, scenario = Path(folder), scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     file = RunDirectory(path).team

@@ -42,16 +42,10 @@ class Training:
         """Return the combination of a recipe and a scenario.
 
         Learners observe the features that the recipe lists or, if the recipe lists none, the features that the scenario
-        lists.
-
-        Args:
-            recipe: a recipe, its name, or the path of its file.
-            scenario: a scenario, its name, or the path of its file.
-            changes: new values for keys of the recipe, such as ``seed=3``.
+        lists. ``changes`` are new values for keys of the recipe, such as ``seed=3``.
 
         Raises ``InvalidInput`` if recipe and scenario do not fit each other: no vehicle learns, the scheme needs
         another number of learners, or one policy would drive learners that observe different features.
-
         """
         recipe = recipe if isinstance(recipe, TrainingRecipe) else load_recipe(recipe)
         scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
@@ -76,13 +70,13 @@ class Training:
 
     @property
     def begins(self) -> str | None:
-        """Description of the initial weights; None if the initial weights are random."""
+        """Description of the initial weights; None if they are random."""
         return self.recipe.begins(self.scenario)
 
     def content(self) -> dict[str, dict[str, Any]]:
         """Return everything that affects the training as plain data ``{"recipe": {...}, "scenario": {...}}``.
 
-        The result includes default values, but no descriptive texts.
+        Default values are included, descriptive texts are not.
         """
         recipe = self.recipe.model_dump(mode="json", exclude=set(WORDS))
         return {"recipe": recipe, "scenario": self.scenario.content(without=WORDS)}
@@ -98,10 +92,7 @@ class Training:
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def config(self, settings: Sequence[str] = ()) -> dict[str, Any]:
-        """Return the content of ``config.json``: recipe, scenario, seeds, versions and settings.
-
-        loss_begins: probability p that a burst of losses begins in one message period.
-        """
+        """Return the content of ``config.json``: recipe, scenario, seeds, versions and settings."""
         recipe = self.recipe
         return {
             "recipe": recipe.model_dump(mode="json"),
@@ -132,14 +123,10 @@ class Training:
 
 
 def recorded_training(run: RunDirectory, config: Mapping[str, Any]) -> Training:
-    """Return the recipe and scenario that the configuration of a run describes.
+    """Return the recipe and scenario in ``config``, the content of a run's ``config.json``.
 
-    Args:
-        run: folder of the run, which error messages name.
-        config: content of the run's ``config.json``.
-
-    Raises ``InvalidInput`` if the configuration is invalid, or if another library trained the policies.
-
+    Raises ``InvalidInput``, which names the folder ``run``, if the configuration is invalid, or if another library
+    trained the policies.
     """
     if "library" in config:
         raise InvalidInput(
