@@ -1,4 +1,4 @@
-"""The agent ``AGENT+search``: at the alert it improves the commands of AGENT by a search, and drives the best commands."""
+"""The agent ``AGENT+search``: at the alert it improves the commands of AGENT by a search, and drives the result."""
 
 from __future__ import annotations
 
@@ -42,6 +42,7 @@ class Searched(AgentAround):
     >>> outcome = eb.evaluate(scenario.sample(2, seed=7), {"searched": searched}, scenario=scenario).outcome("searched")
     >>> bool((outcome.first_impact_harm == outcome.predicted_harm).all())
     True
+
     """
 
     adds = Source.MODEL

@@ -348,7 +348,7 @@ def driven_profiles(agent: Driver, worlds: Worlds, task: Task, last_step: Ints) 
 def fold_episodes(
     table: BestHarmTable, scenario: Scenario, worlds: Worlds, name: str, agents: Mapping[HarmCount, Agent]
 ) -> BestHarmTable:
-    """Let agents drive the worlds; return a copy of ``table`` with the lower harm where an agent does less harm.
+    """Let agents drive the worlds; return a copy of ``table`` with the agents' harm where it is lower.
 
     The agents' commands are recorded and simulated again; the table stores the harm of the second simulation. The
     table's header says in how many worlds the harm was lowered, under the agent's name ``name``. Worlds with best known

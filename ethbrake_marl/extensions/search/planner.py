@@ -103,6 +103,7 @@ class Planner:
     >>> outcome = eb.evaluate(scenario.sample(2, seed=7), {"planner": planner}, scenario=scenario).outcome("planner")
     >>> bool((outcome.first_impact_harm <= outcome.predicted_harm + 1e-9).all())
     True
+
     """
 
     knows = Source.MODEL
@@ -180,7 +181,7 @@ def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
 
 
 def make_estimating_planner(argument: str | None, settings: AgentSettings) -> Agent:
-    """Return the agent ``planner:estimated`` or ``planner:CANDIDATES:estimated``, which searches the estimated world."""
+    """Return the agent ``planner:estimated`` or ``planner:CANDIDATES:estimated``; it searches the estimated world."""
     return Estimating(make_planner(argument, settings), settings.needed_scenario(), shows=True)
 
 

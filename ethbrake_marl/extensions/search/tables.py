@@ -94,7 +94,7 @@ class BestHarmTable:
         return dict(self.header.get(LEFT_OUT, {}))
 
     def rows(self, identity: UInt64s) -> NDArray[np.int64]:
-        """Return the index in the table of each world with hash ``identity`` [m], [m]; -1 for a world not in the table."""
+        """Return the index in the table of each world with hash ``identity`` [m], [m]; -1: not in the table."""
         order = np.argsort(self.identity, kind="stable")
         place = np.minimum(np.searchsorted(self.identity[order], identity), len(order) - 1)
         rows = order[place]
@@ -118,9 +118,7 @@ class BestHarmTable:
                 raise InvalidInput(f"table of best known harm, {harm_count}: {error}") from None
 
     def harm(self, identity: UInt64s, harm_count: HarmCount) -> Floats:
-        """Return the best known harm of each world with hash ``identity`` [m], [m] m2/s2; NaN for a world not in the
-        table.
-        """
+        """Return the best known harm of each world with hash ``identity`` [m], [m] m2/s2; NaN: not in the table."""
         rows = self.rows(identity)
         if harm_count not in self.best:
             return np.full(rows.shape, np.nan)
