@@ -76,7 +76,7 @@ class Reproduction:
         ]
 
     def trained(self, wanted: Collection[str]) -> dict[str, list[Path]]:
-        """Return the recipes of groups whose training runs are all finished: ``group/recipe`` -> folder of each seed."""
+        """Return the recipes of groups whose training runs are all finished: ``group/recipe`` -> folders of seeds."""
         return {
             f"{group.name}/{name}": paths
             for group, name, paths in self.seeds_of(wanted)
