@@ -3,7 +3,7 @@
 An agent's commands are float64 numbers in m/s2. A learner's action is a float32 number in [-1, 1], so most commands do
 not correspond exactly to an action. Therefore each world is simulated twice. In the first episode, the agent drives,
 and its commands are rounded to actions. In the second episode, which is recorded, learners take these actions. An
-environment that gets the recorded actions repeats it bit for bit.
+environment that gets the recorded actions repeats the second episode bit for bit.
 
 If two vehicles almost miss each other, the last bit of an action can decide whether they have an impact. Therefore, if
 rounding to the nearest action changes the harm of a world, the code also tries to round all actions of this world down,

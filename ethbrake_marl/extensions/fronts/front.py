@@ -90,7 +90,10 @@ class Front(NamedTuple):
 
 
 def amounts_of(borne: Floats, weights: Floats) -> Floats:
-    """Return the weighted harm of n worlds, [n] m2/s2, as in ``Front.amounts``; ``borne`` is [n, N], ``weights`` [N]."""
+    """Return the weighted harm of n worlds, [n] m2/s2, as in ``Front.amounts``.
+
+    ``borne`` is the harm of each vehicle, [n, N] m2/s2; ``weights`` is [N].
+    """
     return weighted_harm(borne, np.broadcast_to(weights, borne.shape))
 
 

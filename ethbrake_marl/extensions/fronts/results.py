@@ -34,7 +34,7 @@ def front_results(
 
     All means have 95 % intervals over worlds or, if the worlds come from recordings, over recordings. For each choice
     of weights, ``ratio`` is the mean weighted harm of an agent divided by that of the front (null if the latter is 0),
-    and ``above`` is the difference of the two.
+    and ``above`` is the agent's mean weighted harm minus that of the front.
 
     Args:
         front: the front.

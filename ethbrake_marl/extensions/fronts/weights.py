@@ -21,8 +21,8 @@ SLIGHT = 1e-4  # weight of the other vehicles in a corner; their harm decides be
 def weight_grid(vehicles: int, steps: int = STEPS) -> Floats:
     """Return W evenly spaced choices of weights, [W, N]. In each choice the weights of the N vehicles sum to 1.
 
-    All weights are multiples of 1 / ``steps``. Raises ``InvalidInput`` if ``steps`` is below 1, or if there would be
-    more than ``MOST`` choices.
+    From each row to the next, the weight of one vehicle rises by 1 / ``steps``, and the weight of another vehicle falls
+    by 1 / ``steps``. Raises ``InvalidInput`` if ``steps`` is below 1, or if there would be more than ``MOST`` choices.
 
     >>> from ethbrake_marl.extensions.fronts.weights import weight_grid
     >>> weight_grid(3, 1).tolist()

@@ -193,7 +193,7 @@ class Chains:
 
 
 def _gap(ahead: Any, state: Any) -> float:
-    """Return the gap (m) from the rear of ``ahead`` to the front of ``state``, along ``state``'s direction of travel."""
+    """Return the gap (m) from the rear of ``ahead`` to the front of ``state``, in ``state``'s direction of travel."""
     along = ahead.front - ahead.length * ahead.dx - state.front
     across = ahead.side - ahead.length * ahead.dy - state.side
     return float(along * state.dx + across * state.dy)

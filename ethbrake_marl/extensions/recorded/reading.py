@@ -228,7 +228,10 @@ def _measured(cell: str) -> float:
 
 
 def _number_of(names: dict[str, float], cell: str) -> float:
-    """Return the number of the name in ``cell``; a new name gets the next whole number, an empty one ``ValueError``."""
+    """Return the number of the name in ``cell``; a new name gets the next whole number.
+
+    Raises ``ValueError`` for an empty name.
+    """
     if not (name := cell.strip()):
         raise ValueError
     return names.setdefault(name, len(names) + 1.0)

@@ -7,7 +7,8 @@ short while, then full braking. The search simulates one decision after the othe
 computes exactly the same harm as the engine.
 
 Arguments that several functions share: ``budget`` is the number of candidates (sequences of commands) to simulate in
-each world. ``room`` has arrays for intermediate results. ``world`` has the bounds of the commands and a random stream.
+each world. ``room`` has arrays for intermediate results. ``world`` is the world to simulate; a ``SearchWorld`` also has
+the bounds of the commands and a random stream.
 """
 
 from __future__ import annotations
