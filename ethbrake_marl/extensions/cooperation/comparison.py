@@ -31,7 +31,8 @@ def compare(measured: Sequence[Measured], searched: int) -> Json:
     - ``levels``: results of each level and algorithm;
     - ``steps``: for each algorithm, the change of harm from each level to the next;
     - ``channels``: change of harm from a level to the same level with a worse V2X channel;
-    - ``undertrained``: one sentence that names the levels whose trained policies do worse than full braking, if any.
+    - ``undertrained``: one sentence that names the levels whose trained policies do worse than full braking; empty if
+      there are none.
 
     The joint optimum was searched in the first ``searched`` worlds of the list; comparisons with it use only these
     worlds.

@@ -75,7 +75,7 @@ def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) 
     number of steps so far; it returns the actions, [m, L].
 
     If harm is the only term of the reward, a simulation ends as soon as all vehicles are at rest and will stay at rest,
-    but not in the first ``at_least`` steps. If it fails, the return is NaN.
+    but not in the first ``at_least`` steps. If the simulation of a world fails, its return is NaN.
     """
     vehicles = np.array(engine.learners, np.int64)
     gained, actions = np.zeros((engine.n, len(vehicles))), np.zeros((engine.n, len(vehicles)))

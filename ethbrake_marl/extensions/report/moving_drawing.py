@@ -109,7 +109,7 @@ class _Strip:
             )
 
     def _vehicle(self, i: int) -> Iterator[str]:
-        """Yield the SVG elements of vehicle ``i``: a moving body, lights that show its command, and impact stars."""
+        """Yield the SVG elements of vehicle ``i``: its body, lights that show its command, a star for each impact."""
         places = [self._x(scene.front_m[i]) for scene in self._film]
         length, top = BODY_M * self._scale, _FILM_LANE - _HALF_BODY
         yield f'<g transform="translate({places[0]:.1f} 0)">'

@@ -43,7 +43,10 @@ class Played:
 
     @staticmethod
     def episode(motion: EpisodeMotion, driven: Sequence[int]) -> dict[str, Any]:
-        """Return the data of one episode for the script of the player; ``driven`` are controlled vehicles' indices."""
+        """Return the data of one episode for the script of the player.
+
+        ``driven`` are the indices of the controlled vehicles.
+        """
         obstacle = float(motion.world.obstacle_gap_m[0])
         without = 1 + 3 * motion.world.N
         jerks = bool(motion.pieces[:, without:].any())

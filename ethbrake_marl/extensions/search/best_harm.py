@@ -69,12 +69,12 @@ def best_harm(
     Args:
         scenario: scenario of the worlds.
         worlds: worlds at t = 0, [n].
-        counts: ``first``, ``total``, or both.
+        counts: harm counts to minimise: ``first``, ``total``, or both.
         vehicles: indices of the controlled vehicles; None: the learners of the scenario.
         budget: number of profiles to simulate in each world for each count.
         seed: seed of the random search.
         threads: None: one thread for each core.
-        known: table for the same controlled vehicles, with whose profiles the search starts too.
+        known: table for the same controlled vehicles; the search also starts from its profiles.
         objective: objective to minimise, as under a scenario's key ``objective``. If it is not ``total``, the table
             contains values of this objective instead of harm, and its header names the objective.
 

@@ -17,7 +17,7 @@ _SILENT = ("ray.tune.tune", "ray.tune.analysis.experiment_analysis")  # loggers 
 def connected(address: str, cores: int | None) -> Iterator[None]:
     """Context manager that connects to Ray while its block runs, and disconnects afterwards, also after an error.
 
-    Inside the block, the signal SIGTERM acts like Ctrl-C; after the block, both act as before.
+    Inside the block, the signal SIGTERM acts like Ctrl-C; after the block, both signals act as before.
 
     Args:
         address: address of a running cluster, or ``local``: start Ray on this machine.

@@ -55,7 +55,7 @@ def search(
         dimensions: number of coordinates, d.
         budget: number of points to try.
         seed: seed of the random numbers.
-        adaptive: False: all points are uniform random points.
+        adaptive: True: search around the best points; False: all points are uniform random points.
         on_round: called after each round with the number of points tried so far and ``budget``.
 
     """

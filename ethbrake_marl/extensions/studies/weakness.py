@@ -93,7 +93,7 @@ class Measure:
             budget: number of worlds to try.
             seed: seed of the search.
             most: largest number of worlds in the result; any two of them differ clearly.
-            adaptive: False: all worlds are uniform random worlds.
+            adaptive: True: search around the worst worlds so far; False: all worlds are uniform random worlds.
             on_round: called with the number of worlds tried so far and ``budget``.
 
         """
