@@ -37,17 +37,16 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
     """TorchRL environment with ``n`` worlds of one scenario and ``L`` learners.
 
     Shapes: observation [n, L, F], action [n, L, 1] (with discrete actions [n, L]), reward [n, L, 1], state [n, S], done
-        [n, 1]. F is the number of features of an observation, S the number of features of the state.
+    [n, 1].
 
     Args:
         scenario: the scenario, which must have at least one learner.
         n: number of worlds.
         seed: seed from which the worlds are drawn.
         reward: reward of the learners: a name such as ``harm``, or the weights of the reward's terms.
-        horizon_is_end: if True, an episode that reaches the horizon is terminated; if False, it is truncated.
+        horizon_is_end: True: an episode that reaches the horizon is terminated; False: it is truncated.
         shield: mode of the learners' shield, which must be ``step`` if there are several learners. None: no shield.
-        actions: number of discrete actions, for algorithms such as QMIX, which choose the index of an action. None:
-            actions are numbers in [-1, 1].
+        actions: number of discrete actions, for algorithms such as QMIX; None: actions are numbers in [-1, 1].
 
     """
 
@@ -124,9 +123,8 @@ class LineTask(TaskClass):  # type: ignore[misc]
     Args:
         name: name of the task in BenchMARL, such as ``PAPER_RANDOM``.
         config: mapping with the keys ``scenario``, ``reward`` and ``horizon_is_end``, and optionally ``shield`` and
-            ``actions``. The value of ``scenario`` is the name of a shipped scenario, the path of a scenario file, a
-            mapping with the content of such a file, or a ``Scenario``. The values of the other keys are passed to
-            ``LineEnv``.
+            ``actions``. ``scenario`` is the name of a shipped scenario, the path of a scenario file, a mapping with the
+            content of such a file, or a ``Scenario``. The other values are passed to ``LineEnv``.
 
     """
 
@@ -134,17 +132,12 @@ class LineTask(TaskClass):  # type: ignore[misc]
         super().__init__(name, {**config, "scenario": load_scenario(config["scenario"])})
 
     def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any) -> Callable[[], Any]:
-        """Return a function without arguments that creates a ``LineEnv``.
+        """Return a function without arguments that creates a ``LineEnv`` with ``num_envs`` worlds.
 
-        Args:
-            num_envs: number of worlds.
-            continuous_actions: whether BenchMARL wants continuous actions (True) or discrete actions (False).
-            seed: seed from which the worlds are drawn; None: seed 0.
-            device: unused.
+        If ``seed`` is None, the seed is 0. ``device`` is unused.
 
         Raises ``InvalidInput`` if the task has continuous actions and BenchMARL wants discrete actions, or the other
         way round.
-
         """
         config, actions = self.config, self.config.get("actions")
         if continuous_actions != (actions is None):
@@ -157,11 +150,11 @@ class LineTask(TaskClass):  # type: ignore[misc]
         return lambda: LineEnv(config["scenario"], num_envs, seed or 0, *settings)
 
     def supports_continuous_actions(self) -> bool:
-        """Return whether actions are continuous: True if the key ``actions`` in ``config`` is None or missing."""
+        """Return True if the key ``actions`` in ``config`` is None or missing."""
         return self.config.get("actions") is None
 
     def supports_discrete_actions(self) -> bool:
-        """Return whether actions are discrete: True if the key ``actions`` in ``config`` is a number."""
+        """Return True if the key ``actions`` in ``config`` is a number."""
         return self.config.get("actions") is not None
 
     def max_steps(self, env: Any) -> int:
@@ -204,7 +197,7 @@ class LineTask(TaskClass):  # type: ignore[misc]
 
     @staticmethod
     def env_name() -> str:
-        """Return ``ethbrake``, the first part of the names of this package's tasks in BenchMARL."""
+        """Return ``ethbrake``, the first part of the names of this package's tasks."""
         return "ethbrake"
 
 

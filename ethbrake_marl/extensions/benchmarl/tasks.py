@@ -22,11 +22,10 @@ class _Scenarios(Task):  # type: ignore[misc]  # Task has no types if the extra 
 
     @staticmethod
     def associated_class() -> type[LineTask]:
-        """Return ``LineTask``, because every task here is a ``LineTask``."""
         return LineTask
 
     def get_from_yaml(self, path: str | None = None) -> LineTask:
-        """Return a task for the scenario file ``path``, or, if ``path`` is None, for the shipped scenario of this task.
+        """Return a task for the scenario file ``path``, or, if ``path`` is None, for this task's shipped scenario.
 
         The reward of the task is minus the harm, and there is no shield.
         """

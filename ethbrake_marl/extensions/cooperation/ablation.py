@@ -25,16 +25,10 @@ def run_ablation(
 ) -> tuple[Json, list[Path]] | None:
     """Do all training runs of an ablation, evaluate the trained policies, and write the page, tables and figures.
 
-    Args:
-        plan: settings of the ablation.
-        jobs: number of training runs that run at the same time, and number of threads in the search for joint optima.
-        machine: description of the computer on which the ablation runs; it is stored with the results.
-        tell: function that is called with each progress report; None: progress is not reported.
-
-    Returns the content of ``ablation.json``, and the paths of the page, the Markdown file and the figures. Returns None
-    if Ctrl-C stopped the training runs. Output files of an earlier call are replaced. Raises the exceptions of
-    ``StudyFolder.work``, ``train_all`` and ``measure``.
-
+    ``jobs`` is the number of training runs at the same time, and of threads in the search for joint optima. ``machine``
+    describes the computer; it is stored with the results. Returns the content of ``ablation.json``, and the paths of
+    the page, the Markdown file and the figures. Returns None if Ctrl-C stopped the training runs. Output files of an
+    earlier call are replaced. Raises the exceptions of ``StudyFolder.work``, ``train_all`` and ``measure``.
     """
     with plan.study_folder().work():
         if not train_all([training for _, _, training in plan.trainings()], jobs, tell):
@@ -56,15 +50,14 @@ class Cost(NamedTuple):
 
     @property
     def total_s(self) -> float:
-        """Estimated time that the ablation still needs: training, search and evaluation (s)."""
+        """Training, search and evaluation together, s."""
         return self.training_s + self.search_s + self.driving_s
 
     def to_json(self) -> Json:
-        """Return the estimate as a mapping for JSON."""
         return {**self._asdict(), "damaged": [str(file) for file in self.damaged], "total_s": self.total_s}
 
     def __str__(self) -> str:
-        """Return the estimate as text, with one more line for each damaged result file of a search."""
+        """Return the estimate as text, with one more line for each damaged file."""
         speed = f" at {self.decisions / self.training_s:,.0f}/s" if self.training_s > 0.0 else ""
         text = Timed.in_words
         line = (
@@ -82,11 +75,11 @@ HOW_MEASURED = (
 
 
 def ablation_cost(plan: Plan) -> Cost:
-    """Estimate the time that an ablation still needs, as processor time of one core.
+    """Estimate the time that an ablation still needs.
 
     The function measures the time of a short training run for each level and recipe, of a short evaluation, and of a
-    short search for the joint optimum. In a sweep, the function measures the time of one level only, because all levels
-    of a sweep take about the same time.
+    short search for the joint optimum. In a sweep it measures only one level, because all levels take about the same
+    time.
 
     Raises the exceptions of ``TrainingJob.steps_left``. Raises the exceptions of ``load_team`` if the policies of a
     finished training run cannot be loaded.

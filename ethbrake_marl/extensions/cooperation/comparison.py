@@ -26,19 +26,16 @@ from ethbrake_marl.shields.episodes import Shielded
 def compare(measured: Sequence[Measured], searched: int) -> Json:
     """Return the comparison of all levels as a mapping for JSON. docs/extensions/cooperation.md describes the keys.
 
-    Four keys of the mapping contain a list:
+    Four keys contain a list:
 
     - ``levels``: results of each level and algorithm;
     - ``steps``: for each algorithm, the change of harm from each level to the next;
     - ``channels``: change of harm from a level to the same level with a worse V2X channel;
     - ``undertrained``: one sentence that names the levels whose trained policies do worse than full braking; empty if
-      there are no such levels.
+      there are none.
 
-    Args:
-        measured: result of ``measure``.
-        searched: number of worlds in which the joint optimum was searched: the first worlds of the list. Comparisons
-            with the joint optimum use only the first ``searched`` worlds.
-
+    The joint optimum was searched in the first ``searched`` worlds of the list; comparisons with it use only these
+    worlds.
     """
     algorithms = [m.algorithm for m in measured if m.algorithm is not None]
     steps, channels = [], []
@@ -70,8 +67,8 @@ def _undertrained(measured: Sequence[Measured]) -> list[str]:
 def _level(one: Measured, searched: int) -> Json:
     """Return the results of one level with one algorithm: mean harm (m2/s2) in all worlds and in the searched worlds.
 
-    The searched worlds are the first ``searched`` worlds. The result also contains the mean joint optimum and the share
-    of the possible reduction, both for the searched worlds.
+    The joint optimum was searched in the first ``searched`` worlds. For these worlds the result also has the mean joint
+    optimum and the share of the possible reduction.
     """
     scenario = one.level.scenario
     of_searched = None if one.clusters is None else one.clusters[:searched]
@@ -119,15 +116,10 @@ def _level(one: Measured, searched: int) -> Json:
 
 
 def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: int) -> Json:
-    """Return the results of one level with a shield, and how they differ from the results without a shield.
+    """Return the results of one level with a shield, and how they differ from the results ``one`` without a shield.
 
-    Args:
-        one: results of the level without a shield.
-        shielded: results of the same policies in the same worlds, with a shield.
-        harm_count: harm that the shield bounds: first-impact harm (``first``) or total harm (``total``).
-        searched: number of worlds in which the joint optimum was searched; the result also contains the mean harm over
-            the first ``searched`` worlds.
-
+    ``harm_count`` is the harm that the shield bounds. The result also contains the mean harm over the first
+    ``searched`` worlds.
     """
     before, after = one.reached.vehicle[harm_count], shielded.vehicle_harm
     mean = partial(mean_over_seeds, clusters=one.clusters)
@@ -153,9 +145,8 @@ def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: 
 def _change(before: Measured, after: Measured, algorithm: str) -> Json:
     """Return (harm at level ``after``) - (harm at level ``before``), averaged over the same worlds.
 
-    The result has the form ``{"from": name, "to": name, "algorithm": name, "first": changes, "total": changes}``. For
-    each count of harm, ``changes`` contains the change of harm of the whole line and of each vehicle. ``algorithm`` is
-    the name of the training algorithm, which is stored in the result.
+    The result has the form ``{"from": name, "to": name, "algorithm": name, "first": changes, "total": changes}``.
+    ``changes`` has the change of harm of the line and of each vehicle.
     """
     entry: Json = {"from": before.level.name, "to": after.level.name, "algorithm": algorithm}
     if before.level.swept is not None and after.level.swept is not None:

@@ -38,10 +38,7 @@ def swept_axis(results: Json) -> str | None:
 def sweep_figures(results: Json, caption: str) -> list[Figure]:
     """Return the two figures of a sweep, with swept values on a linear x axis, and with 95 % confidence intervals.
 
-    Args:
-        results: content of ``ablation.json``.
-        caption: text below each figure.
-
+    ``results`` is the content of ``ablation.json``.
     """
     return [_harm_curves(results, caption), _who_bears(results, caption)]
 
@@ -105,15 +102,10 @@ def algorithms(results: Json) -> list[str]:
 def with_intervals(
     axes: Axes, at: Sequence[float], estimates: Sequence[Estimate], *, upright: bool = True, **style: Any
 ) -> None:
-    """Draw each estimate as a mark, and its confidence interval as whiskers.
+    """Draw each estimate as a mark at the positions ``at``, and its confidence interval as whiskers.
 
-    Args:
-        axes: axes to draw on.
-        at: position of each mark on the x axis if ``upright`` is true, else on the y axis.
-        estimates: value and confidence interval of each mark.
-        upright: if True, the y axis shows the values; if False, the x axis shows the values.
-        style: further arguments of matplotlib's ``errorbar``.
-
+    The y axis shows the values if ``upright`` is true, otherwise the x axis. ``style`` is for matplotlib's
+    ``errorbar``.
     """
     values = np.array([each.value for each in estimates])
     errors = np.abs(np.array([each.ends for each in estimates]).T - values)
@@ -147,16 +139,13 @@ def _curve(
 
 
 def _places(levels: Sequence[Json], beside: int) -> list[float]:
-    """Return the x position of each level's mark: the varied key's value, moved to the right.
-
-    The mark is moved by ``beside`` times ``_BESIDE`` times the length of the axis.
-    """
+    """Return the x position of each level's mark: the swept value plus ``beside * _BESIDE`` times the axis' length."""
     low, high = _span(levels)
     return [level["swept_number"] + beside * _BESIDE * (high - low) for level in levels]
 
 
 def _span(levels: Sequence[Json]) -> tuple[float, float]:
-    """Return the smallest and the largest number on the x axis, which covers 0 and the varied key's values."""
+    """Return the ends of the x axis, which covers 0 and the swept values."""
     numbers = [level["swept_number"] for level in levels]
     return min(*numbers, 0.0), max(*numbers, 0.0)
 
@@ -164,7 +153,7 @@ def _span(levels: Sequence[Json]) -> tuple[float, float]:
 def _number_axis(axes: Axes, results: Json) -> None:
     """Set range, ticks and label of the x axis, and let the y axis begin at 0.
 
-    The x axis has ticks at 0 and at each swept value, unless the labels of these ticks would overlap.
+    The x axis has ticks at 0 and at each swept value, unless their labels would overlap.
     """
     numbers = sorted({0.0, *(level["swept_number"] for level in results["levels"])})
     low, high = _span(results["levels"])

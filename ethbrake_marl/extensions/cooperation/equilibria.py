@@ -1,9 +1,8 @@
 """Equilibria of several learners: each learner in turn improves its own commands, until no learner can improve.
 
-A *profile* is the sequence of a learner's commands in a whole episode. The profile is fixed at the alert (open loop),
-so no learner reacts to what the other learners do. The learners know the whole world. One learner after the other
-searches for the profile that is best for its own objective while the other learners keep their profiles. The search
-ends if no learner finds a better profile.
+A learner's profile is fixed at the alert (open loop), so no learner reacts to what the other learners do. The learners
+know the whole world. One learner after the other searches for the profile that is best for its own objective while the
+other learners keep their profiles. The search ends if no learner finds a better profile.
 """
 
 from __future__ import annotations
@@ -75,25 +74,21 @@ class _Game(NamedTuple):
         return self._replace(worlds=self.worlds.take(rows), joint=self.joint.take(rows), others=self.others[rows])
 
     def together(self, own: list[Profiles]) -> Profiles:
-        """Join the profiles ``own``, one for each learner, into one profile with the commands of all learners.
-
-        Each phase of the joined profile lasts from one decision to the next.
-        """
+        """Join the profiles ``own``, one for each learner, into one profile with a phase for each decision."""
         steps = np.arange(int(self.joint.last_step.max()))
         at = [np.concatenate([each.at(np.full(self.joint.n, step)) for each in own], axis=1) for step in steps]
         return Profiles(np.minimum(steps + 1, self.joint.last_step[:, np.newaxis]), np.stack(at, axis=1))
 
     def amount(self, c: int, own: list[Profiles]) -> Floats:
-        """Return the objective of learner ``c`` (from 0), [n] m2/s2, if all learners follow the profiles ``own``."""
+        """Return the objective of learner ``c`` (from 0), [n] m2/s2, if all learners follow ``own``."""
         problem = minimising(self.joint, self.worlds, self.declared, self.task.vehicles[c : c + 1])
         return problem.values(self.together(own))[self.task.harm_count]
 
     def response(self, c: int, own: list[Profiles], effort: Mapping[str, int]) -> Profiles:
         """Search for the profile with the lowest objective of learner ``c`` (from 0) if the others follow ``own``.
 
-        ``effort`` contains keyword arguments of ``search_profiles``, such as ``budget``. For the same commands, the
-        search for one learner and the search for all learners (``joint``) may compute slightly different harms, because
-        of rounding.
+        ``effort`` are keyword arguments of ``search_profiles``. For the same commands, the search for one learner and
+        the search for all learners (``joint``) may compute slightly different harms, because of rounding.
         """
         task, others = replace(self.task, vehicles=self.task.vehicles[c : c + 1]), self.others
         problem = profile_problem(
@@ -138,9 +133,8 @@ def find_equilibria(
 
     In every round, each learner searches for a profile that lowers its own objective, and adopts this profile if the
     objective falls by more than ``tolerance``. If no learner changes its profile in a round, the result is an
-    approximate equilibrium of open-loop profiles. The equilibrium is only approximate because a search tries only
-    ``budget`` profiles. A world may have further equilibria. The result for a world does not depend on the other worlds
-    or on ``threads``.
+    equilibrium of open-loop profiles; it is only approximate because a search tries only ``budget`` profiles. A world
+    may have further equilibria. The result for a world does not depend on the other worlds or on ``threads``.
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.extensions.cooperation import compare_starts, find_equilibria
@@ -152,10 +146,10 @@ def find_equilibria(
     Args:
         scenario: scenario of the worlds, with at least one learner.
         worlds: the n worlds at the alert.
-        objective: objective that each learner minimises: one for all, such as ``own``, or one for each vehicle of the
-            line; None: the objective of the scenario.
-        harm_count: impacts that count as harm: ``first`` (first impact of each pair), or ``total`` (all impacts).
-        budget: number of candidate profiles that one search tries per world.
+        objective: objective of each learner: one for all, such as ``own``, or one for each vehicle of the line; None:
+            the objective of the scenario.
+        harm_count: ``first`` or ``total``.
+        budget: number of profiles that one search tries per world.
         rounds: largest number of rounds; every learner searches once in a round.
         tolerance: gain that a learner must exceed to change its profile, m2/s2.
         seed: seed of the random start and of the searches.
@@ -217,11 +211,8 @@ def _settle(game: _Game, own: list[Profiles], rounds: int, tolerance: float, eff
 def compare_starts(ends: Mapping[str, Equilibrium], harm_count: HarmCount, tolerance: float = 0.1) -> Spread:
     """Compare, in each world, the equilibria that were reached from different starts.
 
-    Args:
-        ends: result of ``find_equilibria``.
-        harm_count: which harm to compare, first-impact harm (``first``) or total harm (``total``).
-        tolerance: two equilibria count as equal if the harm of each vehicle differs by at most ``tolerance`` (m2/s2).
-
+    ``ends`` is the result of ``find_equilibria``. Two equilibria count as equal if the harm of each vehicle differs by
+    at most ``tolerance`` (m2/s2).
     """
     converged = np.stack([each.converged for each in ends.values()])
     borne = np.where(converged[:, :, np.newaxis], np.stack([each.borne[harm_count] for each in ends.values()]), np.nan)
@@ -241,18 +232,17 @@ def best_joint_harm(
     seed: int = 0,
     threads: int = 1,
 ) -> dict[HarmCount, Floats]:
-    """Return the harm of each vehicle in the joint optimum, as a mapping: count of harm -> [n, N] harm (m2/s2).
+    """Return the harm of each vehicle in the joint optimum: count of harm -> [n, N] harm (m2/s2).
 
-    The joint optimum is the least known harm of the line that the learners can achieve together. In each world, the
-    joint optimum is the result with the least harm among the equilibria ``ends`` and the result of ``best_harm``, which
-    searches the commands of all learners together.
+    In each world, the joint optimum is the result with the least harm of the line among the equilibria ``ends`` and the
+    result of ``best_harm``, which searches the commands of all learners together.
 
     Args:
         scenario: scenario of the worlds.
         worlds: the n worlds at the alert.
         ends: equilibria of the scenario's learners in ``worlds``, for any objectives of the learners.
-        harm_count: impacts that count as harm in the search: ``first`` (first impact of each pair), or ``total`` (all).
-        budget: number of candidate profiles that ``best_harm`` tries per world.
+        harm_count: count that the search minimises, ``first`` or ``total``.
+        budget: number of profiles that ``best_harm`` tries per world.
         seed: seed of the random numbers in ``best_harm``.
         threads: number of threads of ``best_harm``.
 
@@ -271,8 +261,8 @@ def price_of_anarchy(borne: Floats, optimum: Floats) -> Estimate | None:
     """Return (line's mean harm in equilibrium) / (line's mean harm in the joint optimum) and its confidence interval.
 
     For the worst equilibria (``Spread.worst``), the ratio is called the price of anarchy. For the best equilibria
-    (``Spread.best``), the ratio is called the price of stability. The function returns None if the harm of the joint
-    optimum is 0 in every world.
+    (``Spread.best``), the ratio is called the price of stability. The result is None if the harm of the joint optimum
+    is 0 in every world.
 
     Args:
         borne: [n, N] harm of each vehicle in equilibrium, m2/s2. Worlds with NaN (no equilibrium) are left out.

@@ -1,4 +1,7 @@
-"""Figures of an ablation: harm at each level, and change of harm from level to level, also for each vehicle alone."""
+"""Figures of an ablation: harm at each level, and change of harm from level to level.
+
+``results`` is the content of ``ablation.json``.
+"""
 
 from __future__ import annotations
 
@@ -44,11 +47,6 @@ def ablation_figures(results: Json, caption: str) -> list[Figure]:
     The three figures show the line's harm at each level, the change of the line's harm from level to level, and the
     change of each vehicle's harm. Red text above a figure names the levels whose trained policies do worse than full
     braking.
-
-    Args:
-        results: content of ``ablation.json``.
-        caption: text below each figure.
-
     """
     if swept_axis(results) is None:
         figures = [_harm_curve(results, caption), _change_figure(results, caption), _who_pays(results, caption)]
@@ -156,7 +154,7 @@ def _who_pays(results: Json, caption: str) -> Figure:
 def signed_ticks(low: float, high: float) -> list[float]:
     """Return the ticks of an axis from ``low`` to ``high``: 0 and round numbers.
 
-    The axis is linear between -0.1 and 0.1 m2/s2 (``LINEAR``), and logarithmic outside this range.
+    The axis is linear between -0.1 and 0.1 m2/s2 (``LINEAR``), and logarithmic outside.
     """
     first = -1 if max(-low, high) > LINEAR else -3
     ticks: list[float] = []
@@ -169,9 +167,9 @@ def signed_ticks(low: float, high: float) -> list[float]:
 
 
 def _place(level: Json, ladder: Sequence[str]) -> float:
-    """Return the x position of a level: the index of its name in ``ladder``.
+    """Return the x position of a level: its index in ``ladder``.
 
-    A level that is a copy of an earlier level with a worse V2X channel is drawn to the right of the earlier level.
+    A copy of an earlier level with a worse V2X channel is drawn to the right of that level.
     """
     return ladder.index(level["clear"] or level["level"]) + (0.0 if level["clear"] is None else _BESIDE)
 
@@ -181,14 +179,7 @@ def _reached(
 ) -> None:
     """Draw the harm of one algorithm's trained policies at each level, with a dot for each training seed.
 
-    Args:
-        axes: axes to draw on.
-        levels: results of all levels, from ``ablation.json``.
-        ladder: names of the levels from left to right.
-        harm_count: which harm to draw, first-impact harm (``first``) or total harm (``total``).
-        algorithm: name of the training algorithm.
-        number: index of the training algorithm, which determines the colour and the offset of its marks.
-
+    ``number`` is the index of the algorithm, which determines colour and offset of its marks.
     """
     own = [level for level in levels if level["algorithm"] in (None, algorithm)]
     style = series_style(number + 1 if number == 0 else number + 3)

@@ -1,9 +1,12 @@
 """Joint optimum of a level: in each world, the least known harm that the level's learners can achieve together.
 
-The joint optimum depends on the worlds, on the learners and on the scripts of the other vehicles. The joint optimum
-does not depend on what the learners know or on their objectives. Levels that differ only in information or objectives
-therefore share one search for the joint optimum. The best commands of one level are also used for every other level
-whose learners can give the same commands.
+The joint optimum depends on the worlds, on the learners and on the scripts of the other vehicles, but not on what the
+learners know or on their objectives. Levels that differ only in information or objectives therefore share one search
+for the joint optimum. The best commands of one level are also used for every other level whose learners can give the
+same commands.
+
+Arguments that several functions share: ``plan`` are the settings of the ablation, and ``samples`` the worlds of each
+level in the order of ``plan.levels``. ``jobs`` is the number of threads of the search.
 """
 
 from __future__ import annotations
@@ -56,13 +59,8 @@ class LevelOptimum:
 def questions(plan: Plan, samples: Sequence[Sample]) -> list[tuple[Level, Sample, list[Level]]]:
     """Return the searches for joint optima that an ablation needs, each as (level, worlds to search, list of levels).
 
-    Levels with the same search problem share one search. The list of levels contains all levels that share the search,
-    and ``level`` is the first level in this list. Levels without learners need no search.
-
-    Args:
-        plan: settings of the ablation.
-        samples: worlds of each level, in the order of ``plan.levels``.
-
+    Levels with the same search problem share one search: the list contains them all, and ``level`` is the first of
+    them. Levels without learners need no search.
     """
     by_content: dict[bytes, tuple[Level, Sample, list[Level]]] = {}
     rows = np.arange(plan.search_episodes)
@@ -75,16 +73,9 @@ def questions(plan: Plan, samples: Sequence[Sample]) -> list[tuple[Level, Sample
 
 
 def search_all(plan: Plan, samples: Sequence[Sample], jobs: int, tell: OnProgress) -> dict[str, BestHarmTable]:
-    """Search the joint optimum of every level with learners; return a dictionary from a level's name to the result.
+    """Search the joint optimum of every level with learners; return the results by name of the level.
 
-    Results of earlier searches are read from the folder of the ablation, and these searches are not repeated.
-
-    Args:
-        plan: settings of the ablation.
-        samples: worlds of each level, in the order of ``plan.levels``.
-        jobs: number of threads in the search for joint optima.
-        tell: function that is called with each progress report.
-
+    Results of earlier searches are read from the folder of the ablation.
     """
     tables: dict[str, BestHarmTable] = {}
     for level, part, alike in questions(plan, samples):
@@ -105,13 +96,10 @@ def _tell(tell: OnProgress, name: str, done: int, total: int) -> None:
 
 
 def best_known(own: LevelOptimum, answers: Sequence[LevelOptimum]) -> dict[HarmCount, Floats]:
-    """Return the least known harm in each world of a level, as a mapping: count of harm -> [n] harm (m2/s2).
+    """Return the least known harm in each world of the level ``own``: count of harm -> [n] harm (m2/s2).
 
-    Args:
-        own: level whose least known harm is returned, with its search result and its trained teams.
-        answers: all levels, including ``own``, with their search results and teams. In a world, the function uses the
-            commands of another level if the learners of ``own`` can give the same commands.
-
+    ``answers`` are all levels, including ``own``. In a world, the commands of another level are used if the learners of
+    ``own`` can give the same commands.
     """
     best = {harm_count: np.full(own.worlds.n, np.inf) for harm_count in HARM_COUNTS}
     for other in answers:
@@ -126,10 +114,10 @@ def best_known(own: LevelOptimum, answers: Sequence[LevelOptimum]) -> dict[HarmC
 def _can_imitate(own: LevelOptimum, other: LevelOptimum) -> Bools:
     """Return for each world, [n] bool, whether learners of ``own`` can give the commands of the learners of ``other``.
 
-    The result is True in a world if five conditions are met: each learner of ``other`` is also a learner in ``own``;
-    each scripted vehicle of ``own`` has the same script in ``other``; the lines of vehicles are the same; the latencies
-    are equal; and each decision time of ``other`` is also a decision time of ``own``. The result may be True if only
-    ``own`` has an obstacle on the road, because ``_harms`` simulates the commands of ``other`` with this obstacle.
+    The result is True if five conditions are met: each learner of ``other`` is also a learner in ``own``; each scripted
+    vehicle of ``own`` has the same script in ``other``; the lines of vehicles are the same; the latencies are equal;
+    and each decision time of ``other`` is also a decision time of ``own``. The result may be True if only ``own`` has
+    an obstacle on the road, because ``_harms`` simulates the commands of ``other`` with this obstacle.
     """
     mine, theirs = own.level.scenario, other.level.scenario
     same_scripts = all(theirs.scripts.get(i) == script for i, script in mine.scripts.items())
@@ -148,8 +136,7 @@ def _can_imitate(own: LevelOptimum, other: LevelOptimum) -> Bools:
 def _harms(own: LevelOptimum, other: LevelOptimum, rows: Ints) -> Iterator[dict[HarmCount, Floats]]:
     """Yield the harm in the worlds ``rows`` of level ``own`` if its learners give commands from level ``other``.
 
-    The function yields one mapping (count of harm -> [rows] harm in m2/s2) for each search result and for each team of
-    ``other``.
+    There is one mapping (count of harm -> [rows] harm in m2/s2) for each search result and for each team of ``other``.
     """
     scenario, task = other.level.scenario, Task(other.level.scenario, other.level.scenario.learners)
     worlds = replace(other.worlds, obstacle_gap_m=own.worlds.obstacle_gap_m).take(rows)
@@ -185,16 +172,9 @@ class Goal(NamedTuple):
 
     @classmethod
     def of(cls, training: Training, reached: Harms, full_brake: Harms) -> Goal:
-        """Return the quantity that a training run minimises: its mean with the trained policies and with full braking.
+        """Return the quantity that ``training`` minimises, from the harms in the same worlds.
 
-        If the recipe or the scenario has objectives, the quantity is the learners' objective. If neither the recipe nor
-        the scenario has objectives, the quantity is the harm of the whole line.
-
-        Args:
-            training: one training run at the level.
-            reached: harm in all worlds with the trained policies.
-            full_brake: harm in the same worlds if all vehicles brake fully.
-
+        This is the learners' objective if the recipe or the scenario has objectives, otherwise the harm of the line.
         """
         reward, scenario = training.recipe.reward, training.scenario
         objectives = reward.settled(scenario.objective, scenario.vehicles)[1]
@@ -209,13 +189,13 @@ class Goal(NamedTuple):
 
     @property
     def missed(self) -> bool:
-        """Whether the mean of the minimised quantity is larger with the trained policies than with full braking."""
+        """Whether the mean is larger with the trained policies than with full braking."""
         return self.reached > self.full_brake + TOLERANCE
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Results of one level of cooperation with one training algorithm, in the same worlds as all other levels."""
+    """Results of one level with one training algorithm, in the same worlds as all other levels."""
 
     level: Level  # the level
     algorithm: str | None  # name of the algorithm (recipe and scheme); None: the level has no learner
@@ -233,18 +213,12 @@ class Measured:
 def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[Measured]:
     """Evaluate the trained policies of all levels in the same worlds, and search the joint optimum of each level.
 
-    Results of earlier searches are reused. If a trained policy does less harm in a world than the best commands of the
-    search, the joint optimum of this world is the policy's harm.
-
-    Args:
-        plan: settings of the ablation. All training runs of the ablation must be finished.
-        jobs: number of threads in the search for joint optima.
-        tell: function that is called with each progress report; None: progress is not reported.
+    All training runs of the ablation must be finished. Results of earlier searches are reused. If a trained policy does
+    less harm in a world than the best commands of the search, the joint optimum of this world is the policy's harm.
 
     Returns one result for each level and algorithm: levels in the order of ``plan.levels``, and for each level the
     algorithms in the order of ``plan.algorithms``. Raises the exceptions of ``load_team`` and ``common_worlds`` before
     the evaluation and the search begin.
-
     """
     say = tell or (lambda progress: None)
     teams: dict[tuple[str, str], list[Team]] = {}
@@ -293,7 +267,7 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
 def _drive(scenario: Scenario, sample: Sample, drivers: Sequence[Driver], tell: OnProgress) -> Harms:
     """Let each of the agents or teams ``drivers`` drive in the same worlds; return their harm.
 
-    In the arrays [seeds, worlds] of the result, each agent or team has one row, as if it were one training seed.
+    Each agent or team has one row in the arrays [seeds, worlds] of the result.
     """
     outcomes = []
     for driver in drivers:

@@ -79,24 +79,19 @@ class Level:
 
     @property
     def columns(self) -> Json:
-        """Columns of result tables for the swept key and its value; an empty dictionary if there is no sweep."""
+        """Columns of result tables for the swept key and its value; empty if there is no sweep."""
         return {} if self.swept is None else self.swept.columns
 
 
 def read_levels(names: Sequence[str], settings: Sequence[Override] = ()) -> list[Level]:
     """Load the levels of an ablation.
 
-    A level that differs from an earlier level only in ``v2x`` is compared with this earlier level (``Level.clear``).
-    The levels without such an earlier level form the *ladder*: a sequence in which each level is compared with the
-    previous level.
+    A level that differs from an earlier level only in ``v2x`` is compared with that level (``Level.clear``). The other
+    levels form the *ladder*, in which each level is compared with the previous one.
 
-    Args:
-        names: names or paths of scenarios, in the order of the comparison.
-        settings: settings ``KEY=VALUE`` that replace values in every scenario.
-
-    Raises ``InvalidInput`` if there are fewer than two levels or if a level is repeated. Raises the exceptions of
-    ``load_runnable`` if a scenario cannot be loaded.
-
+    ``names`` are names or paths of scenarios; ``settings`` replace values in every scenario. Raises ``InvalidInput`` if
+    there are fewer than two levels or if a level is repeated. Raises the exceptions of ``load_runnable`` if a scenario
+    cannot be loaded.
     """
     levels: list[Level] = []
     for name in names:
@@ -120,16 +115,11 @@ def read_levels(names: Sequence[str], settings: Sequence[Override] = ()) -> list
 def sweep_levels(name: str, sweep: str, settings: Sequence[Override], recipes: Sequence[TrainingRecipe]) -> list[Level]:
     """Return one level for each value of a sweep, in ascending order of the values.
 
-    Args:
-        name: name or path of the scenario.
-        sweep: key of the scenario and the values that it takes, ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``.
-        settings: settings ``KEY=VALUE`` for keys of the scenario other than the key of the sweep.
-        recipes: training recipes of the ablation.
-
-    Raises ``InvalidInput`` if the key of the sweep is not a key of a scenario; if ``settings`` or a recipe also set
-    this key; or if levels with different values of this key cannot be compared. Raises the exceptions of
-    ``Swept.parse`` for an invalid ``sweep``, and of ``load_runnable`` if the scenario cannot be loaded.
-
+    ``name`` is the name or path of the scenario. ``sweep`` is a text ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``.
+    ``settings`` are for other keys of the scenario. Raises ``InvalidInput`` if the key of the sweep is not a key of a
+    scenario; if ``settings`` or a recipe also set this key; or if levels with different values of this key cannot be
+    compared. Raises the exceptions of ``Swept.parse`` for an invalid ``sweep``, and of ``load_runnable`` if the
+    scenario cannot be loaded.
     """
     values = Swept.parse(sweep)
     scenario = read_settings([values[0].setting], recipes).scenario
@@ -160,18 +150,12 @@ def sweep_levels(name: str, sweep: str, settings: Sequence[Override], recipes: S
 def common_worlds(levels: Sequence[Level], episodes: int, seed: int) -> list[Sample]:
     """Draw worlds for each level; world k has the same line of vehicles at all levels.
 
-    Two levels with different ``v2x`` may have different latencies. A level may have an obstacle that other levels do
-    not have. If a sweep varies a key of the vehicles, world k is drawn with the same random numbers at all levels, but
-    the vehicles of world k differ from level to level.
-
-    Args:
-        levels: the levels.
-        episodes: number of worlds for each level.
-        seed: seed from which the worlds are drawn.
+    Levels with different ``v2x`` may have different latencies, and a level may have an obstacle that others do not
+    have. If a sweep varies a key of the vehicles, world k is drawn with the same random numbers at all levels, but the
+    vehicles of world k differ from level to level.
 
     Raises ``InvalidInput``, which names the level and the quantity, if a quantity differs that must be the same at all
     levels.
-
     """
     samples = [level.scenario.sample(episodes, seed) for level in levels]
     if not levels[0].same_lines:
@@ -225,7 +209,7 @@ _FULL = {"seeds": 5, "steps_per_learner": 400_000, "episodes": 4_000, "search_ep
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Settings of an ablation, which trains policies at several levels of cooperation and compares them."""
+    """Settings of an ablation."""
 
     levels: tuple[Level, ...]  # levels to compare, in order
     recipes: tuple[TrainingRecipe, ...]  # training recipes; each has its scheme for several learners
@@ -246,10 +230,7 @@ class Plan:
         return tuple(algorithm(recipe) for recipe in self.recipes)
 
     def trainings(self) -> Iterator[tuple[Level, str, TrainingJob]]:
-        """Yield each training run of the ablation as (level, name of the algorithm, training run), ordered by seed.
-
-        Levels without learners have no training runs.
-        """
+        """Yield each training run as (level, name of the algorithm, training run), ordered by seed."""
         for seed in range(self.seeds):
             for recipe in self.recipes:
                 for level in self.levels:
@@ -271,7 +252,7 @@ class Plan:
         return TrainingJob(Training.of(recipe.replace(**changes), level.scenario), folder, noted)
 
     def settings(self) -> dict[str, Any]:
-        """Return a mapping of all settings that affect the results, such as levels, recipes and shield."""
+        """Return all settings that affect the results."""
         numbers = ("seeds", "steps_per_learner", "episodes", "list_seed", "search_episodes", "budget")
         return {
             "levels": [level.scenario.model_dump(mode="json", exclude=set(WORDS)) for level in self.levels],
@@ -281,13 +262,13 @@ class Plan:
         }
 
     def study_folder(self) -> StudyFolder:
-        """Return a ``StudyFolder`` for the ablation, which refuses a folder that contains results of other settings."""
+        """Return a ``StudyFolder``, which refuses a folder that contains results of other settings."""
         advice = f"give another folder (--output); to reuse its trained policies, give a copy without {SETTINGS}"
         written = (*FIGURES, *SWEEP_FIGURES, *(f"ablation.{ending}" for ending in ("html", "md", "csv", "json")))
         return StudyFolder(self.folder, "an ablation", self.settings(), record=SETTINGS, advice=advice, writes=written)
 
     def optimum_folder(self, level: Level) -> Path:
-        """Return the path of the folder in which the search for a level's joint optimum is stored."""
+        """Return the folder of the search for a level's joint optimum."""
         return self.folder / "optimum" / level.name
 
 
@@ -318,10 +299,10 @@ def plan_ablation(
     Args:
         levels: names or paths of scenarios, separated by commas; None: the shipped levels.
         recipes: names or paths of recipes, separated by commas.
-        settings: settings ``KEY=VALUE`` of scenarios and recipes; None: no settings.
-        sweep: key of a scenario and its values, ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``; None: no sweep.
-        quick: if True, numbers that ``given`` does not contain, such as the number of seeds, get small defaults.
-        tell: function that is called with a note if ``gamma`` and ``reward.shaping_discount`` of a recipe differ.
+        settings: settings ``KEY=VALUE`` of scenarios and recipes.
+        sweep: ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``; None: no sweep.
+        quick: True: numbers that ``given`` does not contain get small defaults.
+        tell: called with a note if ``gamma`` and ``reward.shaping_discount`` of a recipe differ.
         given: further fields of ``Plan``, such as ``seeds``; a field that is None gets its default.
 
     Raises ``InvalidInput`` if two recipes have the same name, if a number such as ``seeds`` is below 1, if the shield

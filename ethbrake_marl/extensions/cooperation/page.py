@@ -1,4 +1,8 @@
-"""Output files of an ablation: an HTML page, and its tables as Markdown, CSV and JSON."""
+"""Output files of an ablation: an HTML page, and its tables as Markdown, CSV and JSON.
+
+``results`` is the content of ``ablation.json``. ``conditions`` is a text that describes the worlds, the seeds and the
+machine.
+"""
 
 from __future__ import annotations
 
@@ -34,9 +38,9 @@ _MOST, _USUAL, _LEAST = 3, 2, 2  # number of example worlds with the largest, a 
 def choose_worlds(measured: Sequence[Measured]) -> list[Played]:
     """Choose worlds for the page by the decrease of total harm from the first to the last level.
 
-    In some of the chosen worlds the harm decreases most, in some by about the median, and in some least. The decrease
-    of harm is computed with the policies of the first seed. If a level differs from an earlier level only by a worse
-    V2X channel, this level is not used.
+    In some of these worlds the harm decreases most, in some by about the median, and in some least. The decrease is
+    computed with the policies of the first seed. Levels that differ from an earlier level only by a worse V2X channel
+    are not used.
     """
     ladder = [one for one in measured if one.level.clear is None]
     first, last = ladder[0], ladder[-1]
@@ -58,8 +62,7 @@ def choose_worlds(measured: Sequence[Measured]) -> list[Played]:
 def episodes_section(plan: Plan, measured: Sequence[Measured]) -> Section:
     """Return the section of the page that shows the episodes of all levels side by side.
 
-    The episodes are in the worlds that ``choose_worlds`` returns. At levels with learners, the learners drive with the
-    policies of the first seed.
+    The worlds come from ``choose_worlds``. Learners drive with the policies of the first seed.
     """
     played = choose_worlds(measured)
     rows = np.array([each.number for each in played], np.int64)
@@ -91,7 +94,7 @@ def levels_csv(measured: Sequence[Measured], searched: int) -> str:
     """Return CSV text with one row per level, algorithm and seed. Harms are means over all worlds (m2/s2).
 
     The columns ``searched_*`` are means over the first ``searched`` worlds, in which the joint optimum was searched.
-    The columns with results of the shield are empty if the teams were not evaluated with a shield.
+    The columns of the shield are empty if no team was evaluated with a shield.
     """
     return csv_text(_seed_row(one, seed, searched) for one in measured for seed in range(len(one.reached.collided)))
 
@@ -134,13 +137,7 @@ _ALGORITHM = "Algorithm"
 
 
 def markdown(results: Json, conditions: str) -> str:
-    """Return all tables of an ablation as Markdown.
-
-    Args:
-        results: content of ``ablation.json``.
-        conditions: text below the tables that describes the worlds, the seeds and the machine.
-
-    """
+    """Return all tables of an ablation as Markdown."""
     blocks = [f"**{line}**" for line in results["undertrained"]]
     blocks += [text for title, sheets in _blocks(results) for text in (f"## {title}", *(s.markdown() for s in sheets))]
     return "\n\n".join([*blocks, conditions]) + "\n"
@@ -151,12 +148,7 @@ def ablation_page(
 ) -> str:
     """Return the HTML page of an ablation.
 
-    Args:
-        results: content of ``ablation.json``.
-        conditions: text that describes the worlds, the seeds and the machine.
-        figures: dictionary from the name of a figure's file to the figure.
-        episodes: sections of the page that show single episodes.
-
+    ``figures`` are figures by file name. ``episodes`` are sections that show single episodes.
     """
     titles = FIGURES if swept_axis(results) is None else SWEEP_FIGURES
     drawn = [
@@ -182,10 +174,7 @@ def ablation_page(
 
 
 def _blocks(results: Json) -> list[tuple[str, list[Sheet]]]:
-    """Return the tables of an ablation in groups, each as (title of the group, tables).
-
-    ``results`` is the content of ``ablation.json``.
-    """
+    """Return the tables of an ablation in groups, each as (title of the group, tables)."""
     swept = swept_axis(results)
     shown = {
         level["level"]: f"`{level['level']}`" if swept is None else f"{level['swept_number']:g}"
@@ -267,13 +256,8 @@ _Columns = list[tuple[Column | str, str]]
 def _sheet(rows: Sequence[Json], columns: _Columns) -> Sheet:
     """Return a table with values from ``ablation.json``.
 
-    If all rows are results of the same algorithm, the table has no column with the name of the algorithm.
-
-    Args:
-        rows: for each row of the table, a nested mapping that contains the values of this row.
-        columns: for each column, its heading and the path of its values in ``rows``; the path ``first harm`` means
-            ``row["first"]["harm"]``.
-
+    ``columns`` are headings, each with the path of its values in ``rows``: ``first harm`` means
+    ``row["first"]["harm"]``. If all rows are results of the same algorithm, the table has no column for the algorithm.
     """
     if len({row["algorithm"] for row in rows} - {None}) == 1:
         columns = [(column, path) for column, path in columns if column != _ALGORITHM]
@@ -303,13 +287,8 @@ def _share(heading: str) -> Column:
 def write_ablation(plan: Plan, measured: Sequence[Measured], machine: str) -> tuple[Json, list[Path]]:
     """Write the HTML page, the Markdown, CSV and JSON files and the figures of an ablation; replace existing files.
 
-    Args:
-        plan: settings of the ablation.
-        measured: result of ``measure``.
-        machine: description of the computer on which the ablation ran, for the page and ``ablation.json``.
-
-    Returns the content of ``ablation.json``, and the paths of the page, the Markdown file and the figures.
-
+    ``machine`` describes the computer on which the ablation ran. Returns the content of ``ablation.json``, and the
+    paths of the page, the Markdown file and the figures.
     """
     settings = {
         **plan.settings(),

@@ -65,18 +65,10 @@ class Compared(NamedTuple):
 def make_section(experiment: Experiment, tell: OnProgress) -> RunSection | None:
     """Compare a run's trained team with learners trained alone, a team without messages, and the joint optimum.
 
-    The function trains each learner alone, trains a team without messages, and searches the joint optimum. In each
-    new training run, a learner makes as many decisions as in the original run. The new training runs are stored in
-    ``alone/`` and ``without-messages/`` in the folder of the run, and the results of the comparison in
-    ``cooperation.json``. If a training run is interrupted or fails, the function omits the remaining training runs and
-    the search.
-
-    Args:
-        experiment: the finished run, with its folder, policies and evaluation.
-        tell: function that is called with each progress report.
-
-    Returns the section of the report; None if the run has only one learner.
-
+    The result is None if the run has only one learner. In each new training run, a learner makes as many decisions as
+    in the original run. The new training runs are stored in ``alone/`` and ``without-messages/`` in the folder of the
+    run, and the results of the comparison in ``cooperation.json``. If a training run is interrupted or fails, the
+    remaining training runs and the search are omitted.
     """
     evaluation, team, by = experiment.evaluation, experiment.learned, experiment.evaluation.clusters
     if team != TRAINED_TEAM:
@@ -108,10 +100,7 @@ def make_section(experiment: Experiment, tell: OnProgress) -> RunSection | None:
 
 
 def _train_alone(experiment: Experiment, tell: OnProgress) -> dict[str, Team]:
-    """Train each learner alone while all other learners brake fully; return a dictionary from names to teams.
-
-    A team consists of one trained learner; the other learners brake fully.
-    """
+    """Train each learner alone while the others brake fully; return the resulting teams by name."""
     scenario, policies = experiment.evaluation.scenario, {}
     braking = make_agents(["full_brake"], scenario)["full_brake"]
     for vehicle in scenario.learners:
@@ -125,10 +114,10 @@ def _train_alone(experiment: Experiment, tell: OnProgress) -> dict[str, Team]:
 
 
 def _without_messages(experiment: Experiment, tell: OnProgress) -> tuple[list[Compared], str]:
-    """Train a team with sensors instead of messages; return comparisons with this team, and a sentence about this team.
+    """Train a team with sensors instead of messages; return comparisons with this team, and a sentence about it.
 
-    No comparison is made if the scenario has no messages, if the scenario is a mixture of scenarios, or if a team with
-    sensors cannot be trained. In this case, the sentence says why the list of comparisons is empty.
+    The list is empty if the scenario has no messages or is a mixture, or if such a team cannot be trained. The sentence
+    then says why.
     """
     evaluation, scenario = experiment.evaluation, experiment.evaluation.scenario
     if scenario.members or scenario.v2x.channel.hears == "none":
@@ -163,10 +152,9 @@ def _without_messages(experiment: Experiment, tell: OnProgress) -> tuple[list[Co
 def _joint_optimum(
     experiment: Experiment, outcomes: Mapping[str, Outcome], tell: OnProgress
 ) -> tuple[list[Compared], str]:
-    """Search the joint optimum; return a list with one comparison, and a sentence about the search.
+    """Search the joint optimum; return a list with its comparison with the team, and a sentence about the search.
 
-    The comparison is between the trained team and the joint optimum. If the search is impossible, the list of
-    comparisons is empty, and the sentence says why the search is impossible.
+    If the search is impossible, the list is empty, and the sentence says why.
     """
     evaluation = experiment.evaluation
     rows = np.arange(min(SEARCHED, evaluation.worlds.n))
@@ -200,15 +188,8 @@ def _joint_optimum(
 def _train(experiment: Experiment, scenario: Scenario, folder: str, share: int, tell: OnProgress) -> Team:
     """Train the learners of ``scenario`` with the recipe of the run; return the trained team.
 
-    Raises ``Stopped`` if the training run was interrupted or failed.
-
-    Args:
-        experiment: the finished run, whose recipe is used.
-        scenario: scenario to train in.
-        folder: name of the folder for this training run, inside the folder of the finished run.
-        share: the new training run makes (number of decisions of the finished run) / ``share`` decisions.
-        tell: function that is called with each progress report.
-
+    ``folder`` is a name inside the folder of the finished run. The new run makes 1 / ``share`` of its decisions. Raises
+    ``Stopped`` if the training run was interrupted or failed.
     """
     recipe, path = experiment.trained.training.recipe, experiment.run.path / folder
     path.parent.mkdir(exist_ok=True)
@@ -265,8 +246,7 @@ def _borne(outcomes: Mapping[str, Outcome], harm_count: HarmCount, evaluation: E
 def _added(experiment: Experiment) -> Sheet:
     """Return a table of the harm that each learner of the team prevents.
 
-    The harm that a learner prevents is (harm of the line if this learner brakes fully) - (harm of the line with the
-    whole team).
+    This is (harm of the line if this learner brakes fully) - (harm of the line with the whole team).
     """
     evaluation, scenario = experiment.evaluation, experiment.evaluation.scenario
     columns = [Column("Learner", "learner", text=True)]

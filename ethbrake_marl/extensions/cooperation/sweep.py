@@ -65,17 +65,16 @@ class Swept(NamedTuple):
 
     @property
     def number(self) -> float:
-        """The number in the value of the swept key, such as 15 in ``social:15``; figures show it on the x axis."""
+        """The number in the value, such as 15 in ``social:15``."""
         return float(self.text)
 
     @property
     def setting(self) -> str:
-        """The swept key and this value as a setting ``KEY=VALUE``, such as ``objective=social:15``."""
+        """A setting such as ``objective=social:15``."""
         return f"{self.key}={self.word}{self.text}"
 
     @property
     def override(self) -> Override:
-        """The setting ``KEY=VALUE`` as an ``Override``, which sets the key of a scenario to this value."""
         return Override.parse([self.setting])[0]
 
     @property
@@ -85,10 +84,10 @@ class Swept(NamedTuple):
 
     @property
     def label(self) -> str:
-        """Text that the name of the level ends with, such as ``social-15`` or ``v2x.lost-0.1``."""
+        """End of the level's name, such as ``social-15`` or ``v2x.lost-0.1``."""
         return f"{self.word.rstrip(':') or self.key}-{self.text}"
 
     @property
     def columns(self) -> dict[str, Any]:
-        """Columns of result tables for the swept key: the key, its value as text, and the number in this value."""
+        """Columns of result tables: the key, its value as text, and the number in the value."""
         return {"swept_key": self.key, "swept_value": f"{self.word}{self.text}", "swept_number": self.number}

@@ -58,10 +58,9 @@ _DATASET_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]*-v\d+")
 def check_folder(path: Path, *, force: bool = False) -> None:
     """Check, before episodes are recorded, that a Minari dataset can be written to the folder ``path``.
 
-    If ``force`` is true, ``path`` may be an existing Minari dataset, which will be replaced. Raises ``AlreadyExists``
-    if ``path`` exists and ``force`` is false. Raises ``InvalidInput`` if the name of the folder does not have the form
-    ``NAME-vNUMBER``, if its parent folder is missing or not writable, or if ``path`` exists but is not a Minari
-    dataset.
+    With ``force``, ``path`` may be an existing Minari dataset. Raises ``AlreadyExists`` if ``path`` exists and
+    ``force`` is false. Raises ``InvalidInput`` if the name of the folder does not have the form ``NAME-vNUMBER``, if
+    its parent folder is missing or not writable, or if ``path`` exists but is not a Minari dataset.
     """
     if _DATASET_NAME.fullmatch(path.name) is None:
         raise InvalidInput(f"{path}: the folder of a Minari dataset must be named NAME-vNUMBER, for instance brakes-v0")
@@ -88,16 +87,9 @@ def minari_folder(
 ) -> Iterator[Callable[[Recording], None]]:
     """Context manager that opens a new Minari dataset, and yields a function that adds a recording to the dataset.
 
-    The folder appears at ``path`` when the ``with`` block ends without an exception. Raises ``MissingExtra`` if minari
-    or h5py is not installed.
-
-    Args:
-        path: path of the folder, named ``NAME-vNUMBER``.
-        task: scenario, seed, reward and observation of the recordings.
-        told: metadata (result of ``tell``), which are stored in the dataset as JSON under the key ``ethbrake_marl``
-            when the ``with`` block ends. The caller may add entries to ``told`` until the ``with`` block ends.
-        force: whether to replace an existing dataset.
-
+    The folder appears at ``path`` (named ``NAME-vNUMBER``) when the ``with`` block ends without an exception. The
+    metadata ``told`` (result of ``tell``) are then stored as JSON under the key ``ethbrake_marl``; the caller may add
+    entries until then. Raises ``MissingExtra`` if minari or h5py is not installed.
     """
     with naming_extras():
         import h5py  # noqa: F401  # imported here so that a missing h5py raises our message, not Minari's
@@ -135,8 +127,8 @@ def minari_folder(
 def env_spec(task: Task) -> EnvSpec:
     """Return a Gymnasium spec of the environment in which recorded actions can be repeated.
 
-    ``gymnasium.make(spec)`` creates this environment. The spec contains only plain data, so it can be stored as JSON.
-    Raises ``InvalidInput`` if the scenario does not have exactly one learner.
+    The spec contains only plain data, so it can be stored as JSON. Raises ``InvalidInput`` if the scenario does not
+    have exactly one learner.
     """
     names = [task.scenario.vehicle_names[i] for i in task.scenario.learners]
     check_one_learner(
@@ -170,7 +162,7 @@ def _episodes(recording: Recording) -> Iterator[dict[str, Any]]:
 
 
 def _infos(recording: Recording, vehicle: int) -> dict[str, NDArray[Any]]:
-    """Return the environment's ``info`` for ``vehicle`` (0 = front): dictionary from keys to values [T + 1, n, ...]."""
+    """Return the environment's ``info`` for ``vehicle`` (0 = front): key -> values [T + 1, n, ...]."""
     infos = {name: recording.told(name)[:, :, vehicle] for name in recording.reports[0].columns()}
     cost = np.stack([each.cost for each in recording.reports])
     news = [each.known_from_s[:, vehicle] for each in recording.reports if each.known_from_s is not None]
@@ -195,7 +187,7 @@ _NEEDED_PACKAGES: dict[DatasetFormat, tuple[str, ...]] = {"parquet": ("pyarrow",
 
 @dataclass(frozen=True, slots=True)
 class DatasetSummary:
-    """Summary of a dataset that ``write_dataset`` has written."""
+    """Result of ``write_dataset``."""
 
     path: Path  # path of the file or folder
     format: DatasetFormat  # ``parquet`` or ``minari``
@@ -230,17 +222,16 @@ def write_dataset(
 
     Args:
         path: file (``.parquet``) or folder (``NAME-v0``) to write.
-        agents: names of agents as on the command line, or a mapping from names to agents or teams. In its
-            own episodes, each agent drives all learners of the scenario. The function does not change the agents.
+        agents: names of agents as on the command line, or a mapping from names to agents or teams. Each drives all
+            learners of the scenario in its own episodes. Agents are not changed.
         scenario: a ``Scenario``, or its name or path.
         episodes: number of worlds in which each agent drives: the worlds 0 to ``episodes`` - 1 of ``seed``.
         seed: seed from which the worlds are drawn.
-        format: ``parquet`` or ``minari``; None: the ending of ``path`` selects the format.
+        format: ``parquet`` or ``minari``; None: by the ending of ``path``.
         reward: reward to record: a name such as ``harm``, or the weights of the reward's terms.
-        observation: features to record as observation; None: the features that ``observation_for(scenario)`` returns.
+        observation: features to record; None: the features that ``observation_for(scenario)`` returns.
         force: whether to replace an existing dataset.
-        on_progress: function that is called with the name of an agent and the number of worlds so far recorded with
-            this agent.
+        on_progress: called with the name of an agent and the number of its worlds recorded so far.
 
     """
     check_whole_number("write_dataset: episodes", episodes, 1)
@@ -289,16 +280,9 @@ def write_dataset(
 def check_dataset(
     path: str | Path, scenario: Scenario, format: str | None = None, *, force: bool = False
 ) -> DatasetFormat:
-    """Check that a dataset of ``scenario`` can be written to ``path``, and return the format of the dataset.
+    """Check that a dataset of ``scenario`` can be written to ``path``; return its format.
 
-    Raises the exceptions that ``write_dataset`` raises before the first episode.
-
-    Args:
-        path: file (``.parquet``) or folder (``NAME-v0``) to write.
-        scenario: scenario whose learners are recorded.
-        format: ``parquet`` or ``minari``; None: the ending of ``path`` selects the format.
-        force: whether an existing dataset may be replaced.
-
+    The arguments mean the same as in ``write_dataset``, as do the exceptions before the first episode.
     """
     target = Path(path)
     is_file = target.suffix.lower() == ".parquet"
@@ -323,14 +307,7 @@ def check_dataset(
 
 
 def tell(task: Task, agents: Mapping[str, Driver], episodes: int) -> dict[str, Any]:
-    """Return the metadata of a dataset as plain data: scenario, seed, agents, observation, reward and package versions.
-
-    Args:
-        task: scenario, seed, reward and observation of the recordings.
-        agents: dictionary from names to recorded agents or teams.
-        episodes: number of worlds in which each agent drives.
-
-    """
+    """Return the metadata of a dataset as plain data: scenario, seed, agents, observation, reward and versions."""
     scenario = task.scenario
     teams = {name: Team.of(driver, scenario.learners).drivers for name, driver in agents.items()}
     return {

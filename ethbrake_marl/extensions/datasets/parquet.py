@@ -26,14 +26,9 @@ OF_STEPS = ("reward", "terminated", "truncated")
 def parquet_dataset(path: Path, told: Mapping[str, Any]) -> Iterator[Callable[[Recording], None]]:
     """Context manager that opens a new Parquet file, and yields a function that adds a recording to the file.
 
-    The file appears at ``path`` when the ``with`` block ends without an exception. Raises ``MissingExtra`` if pyarrow
-    is not installed.
-
-    Args:
-        path: path of the file.
-        told: metadata (result of ``tell``), which are stored in the file as JSON under the key ``ethbrake_marl`` when
-            the ``with`` block ends. The caller may add entries to ``told`` until the ``with`` block ends.
-
+    The file appears at ``path`` when the ``with`` block ends without an exception. The metadata ``told`` (result of
+    ``tell``) are then stored as JSON under the key ``ethbrake_marl``; the caller may add entries until then. Raises
+    ``MissingExtra`` if pyarrow is not installed.
     """
     with naming_extras():
         import pyarrow
@@ -48,21 +43,20 @@ def parquet_dataset(path: Path, told: Mapping[str, Any]) -> Iterator[Callable[[R
 
 
 def decision_columns(recording: Recording) -> Columns:
-    """Return the columns of the Parquet file for one recording, as a dictionary from their names to their values.
+    """Return the columns of the Parquet file for one recording, by name.
 
-    Each value of a column belongs to one decision. The decisions are ordered by world, then by time.
-
-    docs/extensions/datasets.md describes the columns.
+    A column has one value for each decision, ordered by world, then by time. docs/extensions/datasets.md describes the
+    columns.
     """
     running = recording.running
     before = recording.told
 
     def each(values: NDArray[Any]) -> NDArray[Any]:
-        """Return, for each decision, its element of ``values`` [T or T + 1, n, ...], ordered by world, then by time."""
+        """Return, for each decision, its element of ``values`` [T or T + 1, n, ...]."""
         return values[: running.shape[1]].swapaxes(0, 1)[running]
 
     def whole(values: NDArray[Any]) -> NDArray[Any]:
-        """Return, for each decision, the element of ``values`` [n] that belongs to the episode of the decision."""
+        """Return, for each decision, the element of ``values`` [n] for its episode."""
         return np.repeat(values, recording.decisions)
 
     in_force, chosen = before("command_in_force_mps2"), before("chosen_command_mps2")[1:]

@@ -6,9 +6,11 @@ and its commands are rounded to actions. In the second episode, which is recorde
 environment that gets the recorded actions repeats the second episode bit for bit.
 
 If two vehicles almost miss each other, the last bit of an action can decide whether they have an impact. Therefore, if
-rounding to the nearest action changes the harm of a world, the code also tries two other roundings: all actions of this
-world down, and all actions up. The recording contains the actions of the rounding that changes the harm of the world
-least.
+rounding to the nearest action changes the harm of a world, the code also tries to round all actions of this world down,
+and all up. The recording contains the rounding that changes the harm of the world least.
+
+In the shapes, ``n`` is the number of worlds, ``T`` the number of decisions in the longest episode, ``L`` the number of
+learners, and ``F`` the number of observed features.
 """
 
 from __future__ import annotations
@@ -54,8 +56,7 @@ class Task:
 class Recording:
     """Recorded episodes of one agent in ``n`` worlds.
 
-    In the shapes, ``T`` is the number of decisions in the longest episode, ``L`` the number of learners, and ``F`` the
-    number of observed features. If an episode has fewer than T decisions, array elements after its end have no meaning.
+    If an episode has fewer than T decisions, array elements after its end have no meaning.
     """
 
     agent: str  # name of the agent
@@ -89,8 +90,7 @@ class Recording:
     def terms(self) -> dict[str, Floats]:
         """Return the terms of the reward without their weights: name of the term -> values [T + 1, n, L].
 
-        Values with the first index t + 1 belong to time step t. Values with the first index 0 belong to the time before
-        the first time step; these values are 0.
+        Values with the first index t + 1 belong to time step t. Values with the first index 0 are 0.
         """
         shape = (len(self.index), self.task.scenario.vehicles)
         terms = {}
@@ -104,16 +104,8 @@ class Recording:
 def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Recording:
     """Let an agent drive the learners of the scenario, and record the episodes.
 
-    The commands of the agent are rounded to float32 actions, and the recorded episodes use these actions. If there are
-    worlds that the physics cannot simulate, raises ``PhysicsError``, which names these worlds. Raises the exceptions of
-    ``episode_engine`` before the first episode begins.
-
-    Args:
-        sample: the worlds, at the alert, in which the episodes are recorded.
-        driver: agent or team that drives the learners.
-        name: name of the agent in the recording.
-        task: scenario, seed, reward and observation of the recording.
-
+    ``sample`` are worlds at the alert. Raises ``PhysicsError``, which names the worlds that the physics cannot
+    simulate. Raises the exceptions of ``episode_engine`` before the first episode begins.
     """
     scenario, learners = task.scenario, task.scenario.learners
     engine = episode_engine(sample.worlds, Team.of(driver, learners), scenario)
@@ -152,16 +144,9 @@ def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Re
 def _rounded(commanded: Floats, worlds: Worlds, evaluated: Ledger, task: Task) -> tuple[Float32s, Floats]:
     """Round the commands to float32 actions; in each world, choose the rounding that changes the harm least.
 
-    Three roundings are possible: all commands of a world to the nearest action, all down, or all up. Rounding down and
-    rounding up are tried only if the nearest actions change the harm of the world by more than ``SLACK``. Returns the
-    rounded actions, [T, n, L], and how much the rounding changes the harm of each world, [n] m2/s2.
-
-    Args:
-        commanded: commands as float64 actions in [-1, 1], before rounding, [T, n, L].
-        worlds: the n worlds at the alert.
-        evaluated: harm of the episodes that were simulated with the commands before rounding.
-        task: scenario, seed, reward and observation of the recording.
-
+    The roundings down and up are tried only if the nearest actions change the harm by more than ``SLACK``.
+    ``commanded`` [T, n, L] are the commands as float64 actions, and ``evaluated`` is the harm of the episodes with
+    these. Returns the rounded actions, [T, n, L], and the change of harm, [n] m2/s2.
     """
     nearest = commanded.astype(np.float32)
     best, off_by = nearest.copy(), _off_by(nearest, worlds, evaluated, task)
@@ -193,10 +178,7 @@ def _off_by(actions: Float32s, worlds: Worlds, evaluated: Ledger, task: Task) ->
 
 
 def _learners_engine(worlds: Worlds, task: Task) -> Engine:
-    """Return an engine in which the learners of ``task`` take actions, as in an environment.
-
-    The engine starts at the alert in ``worlds``, with the scenario, reward, observation and seed of ``task``.
-    """
+    """Return an engine at the alert in which the learners of ``task`` take actions, as in an environment."""
     engine = Engine(
         task.scenario,
         worlds.n,

@@ -29,7 +29,7 @@ _SAME_S = 1e-9  # tolerance for rounding of an elapsed time (s)
 
 
 class Parameters:
-    """Parameters of one law (the formula of a controller) as attributes with the names in ``LAWS``, in SI units."""
+    """Parameters of one law as attributes with the names in ``LAWS``, in SI units."""
 
     def __init__(self, **values: float) -> None:
         self.__dict__.update(values)
@@ -41,9 +41,9 @@ class Parameters:
 class Seen(NamedTuple):
     """Motion of one vehicle in ``n`` worlds, and what it knows from sensors or messages about the vehicle ahead.
 
-    If information about the vehicle ahead is old, the motion of the vehicle ahead is extrapolated to the present time
-    with the last known acceleration of the vehicle ahead. Vehicle 1 treats an obstacle like a vehicle ahead. If nothing
-    is ahead, or if the vehicle knows nothing about the vehicle ahead, the gap is infinite.
+    If information about the vehicle ahead is old, its motion is extrapolated to the present time with its last known
+    acceleration. Vehicle 1 treats an obstacle like a vehicle ahead. If nothing is ahead, or if the vehicle knows
+    nothing about the vehicle ahead, the gap is infinite.
     """
 
     gap_m: Floats  # [n] gap to the vehicle or obstacle ahead; infinite if nothing is ahead
@@ -55,13 +55,9 @@ class Seen(NamedTuple):
 
     @classmethod
     def of(cls, worlds: Worlds, vehicle: int, step_s: float) -> Seen:
-        """Return the present motion of one vehicle, and what this vehicle knows about the vehicle ahead.
+        """Return the present motion of ``vehicle``, and what it knows about the vehicle ahead.
 
-        Args:
-            worlds: present state of the n worlds.
-            vehicle: index of the vehicle that the script drives (0 = front).
-            step_s: time between two decisions (s).
-
+        ``step_s`` is the time between two decisions, s.
         """
         told, own, none = Told.to(worlds, vehicle), worlds.command_mps2[:, vehicle], np.zeros(worlds.n)
         gap, front, force = told.obstacle_m, none, none
@@ -94,10 +90,7 @@ class Seen(NamedTuple):
     def built_up(self, wanted_mps2: Floats, rate_mps3: float) -> Floats:
         """Return the command for the next time step, [n] m/s2, with a limited growth of the deceleration.
 
-        Args:
-            wanted_mps2: [n] acceleration that the law wants (m/s2).
-            rate_mps3: largest growth of the deceleration per second (m/s3).
-
+        ``wanted_mps2`` [n] is the acceleration of the law; ``rate_mps3`` is the largest growth per second, m/s3.
         """
         return np.maximum(wanted_mps2, np.minimum(self.own_mps2, 0.0) - rate_mps3 * self.step_s)
 
@@ -155,12 +148,7 @@ def _share(distance: Floats, safe: Floats, unsafe: Floats) -> Floats:
 def fuzzy(seen: Seen, p: Parameters) -> tuple[Floats, Floats]:
     """Return the proactive and the critical criterion of the fuzzy safety model of UN R157, each [n].
 
-    Each criterion is a number from 0 (no danger) to 1 (full danger).
-
-    Args:
-        seen: motion of the controlled vehicle, and what this vehicle knows about the vehicle ahead.
-        p: parameters of the law ``r157_fsm``.
-
+    Each criterion is a number from 0 (no danger) to 1 (full danger). ``p`` are parameters of the law ``r157_fsm``.
     """
     speed, front = np.maximum(seen.speed_mps, 0.0), np.maximum(seen.front_mps, 0.0)
     ahead, reacting = np.square(front) / (2.0 * p.b_front), speed * p.reaction
@@ -249,7 +237,7 @@ LAWS: dict[str, Law] = {
 
 
 class Controller:
-    """Agent that follows a ``Law``, the formula of a controller from the literature.
+    """Agent that follows a ``Law``.
 
     The memory of the controller is the time at which it noticed a danger, [n] s: infinite if it has noticed no danger,
     and NaN before the first decision.
@@ -273,7 +261,7 @@ class Controller:
         self.name, self.law, self.parameters, self.time_step_s = name, law, Parameters(**parameters), step_s
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Floats:
-        """Return the memory that the controller has before the first decision: an array [n] of NaN.
+        """Return the memory before the first decision: an array [n] of NaN.
 
         Raises ``InvalidInput`` if the law needs a quantity of the vehicle ahead that neither messages nor sensors
         provide.
@@ -284,14 +272,7 @@ class Controller:
         return np.full(alert.n, np.nan)
 
     def act(self, worlds: Worlds, memory: Floats, vehicle: int) -> tuple[Floats, Floats]:
-        """Return the command, [n] m/s2, limited by the vehicle's capacities, and the new memory [n].
-
-        Args:
-            worlds: present state of the n worlds.
-            memory: memory that the previous call of ``act`` returned; at the first decision, the result of ``begin``.
-            vehicle: index of the vehicle that the controller drives (0 = front).
-
-        """
+        """Return the command, [n] m/s2, limited by the vehicle's capacities, and the new memory [n]."""
         seen, p, vehicles = Seen.of(worlds, vehicle, self.time_step_s), self.parameters, worlds.vehicles
         command = self.law.command(seen, p)
         if self.law.notices is not None:
@@ -309,14 +290,10 @@ class Controller:
 def make_controller(argument: str | None, settings: AgentSettings) -> Controller:
     """Return the controller with the name ``settings.spec``, such as ``idm:T=1.0``.
 
-    Args:
-        argument: part of the name after the name of the law: values of parameters, such as ``T=1.0`` or ``T=1.0:a=2``;
-            None: all parameters have their default values.
-        settings: settings of the agent, of which the name (``settings.spec``) and the scenario's time step are used.
+    ``argument`` are the values of parameters in this name, such as ``T=1.0`` or ``T=1.0:a=2``; None: default values.
 
     Raises ``UnknownName`` for a parameter that the law does not have. Raises ``InvalidInput`` if a value is not a
     number or is out of range, or if a parameter is repeated.
-
     """
     name = settings.spec.partition(":")[0]
     law, where = LAWS[name], f"agent {settings.spec!r}"

@@ -1,5 +1,6 @@
-"""Figures of a front: who bears which share of the harm, and the harm of the line against the largest harm of a
-vehicle.
+"""Figures of a front: who bears which share of the harm, and the line's harm against the largest harm of a vehicle.
+
+``results`` is the content of ``front.json``.
 """
 
 from __future__ import annotations
@@ -33,11 +34,7 @@ Json = dict[str, Any]
 
 
 def front_figures(results: Json) -> dict[str, Figure]:
-    """Return a dictionary from the file name to the figure, for all figures of a front. ``results`` is the content of
-    ``front.json``.
-
-    The ternary plot is drawn only for a line of three vehicles.
-    """
+    """Return all figures of a front by file name; the ternary plot is drawn only for a line of three vehicles."""
     figures = {"front.png": sum_figure(results)}
     if len(results["vehicles"]) == 3:
         figures["front-ternary.png"] = ternary_figure(results)
@@ -45,10 +42,9 @@ def front_figures(results: Json) -> dict[str, Figure]:
 
 
 def sum_figure(results: Json) -> Figure:
-    """Draw the mean harm of the line (horizontal axis) and the mean harm of the vehicle that bears the most harm
-    (vertical axis).
+    """Draw the mean harm of the line (horizontally) against the mean harm of the vehicle that bears most (vertically).
 
-    The figure has one point for each choice of weights. ``results`` is the content of ``front.json``.
+    The figure has one point for each choice of weights.
     """
     figure, (axes,) = new_panels((WIDTH_IN, 4.6))
     for name, harm, style in _series(results):
@@ -66,11 +62,7 @@ def sum_figure(results: Json) -> Figure:
 
 
 def ternary_figure(results: Json) -> Figure:
-    """Draw, in a triangle (ternary plot), the shares of the harm that the three vehicles bear. The colour of a point
-    shows the harm of the whole line.
-
-    ``results`` is the content of ``front.json``.
-    """
+    """Draw the shares of the harm that three vehicles bear, in a triangle; the colour shows the harm of the line."""
     figure = new_figure(WIDTH_IN, 5.4)
     axes = figure.add_subplot()
     axes.set_axis_off()
@@ -110,17 +102,16 @@ def ternary_figure(results: Json) -> Figure:
 
 
 def _places(shares: Floats) -> Floats:
-    """Return the positions of k points in the ternary plot, [2, k]: horizontal and vertical coordinates.
+    """Return the positions of k points in the ternary plot, [2, k].
 
-    ``shares`` [k, 3] are the shares of the harm that the three vehicles bear. A point at a corner of the triangle means
-    that one vehicle bears all harm.
+    ``shares`` [k, 3] are the vehicles' shares of the harm; at a corner of the triangle, one vehicle bears all harm.
     """
     places: Floats = (shares[:, :, np.newaxis] * _CORNERS).sum(axis=1).T
     return places
 
 
 def _series(results: Json) -> list[tuple[str, Floats, dict[str, Any]]]:
-    """Return a tuple (name, mean harm [W, N] in m2/s2, style) for the front, full braking, maximin, and each agent."""
+    """Return (name, mean harm [W, N] in m2/s2, style) for the front, full braking, maximin, and each agent."""
     count = results["harm_count"]
 
     def harm(points: Sequence[Mapping[str, Any]]) -> Floats:

@@ -3,6 +3,8 @@
 A point of the front consists of the mean harm of each vehicle over the list of worlds, for one choice of weights. The
 points approximate the convex part of the Pareto front. A search computes the points; there is no proof that no better
 points exist.
+
+N is the number of vehicles and W the number of choices of weights.
 """
 
 from __future__ import annotations
@@ -53,9 +55,7 @@ Progress = Callable[[int, int], None]  # called with the number of finished sear
 
 
 class Front(NamedTuple):
-    """Best profiles (commands over time) in n worlds for each of W choices of weights, and the resulting harm of each
-    vehicle.
-    """
+    """Best profiles in n worlds for each of W choices of weights, and the resulting harm of each vehicle."""
 
     weights: Floats  # [W, N] weights of the vehicles' harm
     harm_count: HarmCount  # harm count that is weighted, ``first`` or ``total``
@@ -67,7 +67,7 @@ class Front(NamedTuple):
     def amounts(self) -> Floats:
         """Weighted harm of each world, [W, n] m2/s2: ``N sum_i w_i h_i / sum_i w_i``, as in the objective ``weighted``.
 
-        Here ``N`` is the number of vehicles, ``w_i`` the weight of vehicle i and ``h_i`` its harm.
+        Here ``w_i`` is the weight of vehicle i and ``h_i`` its harm.
         """
         return np.stack(
             [amounts_of(each, row) for each, row in zip(self.borne[self.harm_count], self.weights, strict=True)]
@@ -76,24 +76,23 @@ class Front(NamedTuple):
     def mean(self, harm_count: HarmCount | None = None) -> Floats:
         """Return the mean harm of each vehicle over the worlds, [W, N] m2/s2.
 
-        ``harm_count`` is ``first`` or ``total``; None: the harm count that the search minimised.
+        ``harm_count`` None means the harm count that the search minimised.
         """
         mean: Floats = self.borne[harm_count or self.harm_count].mean(axis=1)
         return mean
 
     def nondominated(self) -> Bools:
-        """Return a mask [W, n]: True for each profile that no other profile of the front for the same world dominates.
+        """Return a mask [W, n]: True for each profile that no other profile for the same world dominates.
 
-        Profile A dominates profile B if no vehicle bears more harm under A than under B, and at least one vehicle bears
-        less harm.
+        Profile A dominates profile B if no vehicle bears more harm under A than under B, and at least one bears less.
         """
         return nondominated(self.borne[self.harm_count].transpose(1, 0, 2)).T
 
 
 def amounts_of(borne: Floats, weights: Floats) -> Floats:
-    """Return the weighted harm of each of n worlds, [n] m2/s2, as in ``Front.amounts``.
+    """Return the weighted harm of n worlds, [n] m2/s2, as in ``Front.amounts``.
 
-    ``borne`` is the harm of each vehicle, [n, N] m2/s2. ``weights`` [N] are the weights of the vehicles' harm.
+    ``borne`` is the harm of each vehicle, [n, N] m2/s2; ``weights`` is [N].
     """
     return weighted_harm(borne, np.broadcast_to(weights, borne.shape))
 
@@ -113,11 +112,11 @@ def search_front(
     """Search every world for the commands with the least weighted harm, for every choice of weights.
 
     For each choice of weights, the weighted harm of the result in a world is at most the weighted harm of each of
-    ``CONSTANTS`` constant commands, and of the results for all other choices of weights. With one learner, the result
-    also has at most the weighted harm of the shipped profile of this world, of each of ``agents``, and of every shipped
-    policy that can drive the learner. The result for a world depends neither on ``threads`` nor on the other worlds.
-    Raises the exceptions of ``checked_weights``, ``best_harm`` and ``make_agents``, and ``InvalidInput`` if ``agents``
-    are given but the scenario has several learners.
+    ``CONSTANTS`` constant commands, and of the results for all other choices of weights. With one learner, this also
+    holds for the shipped profile of this world, each of ``agents``, and every shipped policy that can drive the
+    learner. The result for a world depends neither on ``threads`` nor on the other worlds. Raises the exceptions of
+    ``checked_weights``, ``best_harm`` and ``make_agents``, and ``InvalidInput`` if ``agents`` are given but the
+    scenario has several learners.
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.extensions.fronts.front import search_front
@@ -136,8 +135,8 @@ def search_front(
         threads: number of threads of the search.
         agents: specs of agents for the one learner, such as ``universal``. For each choice of weights, the agents drive
             every world, in the scenario with these weights as ``harm_weight`` and with the objective ``preference``.
-        on_progress: function that is called with the number of finished searches and the number of all searches. There
-            are two searches for each world and choice of weights.
+        on_progress: called with the number of finished searches and of all searches, two for each world and choice of
+            weights.
 
     """
     weights = checked_weights(weights, scenario.vehicles)
@@ -169,19 +168,10 @@ def search_front(
 
 
 def least_largest(scenario: Scenario, worlds: Worlds, front: Front, *, budget: int = BUDGET, threads: int = 1) -> Borne:
-    """Search for commands that minimise the largest harm of a vehicle, and return the harm of each vehicle under these
-    commands.
+    """Search for commands that minimise the largest harm of a vehicle; return each vehicle's harm, [n, N] m2/s2.
 
-    The result is a dictionary from the harm count to an array [n, N] in m2/s2. In every world, the largest harm of a
-    vehicle under the resulting commands is at most the largest harm of a vehicle under any profile of ``front``.
-
-    Args:
-        scenario: scenario of the worlds.
-        worlds: worlds at t = 0, [n].
-        front: front that was searched in the same worlds.
-        budget: number of profiles to try in each world.
-        threads: number of threads of the search.
-
+    In every world, the largest harm of a vehicle is at most the largest harm of a vehicle under any profile of
+    ``front``, which was searched in the same worlds.
     """
     count, task = front.harm_count, Task(scenario, scenario.learners, front.harm_count)
     parts = []
@@ -210,9 +200,7 @@ class Preferring(NamedTuple):
     def of(
         cls, scenario: Scenario, weights: Floats, agents: Sequence[str], silent: Sequence[str], harm_count: HarmCount
     ) -> Preferring:
-        """Return ``scenario`` with the fixed ``weights`` [N], and the agents whose specs ``agents`` and ``silent``
-        contain.
-        """
+        """Return ``scenario`` with the fixed ``weights`` [N], and its agents by the specs ``agents`` and ``silent``."""
         fixed = scenario.replace(harm_weight=weights.tolist(), objective="preference")
         made = (make_agents(specs, fixed, harm_count=harm_count) for specs in (agents, silent))
         return cls(fixed, *made)
@@ -224,7 +212,6 @@ class Preferring(NamedTuple):
 
 
 def _shipped_specs(scenario: Scenario) -> list[str]:
-    """Return the specs of all shipped policies that can drive the only learner of the scenario."""
     specs = []
     for name in shipped_policies():
         with suppress(InvalidInput):
@@ -241,19 +228,12 @@ def _searched(
     preferring: Sequence[Preferring],
     tell: Callable[[int], None],
 ) -> Front:
-    """Search ``worlds`` for every choice of weights, and return the front.
+    """Search ``worlds`` (at t = 0, [n]) for every choice of weights [W, N], and return the front.
 
     There are two searches for each choice of weights. For each world and choice of weights, the second search starts
-    from the profile with the least weighted harm among all profiles that have already been tried in this world.
-
-    Args:
-        worlds: worlds at t = 0, [n].
-        task: scenario, controlled vehicles, and the harm count to minimise.
-        weights: weights of the vehicles' harm, [W, N].
-        effort: keyword arguments ``budget``, ``seed`` and ``threads`` of ``search_profiles``.
-        preferring: for each of the W choices of weights, the scenario with these weights and agents for this scenario.
-        tell: function that is called after each search with the number of worlds that this search covered.
-
+    from the profile with the least weighted harm among all that were already tried in this world. ``effort`` are the
+    arguments ``budget``, ``seed`` and ``threads`` of ``search_profiles``. ``preferring`` has an element for each choice
+    of weights. ``tell`` is called after each search with its number of worlds.
     """
     problem, pool = task_problem(worlds, task), Pool()
     starts = starting_profiles(problem, worlds, task, scripted_commands(worlds, task))
@@ -289,26 +269,21 @@ def _searched(
 def observes_weights(agent: Driver) -> bool:
     """Return False if an agent is a trained policy that does not observe the weights of the vehicles' harm.
 
-    For every other agent the result is True, because the commands of the agent may depend on the weights.
+    For every other agent the result is True, because its commands may depend on the weights.
     """
     manifest = getattr(agent, "manifest", None)
     return manifest is None or any("harm_weight" in name for name in manifest.observation.features)
 
 
 class Pool:
-    """Profiles that were tried in the same worlds. For given weights, the methods choose the best profile of each
-    world.
-    """
+    """Profiles that were tried in the same worlds; for given weights, the methods choose each world's best profile."""
 
     def __init__(self) -> None:
         self._profiles: list[Profiles] = []
         self._borne: dict[HarmCount, list[Floats]] = {count: [] for count in HARM_COUNTS}
 
     def add(self, problem: ProfileProblem, profiles: Profiles) -> Borne:
-        """Add ``profiles``, one for each world of ``problem``, to the pool.
-
-        Return a dictionary from the harm count to the harm of each vehicle under the added profiles, [n, N] m2/s2.
-        """
+        """Add ``profiles``, one for each world of ``problem``; return the harm of each vehicle, [n, N] m2/s2."""
         self._profiles.append(profiles)
         all_borne = problem.borne(profiles)
         for count, borne in all_borne.items():
@@ -316,12 +291,9 @@ class Pool:
         return all_borne
 
     def choice(self, weights: Floats, harm_count: HarmCount) -> Ints:
-        """Return, for each world, the number of the profile with the least weighted harm, [n].
+        """Return the number (from 0, in the order of ``add``) of each world's best profile, [n].
 
-        The profiles are numbered from 0 in the order in which they were added to the pool.
-
-        Among profiles with equal weighted harm, the profile with the least unweighted harm of the line is chosen.
-        ``weights`` [N] are the weights of the vehicles' harm, and ``harm_count`` is the count of harm that is weighted.
+        This is the profile with the least weighted harm; among equals, with the least unweighted harm of the line.
         """
         borne = np.stack(self._borne[harm_count])
         amounts = amounts_of(borne.reshape(-1, len(weights)), weights).reshape(borne.shape[:2])
@@ -330,10 +302,7 @@ class Pool:
         return np.asarray(np.where(amounts == least, whole, np.inf).argmin(axis=0))
 
     def best(self, weights: Floats, harm_count: HarmCount) -> Profiles:
-        """Return the profile with the least weighted harm in each of the n worlds.
-
-        The arguments are the same as for ``choice``.
-        """
+        """Return the profile with the least weighted harm in each world, [n]."""
         chosen = self.choice(weights, harm_count)
         parts = [(k, np.flatnonzero(chosen == k)) for k in np.unique(chosen)]
         padded = Profiles.padded([self._profiles[k].take(rows) for k, rows in parts], 1)
@@ -341,13 +310,10 @@ class Pool:
         return Profiles(*(np.concatenate(each)[back] for each in zip(*padded, strict=True)))
 
     def least(self, weights: Floats, harm_count: HarmCount) -> tuple[Borne, tuple[Profiles, ...]]:
-        """Choose the profile with the least weighted harm in each world, for each of W choices of weights.
+        """Choose the best profile of each world for each of W choices of weights, ``weights`` [W, N].
 
-        The first result is a dictionary from the harm count to the harm of each vehicle under the chosen profiles, [W,
-        n, N] m2/s2. The second result is a tuple with the chosen profiles of the n worlds, one element for each choice
-        of weights.
-
-        ``weights`` [W, N] are the choices of weights, and ``harm_count`` is the count of harm that is weighted.
+        Returns the harm of each vehicle, [W, n, N] m2/s2 by harm count, and the profiles [n] for each choice of
+        weights.
         """
         chosen = [self.choice(row, harm_count) for row in weights]
         at = np.arange(len(chosen[0]))

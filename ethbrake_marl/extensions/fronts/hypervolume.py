@@ -11,12 +11,10 @@ MOST_DIMENSIONS = 5  # the time grows with the number of points to the power of 
 
 
 def nondominated(points: Floats) -> Bools:
-    """Return a mask [..., Q]: True for each of Q points that is *nondominated*, which means that no other point
-    dominates it.
+    """Return a mask [..., Q]: True for each of Q points that no other point dominates.
 
     Smaller coordinates are better. Point A dominates point B if no coordinate of A is larger than the same coordinate
-    of B, and at least one coordinate of A is smaller than the same coordinate of B. ``points`` [..., Q, N] contains the
-    N coordinates of the Q points.
+    of B, and at least one is smaller. ``points`` is [..., Q, N].
     """
     one, other = points[..., :, np.newaxis, :], points[..., np.newaxis, :, :]
     beaten = (other <= one).all(axis=-1) & (other < one).any(axis=-1)
@@ -24,11 +22,11 @@ def nondominated(points: Floats) -> Bools:
 
 
 def hypervolume(points: Floats, reference: Floats) -> float:
-    """Return the volume of the region that the points dominate, up to the reference point.
+    """Return the volume of the region that ``points`` [Q, N] dominate, up to the point ``reference`` [N].
 
-    Smaller coordinates are better. The function ignores every point of which at least one coordinate is not below the
-    same coordinate of the reference point. The volume is exact; the function cuts the region into slices along the last
-    coordinate (Zitzler 1999, "hypervolume by slicing objectives").
+    Smaller coordinates are better. A point of which a coordinate is not below the same coordinate of the reference
+    point is ignored. The volume is exact; the function cuts the region into slices along the last coordinate (Zitzler
+    1999, "hypervolume by slicing objectives").
 
     >>> import numpy as np
     >>> from ethbrake_marl.extensions.fronts.hypervolume import hypervolume
@@ -37,11 +35,6 @@ def hypervolume(points: Floats, reference: Floats) -> float:
 
     Raises ``InvalidInput`` if there are more than ``MOST_DIMENSIONS`` coordinates, if the shapes are wrong, or if a
     number is not finite.
-
-    Args:
-        points: coordinates of Q points, [Q, N].
-        reference: coordinates of the reference point, [N].
-
     """
     if len(reference) > MOST_DIMENSIONS:
         raise InvalidInput(

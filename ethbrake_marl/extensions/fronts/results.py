@@ -32,19 +32,17 @@ def front_results(
 ) -> Json:
     """Return the content of ``front.json``: the front, full braking, maximin, and the agents.
 
-    All means have 95 % intervals. The intervals are computed over worlds or, if the worlds come from recordings, over
-    recordings. For each choice of weights, ``ratio`` is the mean weighted harm of an agent divided by the mean weighted
-    harm of the front (null if the latter is 0), and ``above`` is the agent's mean weighted harm minus the front's mean
-    weighted harm.
+    All means have 95 % intervals over worlds or, if the worlds come from recordings, over recordings. For each choice
+    of weights, ``ratio`` is the mean weighted harm of an agent divided by that of the front (null if the latter is 0),
+    and ``above`` is the agent's mean weighted harm minus that of the front.
 
     Args:
-        front: front whose results the function returns.
+        front: the front.
         scenario: scenario of the worlds.
         sample: worlds for which the front was searched.
-        beside: results to compare with the front: a mapping from a name to a mapping from the harm count to the harm of
-            each vehicle, [n, N] m2/s2. The name ``full_brake`` is required; further names, such as ``maximin``, are
-            optional.
-        seed: seed with which the worlds were drawn; None: the seed is unknown.
+        beside: results to compare with the front: name -> harm count -> harm of each vehicle, [n, N] m2/s2. The name
+            ``full_brake`` is required; names such as ``maximin`` are optional.
+        seed: seed with which the worlds were drawn, if known.
 
     """
     least, by = front.amounts, sample.clusters
@@ -100,14 +98,9 @@ def hypervolumes(front: Front, full_brake: Floats, clusters: Texts | None = None
     contributes only if it is better than full braking for every vehicle. The second reference point contains, for each
     vehicle, the larger one of two numbers: its mean harm under full braking, and its largest mean harm on the front.
     ``share`` is an agent's hypervolume divided by the front's hypervolume. The 95 % intervals are percentiles over
-    ``RESAMPLES`` bootstrap samples of the worlds, or of the ``clusters`` if given. Raises ``InvalidInput`` if an agent
-    has the name ``front``.
-
-    Args:
-        front: front that also contains the harm of the agents.
-        full_brake: harm of each vehicle if the learners brake fully, [n, N] m2/s2.
-        clusters: name of the cluster (recording) to which each world belongs, [n]; None: all worlds are independent.
-
+    ``RESAMPLES`` bootstrap samples of the worlds, or of the clusters (recordings), whose names for each world are
+    ``clusters`` [n]. ``full_brake`` is the harm of each vehicle if the learners brake fully, [n, N] m2/s2. Raises
+    ``InvalidInput`` if an agent has the name ``front``.
     """
     if len(full_brake.T) > MOST_DIMENSIONS:
         return []
@@ -151,7 +144,7 @@ def _interval(values: Floats) -> Json | None:
 
 
 def full_braking(scenario: Scenario, sample: Sample) -> Borne:
-    """Return a dictionary from the harm count to the harm of each vehicle if all learners brake fully, [n, N] m2/s2."""
+    """Return the harm of each vehicle if all learners brake fully, [n, N] m2/s2 by harm count."""
     brakes = scenario.replace(
         roles={**scenario.roles, **{scenario.vehicle_names[i]: "full_brake" for i in scenario.learners}}
     )
@@ -163,9 +156,8 @@ def full_braking(scenario: Scenario, sample: Sample) -> Borne:
 def front_sheet(results: Json) -> Sheet:
     """Return a table with one row for each choice of weights, and one for each further result, such as full braking.
 
-    A row contains the mean harm of each vehicle. The row of a choice of weights also contains, for each agent, its
-    ``ratio``: the agent's mean weighted harm divided by the mean weighted harm of the front. ``results`` is the content
-    of ``front.json``.
+    A row contains the mean harm of each vehicle. The row of a choice of weights also contains the ``ratio`` of each
+    agent (see ``front_results``). ``results`` is the content of ``front.json``.
     """
     count = results["harm_count"]
     columns: list[Column | str] = [

@@ -27,11 +27,6 @@ def weight_grid(vehicles: int, steps: int = STEPS) -> Floats:
     >>> from ethbrake_marl.extensions.fronts.weights import weight_grid
     >>> weight_grid(3, 1).tolist()
     [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]
-
-    Args:
-        vehicles: number of vehicles in the line, N.
-        steps: number of steps between the weights 0 and 1.
-
     """
     check_whole_number("steps of the weights", steps, 1)
     number = comb(steps + vehicles - 1, steps)
@@ -56,8 +51,8 @@ def weight_grid(vehicles: int, steps: int = STEPS) -> Floats:
 def corners(vehicles: int) -> Floats:
     """Return one choice of weights for each of the N vehicles, [N, N], with almost all weight on this vehicle.
 
-    In row i, vehicle i has the weight 1, and every other vehicle has the weight ``SLIGHT``. The harm of the other
-    vehicles decides only between commands under which vehicle i has almost the same harm.
+    In row i, vehicle i has the weight 1, and the others ``SLIGHT``. Their harm decides only between commands under
+    which vehicle i has almost the same harm.
     """
     return np.where(np.eye(vehicles) == 1.0, 1.0, SLIGHT)
 
@@ -65,8 +60,8 @@ def corners(vehicles: int) -> Floats:
 def checked_weights(weights: Sequence[Sequence[float]] | Floats, vehicles: int) -> Floats:
     """Check W choices of weights of the N vehicles' harm, and return them as an array [W, N].
 
-    Raises ``InvalidInput`` if there is no choice of weights, if a choice does not contain one weight for each vehicle,
-    if a weight is neither 0 nor from 1e-6 to 1e6, or if all weights of a choice are 0.
+    Raises ``InvalidInput`` if there is no choice, if a choice does not have one weight for each vehicle, if a weight is
+    neither 0 nor from 1e-6 to 1e6, or if all weights of a choice are 0.
     """
     rows = [checked_numbers("weights", row) for row in weights]
     for k, row in enumerate(rows):

@@ -6,8 +6,8 @@ at rest, resolves impacts and records the harm. Every time step has three parts:
 1. *Decide.* Agents whose decision is due choose actions in the state that the host reported. A shield may replace
    these actions.
 2. *Move.* The host receives a command and moves the vehicles for one step.
-3. *Meet.* A host that resolves impacts itself reports the impacts. If the host does not resolve impacts, this package
-   does: vehicles that overlap and still approach each other get the speeds after an impact.
+3. *Meet.* A host that resolves impacts itself reports them. Otherwise this package resolves them: vehicles that overlap
+   and still approach each other get the speeds after an impact.
 
 Latencies are rounded up to whole steps of the host, because commands can change only between two steps. If an agent
 knows a latency, it knows the rounded latency.
@@ -63,14 +63,13 @@ SNAP = 1e-6  # times count as equal if they differ by less than this share of a 
 
 
 class HostState(NamedTuple):
-    """State of ``n`` lines of ``N`` vehicles, as a host (another simulator or a test bench) reports it.
+    """State of ``n`` lines of ``N`` vehicles, as a host reports it.
 
     >>> import ethbrake_marl as eb
 
     >>> from ethbrake_marl.extensions.hosts import HostState
     >>> HostState(0.0, [[5.0, 6.0]], [[20.0, 18.0, 20.0]]).impacts is None
     True
-
     """
 
     time_s: ArrayLike  # time on the clock of the host (s), which may start at any number; a number or [n]
@@ -80,14 +79,13 @@ class HostState(NamedTuple):
 
 
 class HostCommand(NamedTuple):
-    """Commands that a host (the simulator that moves the vehicles) receives for one step.
+    """Commands that a host receives for one step.
 
     >>> import ethbrake_marl as eb
 
     >>> from ethbrake_marl.extensions.hosts import HostCommand
     >>> HostCommand._fields
     ('acceleration_mps2', 'speeds_mps', 'wanted_mps2', 'until_s')
-
     """
 
     acceleration_mps2: Floats  # [n, N] acceleration for this step, after latency, standstill and speed limit
@@ -99,8 +97,7 @@ class HostCommand(NamedTuple):
 class Host(Protocol):
     """Interface of a host: a simulator that moves ``n`` lines of vehicles, one line per world, from the alert on.
 
-    A host has the attribute ``dt`` and the methods ``state`` and ``apply``. The class of the host need not inherit from
-    ``Host``.
+    The class of a host need not inherit from ``Host``.
 
     The attribute ``dt`` is the length of every step (s). If ``dt = math.inf``, each call of ``apply`` moves every world
     to the time ``command.until_s`` of its next decision. A world that has already reached ``command.until_s`` does not
@@ -123,7 +120,6 @@ class Host(Protocol):
     >>> worlds = eb.load_scenario("paper-random").sample(5, seed=7).worlds
     >>> drive_host(Bench(worlds), eb.make_agent("full_brake"), "paper-random", worlds).outcome.at_rest.all()
     np.True_
-
     """
 
     dt: float
@@ -140,8 +136,8 @@ class HostFailed(EthBrakeError):
 
     Args:
         reason: error message.
-        ledger: harm until the failure, which is also the attribute ``ledger`` of the exception.
-        worlds: last valid state of the worlds, which is also the attribute ``worlds`` of the exception.
+        ledger: harm until the failure, also an attribute of the exception.
+        worlds: last valid state of the worlds, also an attribute of the exception.
 
     >>> import ethbrake_marl as eb
 
@@ -157,7 +153,7 @@ class HostFailed(EthBrakeError):
 
 
 class Hosted(NamedTuple):
-    """Result of episodes in which an agent drove vehicles of a host (another simulator)."""
+    """Result of episodes in which an agent drove vehicles of a host."""
 
     outcome: Outcome  # harm and final state of each world
     # [n] whether the motion in the host differed from the shield's prediction; the bound of the shield then has no
@@ -166,7 +162,7 @@ class Hosted(NamedTuple):
 
     @classmethod
     def join(cls, parts: list[Hosted]) -> Hosted:
-        """Join the results ``parts`` of different worlds into one result for all worlds, in the order of ``parts``."""
+        """Join the results of different worlds into one result, in the order of ``parts``."""
         distrusted = [part.distrusted for part in parts if part.distrusted is not None]
         outcome = Outcome.join([part.outcome for part in parts])
         return cls(outcome, np.concatenate(distrusted) if distrusted else None)
@@ -177,10 +173,10 @@ def drive_host(host: Host, agent: Driver, scenario: str | Path | Scenario, world
 
     Args:
         host: the host, in which all worlds must be at the alert.
-        agent: agent or team that drives the learners, with or without a shield, for instance from ``make_agent``. The
-            function does not change the agent.
-        scenario: the scenario. The scenario's scripts drive all vehicles that do not learn; agents know these scripts.
-        worlds: the worlds at the alert. The vehicles of the host must begin with the gaps and speeds of these worlds.
+        agent: agent or team that drives the learners, with or without a shield, for instance from ``make_agent``. It is
+            not changed.
+        scenario: the scenario; its scripts drive all vehicles that do not learn, and agents know these scripts.
+        worlds: the worlds at the alert, with whose gaps and speeds the vehicles of the host must begin.
 
     Returns the outcome of the episodes, and a mask [n]: True for the worlds in which the motion differed from the
     prediction of the shield. The mask is None if no shield makes predictions. Raises ``InvalidInput`` if the scenario,
@@ -207,14 +203,8 @@ def drive_host(host: Host, agent: Driver, scenario: str | Path | Scenario, world
 class _Grid:
     """Decision times of vehicles that always decide together: in each world at ``first_s``, then once per time step.
 
-    For each world, the attribute ``made`` [n] is the number of decisions so far, and ``all`` [n] is the number of
-    decisions from the alert to the horizon.
-
-    Args:
-        first_s: [n] time of the first decision in each world (s).
-        vehicles: indices (0 = front) of the vehicles that decide at these times.
-        scenario: scenario that provides the time step and the horizon.
-
+    The attribute ``made`` [n] is the number of decisions so far, and ``all`` [n] the number from the alert to the
+    horizon.
     """
 
     def __init__(self, first_s: Floats, vehicles: list[int], scenario: Scenario) -> None:
@@ -228,16 +218,12 @@ class _Grid:
         return np.where(self.made < self.all, self.decisions.at(self.made), self.horizon_s)
 
     def is_due(self, time_s: Floats) -> Bools:
-        """Return for each world whether a decision is due, [n] bool: whether ``time_s`` has reached ``next_s``."""
+        """Return a mask [n]: True where ``time_s`` has reached ``next_s``."""
         return self.next_s <= time_s + ROUNDING * self.decisions.time_step_s
 
 
 class _Run:
-    """Episodes that run in a host.
-
-    The arguments are the same as in ``drive_host``, but with ``team``, the agents of all learners, instead of
-    ``agent``.
-    """
+    """Episodes that run in a host. The arguments mean the same as in ``drive_host``."""
 
     def __init__(self, host: Host, worlds: Worlds, team: Team, scenario: Scenario) -> None:
         self.host, self.team, self.scenario = host, team, scenario
@@ -269,7 +255,7 @@ class _Run:
         self.at_rest: Bools = np.zeros(worlds.n, np.bool_)
 
     def to_the_end(self) -> Hosted:
-        """Run every world to the end of its episode, and return the result."""
+        """Run every world to the end of its episode."""
         if self.exact:
             self._move()  # to the first decision
         while not self.ended.all():
@@ -303,13 +289,10 @@ class _Run:
             grid.made = grid.made + due
 
     def _ask_guard(self, worlds: Worlds, due: Bools, idle: Ints) -> None:
-        """Let the learners' policies propose actions, and let the shield accept or replace these actions.
+        """Let the learners' policies propose actions, and let the shield accept or replace them.
 
-        Args:
-            worlds: present state of the n worlds.
-            due: [n] whether a decision is due in each world.
-            idle: indices of the worlds in which no decision is due; in these worlds the agents' memories do not change.
-
+        ``due`` [n] says where a decision is due. In the worlds ``idle``, where none is due, the agents' memories do not
+        change.
         """
         engine = self.engine
         assert engine.guard is not None
@@ -332,7 +315,7 @@ class _Run:
         return self.alert.running(self.time_s, gaps, speeds, command_mps2=in_force, pair_hit=self.ledger.count > 0)
 
     def _end(self) -> None:
-        """Mark the episodes that ended in the most recent step, and let the learners of these episodes brake fully."""
+        """Mark the episodes that ended in the most recent step, and let their learners brake fully."""
         first = self.grids[0]
         if not (stepped := ~self.ended & first.is_due(self.time_s) & (first.made > 0)).any():
             return
@@ -377,17 +360,12 @@ class _Run:
         """Resolve the impacts of a step by the paper's eq. (13), for one pair after another from rear to front.
 
         A pair has an impact if, at the end of the step, its gap g is at most 0 and its closing speed w is above 0. Let
-        b be the mean closing acceleration of the pair in the step. If the pair was apart before the step, harm and eq.
-        (13) are computed with the closing speed at the contact, ``sqrt(w^2 + 2 b g)``. If the pair was already in
-        contact before the step, harm and eq. (13) are computed with w.
+        b be the mean closing acceleration of the pair in the step. Harm and eq. (13) are computed with the closing
+        speed at the contact, ``sqrt(w^2 + 2 b g)``, or, if the pair was already in contact before the step, with w.
 
-        Args:
-            before_m: [n, P] gaps before the step (m).
-            begin: [n, N] speeds at the start of the step (m/s).
-            step_s: [n] length of the host's step in each world (s).
-
-        Returns the impacts. The function writes the speeds after the impacts into ``self.speeds_mps``.
-
+        ``before_m`` [n, P] are the gaps before the step (m), ``begin`` [n, N] the speeds at its start (m/s), and
+        ``step_s`` [n] its length (s). Returns the impacts, and writes the speeds after the impacts into
+        ``self.speeds_mps``.
         """
         v, gaps, speeds, speeds_seen = self.alert.vehicles, self.gaps_m, self.speeds_mps, self.speeds_mps.copy()
         first, total, count = np.zeros(gaps.shape), np.zeros(gaps.shape), np.zeros(gaps.shape, np.int64)
@@ -410,8 +388,8 @@ class _Run:
         """Read the state of the host, check the shapes and numbers of its arrays, and return copies.
 
         Returns the time since the alert [n], gaps [n, P], speeds [n, N], and impacts (None if the host does not report
-        impacts). Raises ``HostFailed`` if the host raises an exception, or if an array has a wrong shape or contains a
-        number that is not finite.
+        impacts). Raises ``HostFailed`` if the host raises an exception, or if an array has a wrong shape or a number
+        that is not finite.
         """
         (n, N), read = self.alert.speeds_mps.shape, list[Floats]()
         try:
@@ -442,9 +420,9 @@ class _Run:
         return read[0] - self.origin_s, read[1], read[2], impacts
 
     def _first_state(self) -> tuple[Floats, Floats]:
-        """Return the host's gaps [n, P] and speeds [n, N] at the alert, and store the host's clock time at the alert.
+        """Return the host's gaps [n, P] and speeds [n, N] at the alert, and store its clock time at the alert.
 
-        Raises ``HostFailed`` if the gaps or speeds in the host differ from the gaps or speeds of the worlds.
+        Raises ``HostFailed`` if the gaps or speeds differ from those of the worlds.
         """
         self.origin_s, gaps, speeds, _ = self._read()
         for name, told, given in (("gaps_m", gaps, self.alert.gaps_m), ("speeds_mps", speeds, self.alert.speeds_mps)):
@@ -497,13 +475,9 @@ class _Motion:
     If the host does not report impacts, the rules assume that its vehicles pass through one another. If the host
     reports impacts, the rules allow that vehicles in contact push one another. For vehicles that may have been pushed,
     rule 1 allows every speed that the commands of the whole line make possible, and after an impact every speed that
-    the energy of the line makes possible. For these vehicles, rules 2 and 3 start again from the reported state instead
-    of the state at the alert.
+    the energy of the line makes possible. For these vehicles, rules 2 and 3 start again from the reported state.
 
-    Args:
-        alert: the worlds at the alert.
-        dt: length of the host's steps (s); math.inf if each step ends at the time of a decision.
-
+    ``dt`` is the length of the host's steps (s); math.inf if each step ends at the time of a decision.
     """
 
     def __init__(self, alert: Worlds, dt: float) -> None:
@@ -517,8 +491,7 @@ class _Motion:
     def refusal(self, step: _Step) -> tuple[int, str] | None:
         """Check the state that the host reported at the end of ``step``.
 
-        Returns the index of a world with an impossible state, and an error message. Returns None if the states of all
-        worlds are possible.
+        Returns the index of a world with an impossible state, and an error message; None if all states are possible.
         """
         acting_s = np.maximum(step.until_s[:, np.newaxis] - np.maximum(self._now, self.vehicles.latency_s), 0.0)
         command = np.where(acting_s > 0.0, step.wanted_mps2, 0.0)
@@ -543,7 +516,7 @@ class _Motion:
         return self.time_s[:, np.newaxis]
 
     def _met(self, step: _Step) -> Bools:
-        """Return for each vehicle whether another vehicle may have pushed it during the step, [n, N] bool."""
+        """Return a mask [n, N]: True for vehicles that another vehicle may have pushed during the step."""
         met = np.zeros(step.speeds_mps.shape, np.bool_)
         if step.impacts is not None:
             touch = (step.impacts.count > 0) | (np.minimum(step.gaps_m, self.gaps_m) <= READ_WITHIN)
@@ -552,10 +525,7 @@ class _Motion:
         return met
 
     def _reachable(self, step: _Step, met: Bools) -> tuple[Floats, Floats]:
-        """Return the least and the greatest speed that rule 1 allows at the end of the step, each [n, N] m/s.
-
-        ``met`` [n, N] is True for vehicles that another vehicle may have pushed during the step.
-        """
+        """Return the least and the greatest speed that rule 1 allows at the end of the step, each [n, N] m/s."""
         # a host that handles latencies itself does not round them up to whole steps
         acting = step.until_s[:, np.newaxis] + self.jitter_s > self.vehicles.latency_s
         command = np.where(acting, step.wanted_mps2, 0.0)
@@ -591,15 +561,9 @@ class _Motion:
     def _wrong_speed(self, step: _Step, met: Bools, change: Floats) -> tuple[int, str] | None:
         """Find a reported speed that does not agree with the commands since the alert (rule 3).
 
-        Args:
-            step: commands and reported state of the step.
-            met: [n, N] True for each vehicle that another vehicle may have pushed; the speed of this vehicle is not
-                checked.
-            change: [n, N] change of each vehicle's speed in the step if the vehicle follows its command exactly (m/s).
-
-        Returns the index of the world with the wrong speed, and an error message. Returns None if all speeds agree with
-        the commands.
-
+        The speed of pushed vehicles (``met`` [n, N]) is not checked. ``change`` [n, N] is the change of speed in the
+        step of a vehicle that follows its command exactly (m/s). Returns the index of the world with the wrong speed,
+        and an error message; None if all speeds agree.
         """
         began = self.led_mps + step.begin_mps - self.speeds_mps
         led = held_speeds(began, change, self.vehicles.speed_limit_mps, 1.0)
@@ -620,8 +584,7 @@ def _refused(
 ) -> tuple[int, str] | None:
     """Find the first element of ``values`` [n, k] that is outside its range, ``low`` to ``high`` (both [n, k]).
 
-    Returns the row of this element, and the error message ``describe(row, column, range as text)``. Returns None if all
-    elements are in their ranges.
+    Returns its row, and the error message ``describe(row, column, range as text)``; None if all are in their ranges.
     """
     good = (low <= values) & (values <= high)
     if good.all():
@@ -631,7 +594,7 @@ def _refused(
 
 
 def _checked_dt(host: Host, scenario: Scenario) -> float:
-    """Return the length ``dt`` of the host's steps (s).
+    """Return the length of the host's steps (s).
 
     Raises ``InvalidInput`` if ``host`` is not a host, or if the scenario's time step is not a multiple of ``dt``.
     """
@@ -653,11 +616,7 @@ def _checked_dt(host: Host, scenario: Scenario) -> float:
 
 
 def _check_known(worlds: Worlds, scenario: Scenario, vehicles: tuple[int, ...]) -> None:
-    """Raise ``InvalidInput`` if the worlds have a feature that hosts do not support.
-
-    The features are brakes that build up at a finite rate, periodic messages, and obstacles. ``vehicles`` are the
-    indices of the controlled vehicles.
-    """
+    """Raise ``InvalidInput`` for brakes that build up, periodic messages and obstacles, which hosts do not support."""
     scenario.play_pieces(worlds, vehicles).refuse_build_up("host")
     if worlds.messages.shape[1] or worlds.obstacle_ahead.any():
         what = "periodic messages or tells (v2x)" if worlds.messages.shape[1] else "an obstacle ahead (obstacle_gap_m)"

@@ -39,11 +39,11 @@ _SUMO_OPTIONS = (
 
 
 class SumoHost:
-    """Host that runs worlds as parallel roads of one SUMO simulation. A process can run only one simulation at a time.
+    """Host that runs worlds as parallel roads of one SUMO simulation. A process can run only one at a time.
 
     At the end of each step, every vehicle has exactly the speed that its command requires. SUMO integrates the motion
     with its ballistic method, and lets vehicles pass through one another. SUMO has no negative speeds, so a vehicle
-    that should move backwards after an impact stands still. The method ``close`` ends the simulation.
+    that should move backwards after an impact stands still.
 
     Args:
         worlds: the worlds at the alert.
@@ -87,7 +87,7 @@ class SumoHost:
         return HostState(self._sumo.simulation.getTime(), gaps, self._speeds)
 
     def apply(self, command: HostCommand) -> None:
-        """Compute from ``command`` the speed of each vehicle at the end of the step, and let SUMO make the step."""
+        """Compute the speed of each vehicle at the end of the step, and let SUMO make the step."""
         vehicle, begin = self._sumo.vehicle, np.maximum(command.speeds_mps, 0.0)
         end = np.maximum(command.speeds_mps + command.acceleration_mps2 * self.dt, 0.0)
         for k, line in enumerate(self._names):
@@ -121,14 +121,10 @@ def _net(edges: int) -> str:
 
 
 def _routes(worlds: Worlds, names: Sequence[Sequence[str]]) -> str:
-    """Return the XML of SUMO's routes file, which contains the positions and speeds of all vehicles at the alert.
+    """Return the XML of SUMO's routes file, with the positions and speeds of all vehicles at the alert.
 
-    The last vehicle of each line begins at one tenth of the length of its road, measured from the start of the road.
-
-    Args:
-        worlds: the worlds at the alert.
-        names: for each world, SUMO's names of the vehicles, front to rear.
-
+    The last vehicle of each line begins at one tenth of the length of its road. ``names`` are SUMO's names of the
+    vehicles of each world, front to rear.
     """
     lines = [
         f'<vType id="v" length="{_SUMO_LENGTH_M}" minGap="0" tau="0.001" sigma="0" accel="1000" decel="1000"'
@@ -148,7 +144,7 @@ def _routes(worlds: Worlds, names: Sequence[Sequence[str]]) -> str:
 
 
 class FoundHost(NamedTuple):
-    """Kind of host (a simulator that moves the vehicles) with its settings; ``evaluate`` evaluates agents in it."""
+    """Kind of host with its settings; ``evaluate`` evaluates agents in it."""
 
     name: str  # name and version of the simulator, for tables
     # function that starts a host with worlds at the alert, as a context manager
@@ -166,19 +162,10 @@ class FoundHost(NamedTuple):
     ) -> tuple[Evaluation, dict[str, Bools | None]]:
         """Let one agent after the other drive the scenario's learners in SUMO, each in the same worlds.
 
-        Args:
-            sample: the worlds at the alert.
-            agents: dictionary from names to agents or teams.
-            scenario: scenario of the worlds.
-            seed: seed from which the worlds were drawn, which is stored in the evaluation; None: no seed is stored.
-            at_once: largest number of worlds in one simulation.
-            on_progress: function that is called with the name of an agent and the number of worlds in which this agent
-                has finished its episodes.
+        ``seed`` is stored in the evaluation. ``at_once`` is the largest number of worlds in one simulation.
+        ``on_progress`` is called with the name of an agent and the number of worlds that it has finished.
 
-        Returns the evaluation, and a dictionary from each agent's name to an array [n] bool: True for the worlds in
-        which the motion differed from the prediction of the agent's shield. For an agent without a shield that makes
-        predictions, the dictionary contains None instead of an array.
-
+        Returns the evaluation, and ``Hosted.distrusted`` of each agent by name.
         """
         results: dict[str, Hosted] = {}
         for spec, agent in agents.items():

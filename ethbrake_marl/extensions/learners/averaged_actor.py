@@ -26,19 +26,16 @@ class Deterministic(BasePolicy):
     """Base class of policies without exploration noise: actions are the network's outputs, clipped to [-1, 1].
 
     A subclass must define ``forward``, and either ``means`` or ``act``. If the recipe of ``vine`` has ``focus`` above
-    0, the subclass must also define ``expect``. In all methods, ``rows`` is the number of observations, and F is the
+    0, the subclass must also define ``expect``. In all methods, ``rows`` is the number of observations, and F the
     number of features of an observation.
     """
 
     def means(self, observation: Float32s) -> Float32s:
-        """Return the outputs [rows], not clipped to [-1, 1], of the network in training for observations [rows, F]."""
+        """Return the outputs [rows] of the network in training, not clipped to [-1, 1], for observations [rows, F]."""
         raise NotImplementedError
 
     def expect(self, observation: Float32s) -> Floats:
-        """Return the predicted absolute gradient of the return with respect to the action, [rows].
-
-        ``observation`` [rows, F] are the observations from which the gradient is predicted.
-        """
+        """Return the predicted absolute gradient of the return with respect to the action, [rows]."""
         raise NotImplementedError
 
     def act(self, observation: Float32s) -> Float32s:
@@ -46,11 +43,7 @@ class Deterministic(BasePolicy):
         return np.clip(self.means(observation), -1.0, 1.0)
 
     def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return a dictionary from names to copies of the averaged weights.
-
-        The weights have the names that they have in a policy bundle; ``network`` is the description of the network in
-        this bundle.
-        """
+        """Return copies of the averaged weights, by their names in a policy bundle with ``network``."""
         return tensors_of(self, network)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> Tensor:
@@ -59,17 +52,15 @@ class Deterministic(BasePolicy):
 
 
 class AveragedActor(Deterministic):
-    """Actor whose network exists twice: ``learning`` is trained; ``average`` has running averages of the weights of
-    ``learning``.
+    """Actor with two networks: ``learning`` is trained; ``average`` has running averages of its weights.
 
-    A trained policy uses the averaged weights. The averaged weights have the same names as in PPO of
-    Stable-Baselines3.
+    A trained policy uses the averaged weights. They have the same names as in PPO of Stable-Baselines3.
 
     Args:
-        observation_space: Gymnasium space of an observation.
-        action_space: Gymnasium space of an action.
+        observation_space: space of an observation.
+        action_space: space of an action.
         rate: learning rate as a function of the share of the training run that remains (1 to 0).
-        recipe: recipe of the training run, which also describes the network.
+        recipe: recipe of the training run; it also describes the network.
 
     """
 
@@ -101,10 +92,7 @@ class AveragedActor(Deterministic):
             learns.copy_(mean)
 
     def take_over(self, tensors: Mapping[str, Float32s]) -> None:
-        """Copy the weights of a policy bundle into both networks, ``learning`` and ``average``.
-
-        ``tensors`` is a mapping from names to the weights of the policy bundle.
-        """
+        """Copy the weights ``tensors`` of a policy bundle into both networks."""
         state = self.state_dict()
         for name, theirs in sb3_names(self._spec).items():
             state[theirs].copy_(torch.from_numpy(tensors[name]))

@@ -1,8 +1,11 @@
-"""Branches: copies of a running episode. Each copy is simulated to its end with slightly different actions.
+"""Branches: copies of a running episode, each of which is simulated to its end with slightly different actions.
 
-In a branch, an offset (a small number) is added to one learner's actions for a few steps. After these steps the
-policy's actions are used without an offset. Two branches from the same state differ only in the offset: they use the
-same random numbers, so the same messages are lost.
+In a branch, an offset is added to one learner's actions for a few steps; then the policy acts without an offset. Two
+branches from the same state differ only in the offset: they use the same random numbers, so the same messages are lost.
+
+L is the number of learners, F the number of features of an observation, and m the number of worlds (or, in ``visit``,
+of decisions in all worlds together). ``engine`` simulates n worlds or branches; its state is changed. ``act`` is the
+policy of all learners. ``gamma`` is the discount factor per time step.
 """
 
 from __future__ import annotations
@@ -30,7 +33,7 @@ Decide = Callable[[Observations, Ints, int], Floats]  # (observations [m, L, F],
 
 
 class Offsets(NamedTuple):
-    """Offsets that are added to the actions of one learner in each of n branches (copies of a running episode).
+    """Offsets that are added to the actions of one learner in each of n branches.
 
     For example, ``learner = [0, 0]``, ``size = [0.1, -0.1]`` and ``steps = [3, 3]`` describe two branches. In the first
     branch the foremost learner brakes less for three steps, in the second branch it brakes harder for three steps.
@@ -42,20 +45,12 @@ class Offsets(NamedTuple):
 
 
 def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) -> tuple[Floats, Floats]:
-    """Simulate every branch (copy of a running episode) to its end, with an offset added to one learner's actions.
+    """Simulate every branch to its end, with an offset added to one learner's actions.
 
-    Args:
-        engine: engine that simulates the n branches; its state is changed.
-        act: policy of all learners: a function from observations to actions.
-        offsets: for each branch, the offset, the learner that gets the offset, and the number of steps with this
-            offset.
-        gamma: discount factor per time step.
-
-    Returns two arrays with one number for each branch, [n]. The first array contains the discounted return of the
-    learner with the offset, from the start of the branch on (NaN if the simulation failed). The second array contains
-    the sum, over the steps, of the difference that the offset makes to the action (after clipping to [-1, 1]). If harm
-    is the only term of the reward, a branch ends as soon as all its vehicles are at rest and will stay at rest.
-
+    Returns two arrays [n]. The first is the discounted return of the learner with the offset, from the start of the
+    branch on (NaN if the simulation failed). The second is the sum, over the steps, of the difference that the offset
+    makes to the action after clipping to [-1, 1]. If harm is the only term of the reward, a branch ends as soon as all
+    its vehicles are at rest and will stay at rest.
     """
     moved, most = np.zeros(engine.n), int(offsets.steps.max(initial=0))
 
@@ -76,19 +71,11 @@ def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) ->
 def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) -> Floats:
     """Simulate all n worlds of an engine to the end, and return each learner's discounted return, [n, L].
 
-    L is the number of learners, F the number of features of an observation, and m the number of worlds whose
-    simulation has not ended.
+    ``decide`` gets the observations [m, L, F] and the indices of the m worlds whose simulation has not ended, and the
+    number of steps so far; it returns the actions, [m, L].
 
-    Args:
-        engine: engine that simulates the n worlds; its state is changed.
-        decide: function that returns the actions of the learners, [m, L]. The three arguments of ``decide`` are the
-            observations [m, L, F], the indices of the m worlds, and the number of steps so far.
-        gamma: discount factor per time step.
-        at_least: for this number of steps from the start, no simulation ends early, even if all vehicles are at rest.
-
-    If harm is the only term of the reward, the simulation of a world ends as soon as all its vehicles are at rest and
-    will stay at rest. If the simulation of a world fails, its return is NaN.
-
+    If harm is the only term of the reward, a simulation ends as soon as all vehicles are at rest and will stay at rest,
+    but not in the first ``at_least`` steps. If the simulation of a world fails, its return is NaN.
     """
     vehicles = np.array(engine.learners, np.int64)
     gained, actions = np.zeros((engine.n, len(vehicles))), np.zeros((engine.n, len(vehicles)))
@@ -110,12 +97,7 @@ def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) 
 
 
 def visit(engine: Engine, act: Act) -> tuple[Observations, State]:
-    """Simulate all worlds of an engine to the end, and return the observations and states at all decisions.
-
-    ``act`` is the policy of all learners. Returns the observations [m, L, F] and the states of the worlds at all
-    decisions, ordered by time. Here m is the number of decisions in all worlds together. L is the number of learners, F
-    the number of features of an observation.
-    """
+    """Simulate all worlds to the end; return observations [m, L, F] and states at all decisions, ordered by time."""
     seen_then, moments = [], []
 
     def decide(seen: Observations, rows: Ints, number: int) -> Floats:
@@ -128,12 +110,12 @@ def visit(engine: Engine, act: Act) -> tuple[Observations, State]:
 
 
 def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
-    """Return, for each of m worlds, whether all its vehicles are at rest and will stay at rest, [m] bool.
+    """Return a mask [m]: True for worlds in which all vehicles are at rest and will stay at rest.
 
-    ``rows`` [m] are the indices of the worlds in the engine; ``before`` [m, columns] is the packed state of these
-    worlds one time step earlier. For a world in which a latency has not elapsed, or whose state (apart from the time)
-    has changed in this step, the result is False. When a latency elapses, the observation may change, so that a policy
-    may move a vehicle again.
+    ``rows`` [m] are the indices of the worlds in the engine; ``before`` [m, columns] is their packed state one time
+    step earlier. For a world in which a latency has not elapsed, or whose state (apart from the time) has changed in
+    this step, the result is False. When a latency elapses, the observation may change, so that a policy may move a
+    vehicle again.
     """
     if engine.packed.has_messages or engine.in_pieces:
         return np.zeros(len(rows), np.bool_)  # a message may still change the observation, or a profile the command
@@ -144,15 +126,9 @@ def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
 
 @compiled
 def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, stands: Bools) -> None:
-    """Write into ``stands`` [m], for each of m worlds, whether all its vehicles are at rest and will stay at rest.
+    """Compiled part of ``_stands_for_good``: write the mask into ``stands`` [m].
 
-    Args:
-        state: packed state of all worlds of an engine: one row of numbers per world.
-        before: [m, columns] packed state of the m worlds one time step earlier.
-        params: packed constants of all worlds of the engine: one row per world, with masses, latencies and so on.
-        rows: [m] indices of the worlds to check, in ``state`` and ``params``.
-        stands: [m] bool array into which the result is written (True: all vehicles stay at rest).
-
+    ``state`` and ``params`` are the packed state and constants of all worlds of the engine, one row per world.
     """
     column = columns(state)
     by_link = params.shape[1] > column.own_latency
@@ -172,12 +148,9 @@ def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, sta
 
 
 def counted_harm(engine: Engine, count: HarmCount) -> Floats:
-    """Return, for each of the L learners of an engine, the harm (up to the present time) that this learner should make
-    small, [n, L] m2/s2.
+    """Return the harm, up to the present time, that each learner should make small, [n, L] m2/s2.
 
-    If the reward has objectives, each learner should make the value of its own objective small. If the reward has no
-    objectives, each learner should make the harm of the whole line small. ``count`` is the count of harm: ``first``
-    (each pair's first impact) or ``total`` (all impacts).
+    This is the value of the learner's own objective if the reward has objectives; otherwise it is the harm of the line.
     """
     declared, shape = engine.reward.objective, (engine.n, len(engine.learners))
     if declared is None:
@@ -187,14 +160,14 @@ def counted_harm(engine: Engine, count: HarmCount) -> Floats:
 
 
 def other_count(count: HarmCount) -> HarmCount:
-    """Return the harm count other than ``count``: ``total`` for ``first``, and ``first`` for ``total``."""
+    """Return the harm count other than ``count``."""
     return "total" if count == "first" else "first"
 
 
 def moving_rows(moments: State) -> Bools:
-    """Return, for each of the n states ``moments``, whether at least one vehicle moves, [n] bool.
+    """Return a mask [n]: True for states in which at least one vehicle moves.
 
-    A training run ignores states in which all vehicles are at rest, because actions have no effect there.
+    Training ignores states in which all vehicles are at rest, because actions have no effect there.
     """
     column = moments.packed.column
     moving: Bools = (moments.motion[:, column.speed : column.command] != 0.0).any(axis=1)

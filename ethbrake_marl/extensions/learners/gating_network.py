@@ -19,13 +19,12 @@ from ethbrake_marl.training.networks import ACTIVATIONS
 
 
 class AveragedGatingNetwork(nn.Module):
-    """Gating network: from an observation of F features it chooses which of K experts (networks) acts.
+    """Gating network: from an observation of F features it chooses which of K experts acts.
 
-    The network exists twice: ``learning`` is trained; ``average`` has running averages of the weights of ``learning``.
-    The network ``average`` chooses the expert.
+    The network ``learning`` is trained; ``average`` has running averages of its weights, and chooses the expert.
 
     A memory stores the observation, and the extra cost of each expert, for the last M decisions at which the experts
-    were compared. The extra cost is the cost of the expert minus the cost of the cheapest expert.
+    were compared. The extra cost is the cost minus the cost of the cheapest expert.
 
     Args:
         inputs: number F of features of an observation.
@@ -54,22 +53,18 @@ class AveragedGatingNetwork(nn.Module):
         self.register_buffer("compared", torch.zeros(1, dtype=torch.int64))
 
     def remember(self, seen: Float32s, more: Float32s) -> None:
-        """Store m decisions in the memory: their observations ``seen`` [m, F], and the extra costs ``more`` [m, K] of K
-        experts.
-        """
+        """Store m decisions: their observations ``seen`` [m, F], and the experts' extra costs ``more`` [m, K]."""
         places = torch.arange(int(self.compared), int(self.compared) + len(seen)) % len(self.seen)
         self.seen[places], self.more[places] = torch.from_numpy(seen), torch.from_numpy(more)
         self.compared += len(seen)
 
     def recall(self, count: int) -> tuple[Tensor, Tensor]:
-        """Draw ``count`` decisions from the memory; return their observations [count, F] and the experts' extra costs
-        [count, K].
-        """
+        """Draw ``count`` decisions from the memory; return observations [count, F] and extra costs [count, K]."""
         some = torch.randint(min(int(self.compared), len(self.seen)), (count,))
         return self.seen[some], self.more[some]
 
     def choose(self, observation: Float32s) -> NDArray[np.int64]:
-        """Return, for each of the observations [rows, F], the index of the expert that ``average`` chooses, [rows]."""
+        """Return the index of the expert that ``average`` chooses for each of the observations [rows, F], [rows]."""
         with torch.no_grad():
             chosen: NDArray[np.int64] = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
         return chosen

@@ -17,11 +17,10 @@ NARROWEST = 4.0  # least ratio of the largest offset to the smallest; takes prec
 
 
 def limit_that_cuts(sizes: Floats, share: float) -> float:
-    """Return the limit for absolute gradients; clipping to this limit lowers the sum of the absolute gradients by the
-    fraction ``share``.
+    """Return the limit to which absolute gradients must be clipped so that their sum falls by the fraction ``share``.
 
-    ``sizes`` [n] are the absolute gradients. For example, with ``sizes`` = [1, 1, 4] and ``share`` = 1/3 the limit is
-    2: clipping at 2 gives [1, 1, 2], and the sum falls from 6 to 4, by one third.
+    ``sizes`` [n] are the absolute gradients. With ``sizes`` = [1, 1, 4] and ``share`` = 1/3 the limit is 2: clipping at
+    2 gives [1, 1, 2], and the sum falls from 6 to 4, by one third.
     """
     rising = np.sort(sizes)
     remaining = (
@@ -39,13 +38,9 @@ def smallest_offset(measured: Floats, least: float, most: float) -> float:
     limited to the range from ``least`` to ``most / NARROWEST``. If small offsets do not give larger gradients than
     large offsets, the result is ``least``.
 
-    Args:
-        measured: [n, 2] rows of (absolute value of a gradient, offset with which this gradient was measured). An offset
-            of 0 means that the row is still empty. The gradients measured with the smaller half of the offsets are
-            compared with the gradients measured with the larger half.
-        least: smallest offset that the recipe allows.
-        most: largest offset that the recipe allows.
-
+    ``measured`` [n, 2] has rows of (absolute gradient, offset with which it was measured); offset 0 means that the row
+    is still empty. The gradients of the smaller half of the offsets are compared with those of the larger half.
+    ``least`` and ``most`` are the smallest and the largest offset that the recipe allows.
     """
     known = measured[measured[:, 1] > 0.0]
     halves = np.array_split(known[np.argsort(known[:, 1], kind="stable")], 2)

@@ -34,12 +34,11 @@ from ethbrake_marl.policies.network_spec import Float32s
 
 
 class ExpertsModel(VineModel):
-    """Model that trains a mixture of experts: several networks, and a gating network that chooses which of these
-    networks acts.
+    """Model that trains a mixture of experts.
 
     The training run has four stages. The first stage trains the first expert in all worlds. The second stage trains the
-    other experts, each in worlds that are selected for this expert. The third stage trains the gating network, and the
-    last stage trains all networks together.
+    other experts, each in worlds that are selected for it. The third stage trains the gating network, and the last
+    stage trains all networks together.
 
     Args:
         environment: environment in which the model is trained.
@@ -94,15 +93,12 @@ class ExpertsModel(VineModel):
         update_learning_rate(optimizers, rate)
 
     def _enter(self, stage: Stage, number: int) -> None:
-        """Prepare a stage of the training run of a mixture of experts. ``number`` is the number of the update at which
-        the stage begins or is resumed.
+        """Prepare a stage of the training run, which begins or is resumed at the update ``number``.
 
-        If the stage trains a second or later expert, this expert first imitates templates (random braking profiles)
-        that have a higher return than the earlier experts. After the imitation, the worlds for the training of this
-        expert are selected.
+        If the stage trains a second or later expert, this expert first imitates templates that have a higher return
+        than the earlier experts. Then the worlds for its training are selected.
 
-        The preparation of a stage depends only on the earlier experts, so a resumed training run repeats the
-        preparation exactly.
+        The preparation depends only on the earlier experts, so a resumed training run repeats it exactly.
 
         Raises ``NoBetterTemplate`` if no template has a higher return than the earlier experts, or if no world can be
         selected.
@@ -141,20 +137,14 @@ class ExpertsModel(VineModel):
         follow(pupil.average, pupil.learning, 0.0)
 
     def _compare(self, seen: Float32s, moments: State) -> tuple[Float32s, Floats, Float32s]:
-        """Compare the K experts: let each expert drive from B visited decisions to the end of the episode, and return
-        the cost of each expert at each decision.
+        """Let each of K experts drive from B visited decisions to the end of the episode, to compare their costs.
 
-        The cost of an expert is minus its return, plus ``tie_break`` times its harm. The harm in this cost is the total
-        harm if the reward counts first-impact harm, and the first-impact harm if the reward counts total harm. The B
-        decisions are drawn from the visited decisions at which the experts choose different actions.
+        The cost of an expert is minus its return, plus ``tie_break`` times its harm. The harm in this cost is the count
+        of harm that the reward does not use. The B decisions are drawn from the visited decisions (observations
+        ``seen`` [steps, rows, F]) at which the experts choose different actions.
 
-        Args:
-            seen: [steps, rows, F] observations at the visited decisions.
-            moments: states of the worlds at the visited decisions.
-
-        Returns the observations at the B decisions, [B, F], the cost of each expert, [B, K], and the importance (weight
-        in the loss) of each decision, [B].
-
+        Returns the observations at the B decisions, [B, F], the cost of each expert, [B, K], and the weight of each
+        decision in the loss (importance), [B].
         """
         engine, members = self.engine, [actor.act for actor in self.policy.actors]
         observed = seen.reshape(-1, seen.shape[2])
@@ -176,13 +166,8 @@ class ExpertsModel(VineModel):
         """Train the gating network to choose the cheapest expert.
 
         The weight of a wrong choice in the loss is proportional to its extra cost: the cost of the chosen expert minus
-        the cost of the cheapest expert.
-
-        Args:
-            seen: [B, F] observations at the B decisions.
-            costs: [B, K] cost of each expert at each of the B decisions.
-            importance: [B] weight of each decision in the loss; None: all weights are 1.
-
+        the cost of the cheapest expert. ``seen`` is [B, F], ``costs`` [B, K], and ``importance`` [B] weighs the
+        decisions in the loss (None: all weights are 1).
         """
         importance = np.ones(len(seen), np.float32) if importance is None else importance
         gate = self.policy.gate

@@ -1,4 +1,4 @@
-"""Policy made of several actors (experts) and a gating network, which chooses one of the actors at each decision."""
+"""Policy of several actors (experts) and a gating network, which chooses one of the actors at each decision."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from ethbrake_marl.training.networks import tensors_of_layers
 
 
 class ExpertsPolicy(Deterministic):
-    """Mixture of experts: at each decision a gating network chooses which of several actors (experts) acts.
+    """Mixture of experts: at each decision a gating network chooses which of several actors acts.
 
     Args:
-        observation_space: Gymnasium space of an observation.
-        action_space: Gymnasium space of an action.
+        observation_space: space of an observation.
+        action_space: space of an action.
         rate: learning rate as a function of the share of the training run that remains (1 to 0).
         recipe: recipe with the key ``experts``.
 
@@ -40,10 +40,9 @@ class ExpertsPolicy(Deterministic):
         self.gate = AveragedGatingNetwork(flatdim(observation_space), rate, recipe)
 
     def _chosen(self, observation: Float32s, ask: Callable[[AveragedActor, Float32s], NDArray[Any]]) -> Floats:
-        """Return one number for each observation [rows, F], computed by the actor that the gating network chooses for
-        this observation.
+        """Return one number for each of the observations [rows, F], computed by the actor that the gate chooses.
 
-        ``ask`` is the method that computes an actor's numbers from observations, such as ``AveragedActor.means``.
+        ``ask`` computes an actor's numbers from observations, such as ``AveragedActor.means``.
         """
         chosen, values = self.gate.choose(observation), np.empty(len(observation))
         for number, actor in enumerate(self.actors):

@@ -23,13 +23,7 @@ class Stage(NamedTuple):
 
 
 def stages_of(plan: ExpertsPlan, updates: int) -> tuple[Stage, ...]:
-    """Return the stages of a training run, earliest first. A stage with a small share may get no updates.
-
-    Args:
-        plan: value of the recipe's key ``experts``, which contains the share of updates for each stage.
-        updates: number of updates in the whole training run.
-
-    """
+    """Return the stages of a training run of ``updates`` updates. A stage with a small share may get no updates."""
     shares, others = plan.shares, plan.networks - 1
     parts: list[tuple[Trains, int, float]] = [("first", 0, shares.pretraining_first)]
     parts += [("other", k + 1, shares.pretraining_others / others) for k in range(others)]

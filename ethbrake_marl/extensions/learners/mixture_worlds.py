@@ -1,7 +1,8 @@
 """Selection of the worlds and templates with which a new expert of a mixture is trained.
 
-A *template* is a random braking profile. A new expert first imitates templates that have a higher return than all
-earlier experts.
+Arguments that several functions share: ``engine`` is the engine of the training run; it is not changed. ``plan`` is the
+value of the recipe key ``experts``. ``explored`` is the result of ``explore``. ``act`` is a policy: a function from
+observations [rows, F] to actions [rows]. ``gamma`` is the discount factor per time step.
 """
 
 from __future__ import annotations
@@ -29,9 +30,7 @@ NO_DIFFERENCE = 1e-2  # returns that differ by less than this count as equal
 
 
 class Explored(NamedTuple):
-    """The first n worlds of the training run; for each world, the highest return and the least harm of the earlier
-    experts.
-    """
+    """The first n worlds of the training run, with the highest return and least harm of the earlier experts."""
 
     alert: Worlds  # the worlds at the alert
     start: State  # states of the worlds at the first decision
@@ -40,23 +39,14 @@ class Explored(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """Observations and actions at m decisions of templates (random braking profiles), which a new expert imitates."""
+    """Observations and actions at m decisions of templates, which a new expert imitates."""
 
     seen: Float32s  # [m, F] observations
     action: Float32s  # [m] actions of the templates, in [-1, 1]
 
 
 def explore(engine: Engine, plan: ExpertsPlan, acts: Sequence[Act], gamma: float) -> Explored:
-    """Let every earlier expert drive the first ``plan.worlds`` worlds of the training run; return the highest return
-    and the least harm in each world.
-
-    Args:
-        engine: engine of the training run; it is not changed.
-        plan: settings of the mixture of experts (recipe key ``experts``).
-        acts: the earlier experts; each expert is a function from observations [rows, F] to actions [rows].
-        gamma: discount factor per time step.
-
-    """
+    """Let every earlier expert of ``acts`` drive the first ``plan.worlds`` worlds of the training run."""
     alert, start = engine.first_moments(plan.worlds)
     gained, harm = np.full(plan.worlds, -np.inf), np.full(plan.worlds, np.inf)
     for act in acts:
@@ -68,18 +58,10 @@ def explore(engine: Engine, plan: ExpertsPlan, acts: Sequence[Act], gamma: float
 def drive_from(
     engine: Engine, start: State, act: Act, gamma: float, count: HarmCount | None = None
 ) -> tuple[Floats, Floats]:
-    """Let one policy drive from each of n states to the end of the episode, and measure its return and its harm.
+    """Let one policy drive from each of n states to the end of the episode, and measure its return and harm.
 
-    Args:
-        engine: engine of the training run; it is not changed.
-        start: the n states from which the policy drives.
-        act: policy: a function from observations [rows, F] to actions [rows].
-        gamma: discount factor per time step.
-        count: count of harm, ``first`` or ``total``; None: the count that the reward uses.
-
-    Returns two arrays [n] for the first learner: the return (NaN if the simulation failed), and the harm that this
-    learner should make small (m2/s2).
-
+    Returns two arrays [n] for the first learner: the return (NaN if the simulation failed), and the harm that it should
+    make small (m2/s2) under ``count`` (None: the count that the reward uses).
     """
     rows = engine.branch(start)
     nowhere = np.zeros(rows.n, np.int64)
@@ -88,21 +70,12 @@ def drive_from(
 
 
 def show_templates(engine: Engine, plan: ExpertsPlan, explored: Explored, gamma: float, seed: int) -> Shown:
-    """Draw templates (random braking profiles); return the decisions of templates that have a higher return than all
-    earlier experts.
+    """Draw templates; return the decisions of templates that have a higher return than all earlier experts.
 
     In each world ``plan.templates`` templates are drawn. If the template with the least harm does less harm than every
-    earlier expert, this template is simulated. If the return of this template exceeds the return of the best earlier
-    expert by more than ``plan.gain``, the observations and actions of the template are returned.
-
-    Args:
-        engine: engine of the training run; it is not changed.
-        plan: settings of the mixture of experts (recipe key ``experts``).
-        explored: result of ``explore``: worlds, and the highest return and least harm of the earlier experts in each
-            world.
-        gamma: discount factor per time step.
-        seed: seed with which the templates are drawn.
-
+    earlier expert, this template is simulated. Its observations and actions are returned if its return exceeds the
+    return of the best earlier expert by more than ``plan.gain``. ``seed`` is the seed with which the templates are
+    drawn.
     """
     (vehicle,) = engine.learners
     problem = profile_problem(
@@ -138,20 +111,11 @@ def show_templates(engine: Engine, plan: ExpertsPlan, explored: Explored, gamma:
 
 
 def own_worlds(engine: Engine, plan: ExpertsPlan, explored: Explored, act: Act, gamma: float) -> State:
-    """Select the worlds in which a new expert is to be trained, and return their states at the first decision.
+    """Select the worlds in which the new expert ``act`` is to be trained; return their states at the first decision.
 
     A world is selected if the return of the new expert is above the return of the best earlier expert, or less than
     ``plan.margin`` below it. Worlds in which these two returns are equal, or in which an earlier expert does no harm,
     are not selected.
-
-    Args:
-        engine: engine of the training run; it is not changed.
-        plan: settings of the mixture of experts (recipe key ``experts``).
-        explored: result of ``explore``: worlds, and the highest return and least harm of the earlier experts in each
-            world.
-        act: the new expert: a function from observations [rows, F] to actions [rows].
-        gamma: discount factor per time step.
-
     """
     gained, _ = drive_from(engine, explored.start, act, gamma)
     more = gained - explored.gained
@@ -160,7 +124,4 @@ def own_worlds(engine: Engine, plan: ExpertsPlan, explored: Explored, act: Act, 
 
 
 class NoBetterTemplate(EthBrakeError, ValueError):
-    """Raised if no template (random braking profile) has a higher return than the earlier experts.
-
-    This error means that a further expert would have nothing to learn.
-    """
+    """Raised if no template has a higher return than the earlier experts, so a further expert has nothing to learn."""

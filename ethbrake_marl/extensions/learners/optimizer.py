@@ -22,7 +22,7 @@ for _name in ("step", "add_param_group", "zero_grad", "state_dict", "load_state_
 
 
 def adam(rate: float, *networks: nn.Module | None) -> Adam:
-    """Return an Adam optimiser with the learning rate ``rate`` for all weights of ``networks``. None is skipped."""
+    """Return an Adam optimiser for all weights of ``networks``; None is skipped."""
     return Adam([weight for each in networks if each is not None for weight in each.parameters()], lr=rate, eps=1e-5)
 
 
@@ -36,13 +36,9 @@ def descend(optimizer: Optimizer, *losses: Tensor) -> None:
 
 @torch.no_grad()
 def follow(average: Iterable[Tensor], learning: nn.Module, keep: float) -> None:
-    """Update a running average of weights: ``average = keep * average + (1 - keep) * learning``.
+    """Update averaged weights in place: ``average = keep * average + (1 - keep) * learning``.
 
-    Args:
-        average: averaged weights in the order of ``learning.parameters()``; they are changed.
-        learning: network in training, whose weights are averaged.
-        keep: weight of the old average, from 0 to 1.
-
+    ``average`` has the order of ``learning.parameters()``.
     """
     for mean, learns in zip(average, learning.parameters(), strict=True):
         mean.lerp_(learns, 1.0 - keep)

@@ -1,5 +1,4 @@
-"""The algorithm rollout classification: try several actions at a decision, and learn to choose the action with the
-least cost.
+"""The algorithm rollout classification: try several actions at a decision, and learn to choose the cheapest one.
 
 Source: Lagoudakis and Parr, Reinforcement Learning as Classification, 2003.
 """
@@ -21,10 +20,10 @@ class RolloutClassification(Algorithm):
     """The algorithm rollout classification. One actor drives all learners."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> RolloutClassificationModel:
-        """Return a new model for a training run. The model learns in ``environment``.
+        """Return a new model for a training run.
 
-        At first the model acts like the first policy of the recipe's key ``policies``; without this key the model
-        brakes fully.
+        At first the model acts like the first policy of the recipe's key ``policies``; without this key it brakes
+        fully.
         """
         recipe = training.recipe
         assert isinstance(recipe, RolloutClassificationRecipe)
@@ -33,10 +32,6 @@ class RolloutClassification(Algorithm):
         return RolloutClassificationModel(environment, recipe, weights)
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return a dictionary from names to copies of an actor's averaged weights.
-
-        The weights have the names that they have in a policy bundle; ``network`` is the description of the network in
-        this bundle.
-        """
+        """Return copies of an actor's averaged weights, by their names in a policy bundle with ``network``."""
         tensors: dict[str, Float32s] = actor.tensors(network)
         return tensors

@@ -29,11 +29,7 @@ from ethbrake_marl.training.networks import ACTIVATIONS, copy_of, tensors_of_lay
 
 
 class _TorchActor(Actor):
-    """Copy of the class ``Actor`` (network of a policy) that multiplies matrices with torch instead of numpy.
-
-    ``_TorchActor`` is three times as fast as ``Actor``. The outputs of ``_TorchActor`` and ``Actor`` differ only by
-    rounding.
-    """
+    """Copy of the class ``Actor`` that multiplies matrices with torch: three times as fast, equal but for rounding."""
 
     @torch.no_grad()
     def _forward(self, layers: Layers, x: Float32s) -> Float32s:
@@ -47,24 +43,22 @@ class _TorchActor(Actor):
 
 
 class ChoosingActor(Deterministic):
-    """Actor whose network gives each of several choices a score. The actor takes the choice with the highest score.
+    """Actor that takes the choice to which its network gives the highest score.
 
     Each choice has a number. A choice with a number below ``first`` is a trained policy, which then computes the
-    action. A choice with the number ``first`` or above is an action; these actions are evenly spaced from -1 to 1. The
-    network ``learning`` is trained. The network ``average`` has running averages of the weights of ``learning``; when
-    the actor drives, ``average`` chooses.
+    action. The other choices are actions, evenly spaced from -1 to 1. The network ``learning`` is trained; ``average``
+    has running averages of its weights, and chooses when the actor drives.
 
     A memory stores the last M decisions at which C choices were compared. The *extra cost* of a choice is its cost
     minus the cost of the cheapest choice at the same decision. F is the number of features of an observation.
 
     Args:
-        observation_space: Gymnasium space of an observation.
-        action_space: Gymnasium space of an action.
+        observation_space: space of an observation.
+        action_space: space of an action.
         rate: learning rate as a function of the share of the training run that remains (1 to 0).
         recipe: recipe of the training run.
         policies: for each trained policy that the actor can choose, a mapping from names to weights.
-        members: number of scenarios in the mixture of scenarios in which the actor is trained; 1 if the scenario is not
-            a mixture.
+        members: number of scenarios in the mixture in which the actor is trained; 1 if the scenario is no mixture.
 
     """
 
@@ -107,11 +101,7 @@ class ChoosingActor(Deterministic):
 
     @torch.no_grad()
     def choose(self, observation: Float32s) -> Ints:
-        """Return, for each of the observations [rows, F], the number of the choice with the highest score, [rows].
-
-        A choice with a number below the attribute ``first`` is a trained policy. A choice with the number ``first`` or
-        above is an action; these actions are evenly spaced from -1 to 1.
-        """
+        """Return the number of the choice with the highest score for each of the observations [rows, F], [rows]."""
         chosen: Ints = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
         return chosen
 
@@ -128,13 +118,10 @@ class ChoosingActor(Deterministic):
         return {**tensors_of_layers("policy", self.average), **of_policies}
 
     def remember(self, seen: Float32s, tried: Ints, more: Floats) -> None:
-        """Store m decisions, with the tried choices and their extra costs, in the memory.
+        """Store m decisions in the memory.
 
-        Args:
-            seen: [m, F] observations at the m decisions.
-            tried: [m, C] numbers of the tried choices, as ``choose`` returns them; column 0: the actor's own choice.
-            more: [m, C] extra cost of each tried choice.
-
+        ``seen`` [m, F] are the observations, ``tried`` [m, C] the numbers of the tried choices (column 0: the actor's
+        own choice), and ``more`` [m, C] their extra costs.
         """
         places = torch.arange(int(self.known), int(self.known) + len(seen)) % len(self.seen)
         self.seen[places], self.tried[places] = torch.from_numpy(seen), torch.from_numpy(tried)
@@ -144,15 +131,9 @@ class ChoosingActor(Deterministic):
     def draw(self, batches: int, count: int, focus: float) -> Iterator[tuple[Tensor, Tensor]]:
         """Draw decisions from the memory for several gradient steps.
 
-        Yields, for each gradient step, the indices of the drawn decisions in the memory, [count], and their importance
-        (weight in the loss), [count].
-
-        Args:
-            batches: number of gradient steps.
-            count: number of decisions for each gradient step.
-            focus: share of the draws in which the probability of a decision is proportional to its largest extra cost;
-                the other draws are uniform.
-
+        Yields, for each of ``batches`` gradient steps, the indices of the drawn decisions in the memory, [count], and
+        their weights in the loss (importance), [count]. In the share ``focus`` of the draws, the probability of a
+        decision is proportional to its largest extra cost; the other draws are uniform.
         """
         known = min(int(self.known), len(self.seen))
         if focus == 0.0 or batches == 0:
@@ -165,17 +146,12 @@ class ChoosingActor(Deterministic):
             yield torch.from_numpy(rows[part]), torch.from_numpy(importance[part])
 
     def loss(self, some: Tensor, importance: Tensor, guide: float) -> Tensor:
-        """Return the loss at some decisions of the memory: the expected extra cost of a choice, plus a convex term.
+        """Return the loss at some decisions: (expected extra cost of a choice) + ``guide`` * (convex term).
 
         The probability of a choice is the softmax of the scores. If a probability is close to 0 or 1, the gradient of
         the expected extra cost nearly vanishes, but the gradient of the convex term does not. The convex term lowers
-        the score of every tried choice except the cheapest one, in proportion to its extra cost.
-
-        Args:
-            some: for each decision that enters the loss, its index in the memory.
-            importance: weight in the loss of each decision in ``some``.
-            guide: factor on the convex term; the loss is (expected extra cost) + ``guide`` * (convex term).
-
+        the score of every tried choice except the cheapest one, in proportion to its extra cost. ``some`` are the
+        indices of the decisions in the memory, and ``importance`` their weights in the loss.
         """
         more = self.more[some]
         scores = self.learning(self.seen[some]).gather(1, self.tried[some])

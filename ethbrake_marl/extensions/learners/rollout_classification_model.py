@@ -1,6 +1,4 @@
-"""Model of rollout classification: it tries several actions at a decision, and learns which of these actions has the
-least cost.
-"""
+"""Model of rollout classification: it tries several actions at a decision, and learns which one has the least cost."""
 
 from __future__ import annotations
 
@@ -31,8 +29,7 @@ LEAST_USUAL = 0.1  # m2/s2; least divisor of relative costs, for scenarios with 
 
 
 class RolloutClassificationModel(VineModel):
-    """Model that drives with an actor, tries several actions at some decisions, and learns from the costs of these
-    actions.
+    """Model that drives with an actor, tries several actions at some decisions, and learns from their costs.
 
     Args:
         environment: environment in which the model is trained.
@@ -85,20 +82,12 @@ class RolloutClassificationModel(VineModel):
         self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
 
     def _try_actions(self, seen: Float32s, moments: State) -> tuple[Float32s, Ints, Floats]:
-        """Try C choices (actions, or trained policies that act) at each of B visited decisions; return the cost of each
-        choice.
+        """Try C choices at each of B visited decisions: simulate the episode to its end after each choice.
 
-        After each tried choice the model simulates the episode to its end.
-
-        Args:
-            seen: [steps, rows, F] observations at the visited decisions.
-            moments: states of the worlds at the visited decisions.
-
-        Returns three arrays: the observations [B, F], the numbers of the choices [B, C] (numbered as in
-        ``ChoosingActor``), and the costs of the choices [B, C]. Column 0 is the actor's own choice. The cost of a
-        choice is minus the return from the decision on; the recipe's keys ``tie_break``, ``caution`` and ``relative``
-        modify this cost.
-
+        ``seen`` [steps, rows, F] are the observations at the visited decisions. Returns the observations [B, F], the
+        numbers of the choices [B, C] (numbered as in ``ChoosingActor``), and their costs [B, C]. Column 0 is the
+        actor's own choice. The cost of a choice is minus the return from the decision on; the recipe's keys
+        ``tie_break``, ``caution`` and ``relative`` modify this cost.
         """
         recipe, actor, learners = self.recipe, self.policy, len(self.engine.learners)
         observed, first, last = seen.reshape(-1, seen.shape[2]), actor.first, recipe.network.choices - 1
@@ -153,15 +142,11 @@ class RolloutClassificationModel(VineModel):
         return observed[rows], tried, costs
 
     def _usual(self, rows: Ints, least: Floats) -> Floats:
-        """For each scenario of a mixture of scenarios, update the running mean of the cost of the cheapest choice;
-        return, for each of B decisions, the running mean of the decision's scenario, [B].
+        """Update the running mean of the least cost in each scenario of a mixture; return each decision's mean, [B].
 
         A running mean below ``LEAST_USUAL`` is returned as ``LEAST_USUAL``, because costs are divided by the result.
-
-        Args:
-            rows: [B] for each of the B decisions, the index of the visited state in which the decision was made.
-            least: [B] cost of the cheapest tried choice at each decision.
-
+        ``rows`` [B] are the indices of the visited states in which the decisions were made; ``least`` [B] is the cost
+        of the cheapest tried choice.
         """
         numbers = self._numbers[rows]
         first = int(numbers.min())

@@ -32,14 +32,7 @@ class ChoosingShape(Shape):
     )
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
-        """Return the description of the network, for a policy bundle. The actor with this network takes the action that
-        has the highest score.
-
-        Args:
-            observation_size: number of features of an observation.
-            more: values of further fields of ``NetworkSpec``, by name.
-
-        """
+        """Return the description of the network, for a policy bundle; ``more`` are values of further fields."""
         return super().spec(observation_size, output="choice", choices=self.choices, **more)
 
 
@@ -145,10 +138,7 @@ class RolloutClassificationRecipe(TrainingRecipe):
         return 2 * len(self.near) + len(self.fixed) + self.drawn
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Return the description of the network, and of the policies that it can choose, for a policy bundle.
-
-        ``observation_size`` is the number of features of an observation.
-        """
+        """Return the description of the network, and of the policies that it can choose, for a policy bundle."""
         several = {"observation_size": observation_size, "value_hidden": ()}
         networks = tuple(each.manifest.network.model_copy(update=several) for each in self.loaded_policies)
         return self.network.spec(observation_size, among=networks)
@@ -157,11 +147,9 @@ class RolloutClassificationRecipe(TrainingRecipe):
     def loaded_policies(self) -> tuple[Policy, ...]:
         """The trained policies that the key ``policies`` names.
 
-        The policies are loaded when this property is first used.
-
         If a named policy itself chooses among several policies, these policies take the place of the named policy.
 
-        Raises ``InvalidInput`` if a policy cannot be used; the message names this policy.
+        Raises ``InvalidInput`` if a policy cannot be used.
         """
         loaded: list[Policy] = []
         for name in self.policies:

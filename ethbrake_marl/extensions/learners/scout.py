@@ -1,9 +1,11 @@
-"""Scout: a small network that predicts at which decisions the action matters. More branches start at these decisions
-than at other decisions.
+"""Scout: a small network that predicts at which decisions the action matters, so that more branches start there.
 
-A branch is a copy of the episode with another action. Simulating a branch from a decision at which the action has no
+A branch is a copy of the episode with another action. To simulate a branch from a decision at which the action has no
 effect is a waste of time. Therefore decisions at which the action matters are drawn with a higher probability, and get
 a smaller weight in the loss, so that the expected loss stays the same (importance sampling).
+
+The *size* of a decision is the absolute value of the measured gradient or, for a mixture of experts, the difference in
+cost between the experts. F is the number of features of an observation.
 """
 
 from __future__ import annotations
@@ -21,12 +23,7 @@ WIDTH = 64  # units of the hidden layer
 
 
 class Scout(nn.Module):
-    """Small network that predicts from an observation how much the action at a decision matters.
-
-    The network learns to predict the *size* of a decision: the absolute value of the measured gradient or, for a
-    mixture of experts, the difference in cost between the experts. ``inputs`` is the number F of features of an
-    observation.
-    """
+    """Network that predicts the size of a decision from an observation with ``inputs`` features."""
 
     def __init__(self, inputs: int) -> None:
         super().__init__()
@@ -37,29 +34,21 @@ class Scout(nn.Module):
         nn.init.zeros_(last.bias)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Return the natural logarithm, cut off at 20, of the predicted size of each decision, [rows], for observations
-        [rows, F].
-        """
+        """Return the natural logarithm, cut off at 20, of each predicted size, [rows], for observations [rows, F]."""
         logarithm: Tensor = self.layers(observation)[:, 0].clamp(max=20.0)
         return logarithm
 
     def expect(self, observation: Float32s) -> Floats:
-        """Return, for observations [rows, F], the predicted size of each decision, [rows]; each size is above 0."""
+        """Return the predicted size of each decision, [rows], above 0, for observations [rows, F]."""
         with torch.no_grad():
             size: Floats = np.exp(self(torch.from_numpy(observation)).numpy().astype(np.float64))
         return size
 
     def loss(self, observation: Tensor, size: Tensor, importance: Tensor) -> Tensor:
-        """Return a loss that is smallest if, for each observation, the network predicts the mean size of the decisions
-        with this observation.
+        """Return a loss that is smallest if the network predicts the mean size of the decisions with an observation.
 
-        Decisions of a large size influence this loss less than they would influence a squared error.
-
-        Args:
-            observation: [rows, F] observations at the decisions.
-            size: [rows] measured size of each decision (absolute gradient, or difference in cost).
-            importance: [rows] weight of each decision in the loss.
-
+        Decisions of a large size influence this loss less than they would influence a squared error. ``observation`` is
+        [rows, F]; ``size`` [rows] are the measured sizes; ``importance`` [rows] weighs the decisions in the loss.
         """
         logarithm = self(observation)
         loss: Tensor = (importance * (logarithm.exp() - size * logarithm)).mean()
@@ -67,17 +56,12 @@ class Scout(nn.Module):
 
 
 def draw_rows(expected: Floats, count: int, focus: float) -> tuple[Ints, Float32s]:
-    """Draw ``count`` of n decisions with replacement; decisions at which the action matters more are drawn more often.
+    """Draw ``count`` of n decisions with replacement; decisions of a larger size are drawn more often.
 
-    Args:
-        expected: [n] size of each decision (predicted gradient, or difference in cost), above 0.
-        count: number of decisions that are drawn.
-        focus: share of the draws in which the probability of a decision is proportional to its entry in ``expected``;
-            the other draws are uniform.
-
-    Returns the indices of the drawn decisions [count], and their importance [count], which is their weight in the loss:
-    ``1 / (n p)``, where p is the probability of drawing the decision. The expected value of the importance is 1.
-
+    In the share ``focus`` of the draws, the probability of a decision is proportional to its size ``expected`` [n],
+    above 0; the other draws are uniform. Returns the indices of the drawn decisions [count], and their importance
+    [count], which is their weight in the loss: ``1 / (n p)``, where p is the probability of drawing the decision. The
+    expected value of the importance is 1.
     """
     n = len(expected)
     chance = (1.0 - focus) / n + focus * (expected / expected.sum())
@@ -88,23 +72,14 @@ def draw_rows(expected: Floats, count: int, focus: float) -> tuple[Ints, Float32
 def choose_rows(
     observed: Float32s, rows: Ints, count: int, focus: float, expect: Callable[[Float32s], Floats] | None
 ) -> tuple[Ints, Float32s]:
-    """Draw ``count`` of the decisions ``rows``; at the drawn decisions several actions will be tried.
+    """Draw ``count`` of the decisions ``rows``, at which several actions will be tried.
 
-    Decisions at which the action is predicted to matter are drawn more often.
+    ``observed`` [n, F] are the observations at all decisions; ``rows`` are indices in ``observed``. Decisions are drawn
+    as in ``draw_rows``, by the sizes that ``expect`` (such as ``Scout.expect``) predicts from observations. If
+    ``focus`` is 0 or ``expect`` is None, they are drawn uniformly and without replacement.
 
-    Args:
-        observed: [n, F] observations at all n decisions.
-        rows: indices (in ``observed``) of the decisions from which the function draws.
-        count: number of decisions that are drawn.
-        focus: share of the draws in which the probability of a decision is proportional to its predicted size;
-            decisions are drawn with replacement (see ``draw_rows``). If ``focus`` is 0, all decisions are drawn
-            uniformly and without replacement.
-        expect: function that returns, for observations [rows, F], how much the action at each decision matters, [rows]
-            (see ``Scout.expect``). If ``expect`` is None, decisions are drawn as with ``focus`` = 0.
-
-    Returns the indices of the drawn decisions in ``observed``, and the weight of each drawn decision in the loss
-    (*importance*). The weight is 1 if the decisions are drawn uniformly.
-
+    Returns the indices of the drawn decisions in ``observed``, and the weight of each in the loss (*importance*), which
+    is 1 if the decisions are drawn uniformly.
     """
     if focus == 0.0 or expect is None or len(rows) == 0:
         some = rows[torch.randperm(len(rows))[:count].numpy()]

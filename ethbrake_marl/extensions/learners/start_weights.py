@@ -11,7 +11,7 @@ from ethbrake_marl.training.training import Training
 
 
 def widened(policy: Policy, training: Training) -> dict[str, NDArray[np.float32]]:
-    """Return the weights of ``policy`` by name, as initial weights of a training run that may observe more features.
+    """Return the weights of ``policy`` as initial weights of a training run that may observe more features.
 
     The weights for features that the policy does not observe are 0. Raises ``InvalidInput`` if the training run does
     not observe a feature of the policy, if the policy is a mixture of experts, or if the networks of the policy and of
@@ -34,17 +34,10 @@ def widened(policy: Policy, training: Training) -> dict[str, NDArray[np.float32]
 
 
 def padded(policy: Policy, training: Training, key: str) -> dict[str, NDArray[np.float32]]:
-    """Return the weights of ``policy`` by name, except the weights of its critic, for a training run that may observe
-    more features.
+    """Return the weights of ``policy``, without its critic, for a training run that may observe more features.
 
     The weights for features that the policy does not observe are 0. Raises ``InvalidInput`` if the training run does
-    not observe a feature of the policy.
-
-    Args:
-        policy: trained policy.
-        training: training run that will use the returned weights.
-        key: key of the recipe that names the policy; it is quoted in the error message.
-
+    not observe a feature of the policy; the message quotes ``key``, the recipe's key that names the policy.
     """
     names = [feature.name for feature in training.observation.features]
     known = policy.manifest.observation.features

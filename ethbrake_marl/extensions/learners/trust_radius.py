@@ -25,19 +25,14 @@ def trusted_targets(tried: Tried, radius: float, anchor: float) -> tuple[Float32
     """Return targets [B] for the actor's outputs at B decisions, and the weights [B] of the squared errors in the loss.
 
     Let ``m`` be the actor's present output at a decision, and ``g`` the measured gradient of the return. Then ``weight
-    = (|g| / radius) + anchor`` and ``target = m + (g / weight)``. For every gradient, the distance between the target
-    and ``m`` is less than ``radius``. At ``output = m``, the loss ``(weight / 2) * (output - target)^2`` has the slope
-    ``-g``; therefore a small change of the output that lowers the loss raises the return.
+    = (|g| / radius) + anchor`` and ``target = m + (g / weight)``. The distance between the target and ``m`` is always
+    less than ``radius``. ``anchor`` must be above 0; it is the weight of a decision with gradient 0, and a larger
+    ``anchor`` moves the target closer to ``m``, especially if the gradient is small. At ``output = m``, the loss
+    ``(weight / 2) * (output - target)^2`` has the slope ``-g``; therefore a small change of the output that lowers the
+    loss raises the return.
 
-    Actions are clipped to [-1, 1]. Therefore the target of an output at or above 1 is never above the output, and the
+    Because actions are clipped to [-1, 1], the target of an output at or above 1 is never above the output, and the
     target of an output at or below -1 is never below the output.
-
-    Args:
-        tried: decisions at which two actions were tried, with the actor's outputs and the measured gradients.
-        radius: trust radius; the distance from an output to its target is always smaller than this radius.
-        anchor: weight in the loss of a decision with gradient 0; must be above 0. A larger ``anchor`` moves the target
-            closer to the output, especially if the gradient is small.
-
     """
     outward = ((tried.mean >= 1.0) & (tried.gradient > 0.0)) | ((tried.mean <= -1.0) & (tried.gradient < 0.0))
     gradient = tried.gradient.copy()

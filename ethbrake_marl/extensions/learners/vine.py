@@ -33,8 +33,8 @@ class Vine(Algorithm):
     def build(self, training: Training, environment: EthBrakeVecEnv) -> VineModel:
         """Return a new model for a training run.
 
-        The model learns in ``environment``. The model's initial weights are copied from the policy that the recipe's
-        key ``start`` names; without this key, the initial weights are random.
+        The initial weights come from the policy that the recipe's key ``start`` names; without this key they are
+        random.
         """
         recipe = training.recipe
         assert isinstance(recipe, VineRecipe)
@@ -49,16 +49,12 @@ class Vine(Algorithm):
         return model
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return a dictionary from names to copies of an actor's averaged weights.
-
-        The weights have the names that they have in a policy bundle; ``network`` is the description of the network in
-        this bundle.
-        """
+        """Return copies of an actor's averaged weights, by their names in a policy bundle with ``network``."""
         tensors: dict[str, Float32s] = actor.tensors(network)
         return tensors
 
     def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:
-        """Return a dictionary from names to the optimisers of the model.
+        """Return the optimisers of the model, by name.
 
         A model with one actor has one optimiser, ``policy``. A mixture of experts has the optimisers ``network_1``,
         ``network_2``, ... of its experts, and ``gate`` of its gating network.

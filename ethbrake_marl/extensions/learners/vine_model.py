@@ -26,11 +26,10 @@ from ethbrake_marl.policies.network_spec import Float32s
 
 
 class VineModel(BaseAlgorithm):
-    """Model that drives with a deterministic actor, tries two actions at some decisions, and learns from the difference
-    between the two returns.
+    """Model that drives with a deterministic actor, and measures gradients of the return at some decisions.
 
-    One of the two actions is higher than the actor's action, the other is lower. From the difference between the
-    returns after these two actions the model computes the gradient of the return with respect to the action.
+    The model tries one action above and one below the actor's action. The difference between the two returns gives the
+    gradient of the return with respect to the action.
 
     Args:
         environment: environment in which the model is trained.
@@ -83,11 +82,7 @@ class VineModel(BaseAlgorithm):
         return self
 
     def _update(self, callback: BaseCallback, total: int) -> None:
-        """Make one update of the training run: collect decisions, and learn from them.
-
-        ``callback`` is the callback of the training run, and ``total`` is the number of decisions in the whole training
-        run.
-        """
+        """Make one update of a training run of ``total`` decisions: collect decisions, and learn from them."""
         actor = self.policy
         seen, moments = self._visit(callback, actor.act)
         callback.on_rollout_end()
@@ -95,7 +90,7 @@ class VineModel(BaseAlgorithm):
         self._train(actor, self._try_out(seen, moments, actor))
 
     def _visit(self, callback: BaseCallback, act: Act) -> tuple[Float32s, State]:
-        """Drive all worlds for ``n_steps`` decisions with the policy ``act``; call ``callback`` after each decision.
+        """Drive all worlds for ``n_steps`` decisions with ``act``; call ``callback`` after each decision.
 
         Returns the observations [n_steps, rows, F], and the states of the worlds at the visited decisions.
         """
@@ -117,16 +112,10 @@ class VineModel(BaseAlgorithm):
         return np.stack(seen), State.join(moments)
 
     def _try_out(self, seen: Float32s, moments: State, actor: Deterministic) -> Tried:
-        """At some visited decisions, try a higher and a lower action; after each tried action, simulate the episode to
-        its end.
+        """At some visited decisions, try a higher and a lower action, and simulate the episode to its end after each.
 
-        Args:
-            seen: [steps, rows, F] observations at the visited decisions.
-            moments: states of the worlds at the visited decisions.
-            actor: policy that drives; a tried action is the action of this policy plus or minus an offset.
-
-        Returns the decisions at which the two actions were tried, with the measured gradients.
-
+        A tried action is the action of ``actor`` plus or minus an offset. ``seen`` [steps, rows, F] are the
+        observations at the visited decisions.
         """
         recipe, learners = self.recipe, len(self.engine.learners)
         moving = np.flatnonzero(moving_rows(moments).repeat(learners))

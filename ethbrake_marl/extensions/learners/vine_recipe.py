@@ -112,18 +112,15 @@ class VineRecipe(TrainingRecipe):
         return self
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Return the description of the network for a policy bundle: an actor, or several actors and a gating network.
-
-        ``observation_size`` is the number of features of an observation.
-        """
+        """Return the network's description for a policy bundle: an actor, or several actors and a gating network."""
         plan = self.experts
         mixture = {} if plan is None else {"networks": plan.networks, "gate_hidden": plan.gating}
         return self.network.spec(observation_size, **mixture)
 
     def policy_to_start_from(self, scenario: Scenario) -> str | None:
-        """Return the name of the policy whose weights are the initial weights of a training run on ``scenario``.
+        """Return the policy with the initial weights for ``scenario``; None: the initial weights are random.
 
-        The name is a text such as ``ppo-obstacle`` or ``ppo@runs/x``; None: the initial weights are random.
+        The policy is a text such as ``ppo-obstacle`` or ``ppo@runs/x``.
         """
         if self.start is None or "@" in self.start:
             return self.start
@@ -131,11 +128,9 @@ class VineRecipe(TrainingRecipe):
         return next((name for name in names if load_shipped(name).manifest.scenario.get("name") == scenario.name), None)
 
     def begins(self, scenario: Scenario) -> str:
-        """Return a text that names the origin of the initial weights in messages: a policy such as ``ppo``, or ``random
-        weights``.
+        """Return the origin of the initial weights for messages: a policy such as ``ppo``, or ``random weights``.
 
-        If the policy that ``start`` names is not shipped for ``scenario``, the text says that the weights are random
-        for this reason.
+        If the policy that ``start`` names is not shipped for ``scenario``, the text gives this reason.
         """
         why = "" if self.start is None else f", because no {self.start} is shipped for scenario {scenario.name!r}"
         return self.policy_to_start_from(scenario) or f"random weights{why}"

@@ -44,10 +44,9 @@ class Chains:
     Args:
         file: path of the file, for error messages.
         entry: format of the file.
-        every_s: time between two moments at which chains are formed (s).
+        every_s: time between two moments at which chains are formed, s.
         vehicles: number of vehicles in a chain.
-        names: dictionary from the number of a vehicle or lane to its name, for error messages. If a number has no name,
-            the message shows the number.
+        names: names of vehicles and lanes for error messages, by number; a number without a name is shown itself.
 
     """
 
@@ -64,15 +63,12 @@ class Chains:
     def cut(self, moments: Iterator[tuple[float, list[Any]]]) -> Iterator[tuple[list[float], str]]:
         """Yield each chain: its gaps (m) and speeds (m/s) from front to rear, and the ids of its vehicles (``2-3-4``).
 
-        The first chain of a queue begins with the front vehicle of the queue; the next chain begins directly behind the
-        first chain, and so on. At one moment, a vehicle belongs to at most one chain.
+        ``moments`` are pairs of a time (in units of ``every_s``) and the states of all vehicles. The first chain of a
+        queue begins with its front vehicle, the next chain directly behind the first, and so on. At one moment, a
+        vehicle belongs to at most one chain.
 
-        After the last chain, the function raises ``InvalidInput`` if too many vehicles have faulty data, or if the
-        recorded gaps or positions change by amounts that do not agree with the recorded speeds.
-
-        Args:
-            moments: pairs of a time (in units of ``every_s``) and the states of all vehicles at this time.
-
+        After the last chain, ``InvalidInput`` is raised if too many vehicles have faulty data, or if the recorded gaps
+        or positions do not change as the recorded speeds require.
         """
         last, before, before_by_id = math.nan, dict[float, Link](), dict[float, Any]()
         for tick, there in moments:
@@ -105,15 +101,10 @@ class Chains:
         return self.names.get(number) or f"{number:.0f}"
 
     def _links(self, there: list[Any], by_id: dict[float, Any], row: bool) -> dict[float, Link]:
-        """Return a dictionary from a vehicle's id to the vehicle that follows it at one moment; count faulty data.
+        """Return the follower of each vehicle at one moment, by the vehicle's id; count faulty data.
 
-        Args:
-            there: states of all vehicles at this moment.
-            by_id: dictionary from the id of a vehicle to its state at this moment. If a vehicle is recorded twice, the
-                dictionary contains the state that is recorded first.
-            row: whether chains are formed at this moment. If ``row`` is False, the function counts neither the data
-                that it leaves out nor faulty data.
-
+        ``by_id`` has the states by id; if a vehicle is recorded twice, it has the first state. Without ``row`` (no
+        chains are formed at this moment), neither omitted nor faulty data are counted.
         """
         behind, in_lane = dict[float, Link](), dict[float, float]()  # in_lane: vehicle -> vehicle ahead in the lane
         if self.entry.by_lane:
@@ -161,13 +152,8 @@ class Chains:
     ) -> None:
         """Add the changes of gaps and positions between two moments to sums that ``cut`` checks after the last chain.
 
-        Args:
-            behind: result of ``_links`` at the later moment: the follower of each vehicle.
-            before: result of ``_links`` at the earlier moment.
-            by_id: dictionary from the id of a vehicle to its state at the later moment.
-            by_id_before: dictionary from the id of a vehicle to its state at the earlier moment.
-            passed_s: time between the two moments (s).
-
+        ``behind`` and ``before`` are results of ``_links`` at the later and the earlier moment; ``passed_s`` is the
+        time between them, s.
         """
         for each in behind.keys() & before.keys():
             now, then = behind[each], before[each]
@@ -207,10 +193,7 @@ class Chains:
 
 
 def _gap(ahead: Any, state: Any) -> float:
-    """Return the gap (m) from the rear of the vehicle ``ahead`` to the front of the vehicle ``state``.
-
-    The gap is measured along the direction of travel of the vehicle ``state``.
-    """
+    """Return the gap (m) from the rear of ``ahead`` to the front of ``state``, in ``state``'s direction of travel."""
     along = ahead.front - ahead.length * ahead.dx - state.front
     across = ahead.side - ahead.length * ahead.dy - state.side
     return float(along * state.dx + across * state.dy)

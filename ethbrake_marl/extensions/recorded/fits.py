@@ -24,13 +24,8 @@ SLOWEST_MPS, LONGEST_S = 0.5, 60.0  # least speed and longest time gap of rows t
 def fit_rows(rows: Floats, draw: DataDraw) -> dict[str, Any]:
     """Return scenario keys with distributions of time gaps, of the line's mean speed, and of deviations from this mean.
 
-    Raises ``InvalidInput`` if fewer than ``QUANTILES`` chains have speeds of at least ``SLOWEST_MPS``, and time gaps
-    above 0 and at most ``LONGEST_S``.
-
-    Args:
-        rows: [k, 2 N - 1] gaps (m) and speeds (m/s) of k chains of N vehicles.
-        draw: kind of distribution: ``normal``, ``lognormal`` or ``quantiles``.
-
+    ``rows`` [k, 2 N - 1] are gaps (m) and speeds (m/s) of k chains of N vehicles. Raises ``InvalidInput`` if fewer than
+    ``QUANTILES`` chains have speeds of at least ``SLOWEST_MPS``, and time gaps above 0 and at most ``LONGEST_S``.
     """
     gaps, speeds = np.split(rows, [rows.shape[1] // 2], axis=1)
     times = gaps / np.maximum(speeds[:, 1:], SLOWEST_MPS)
@@ -53,10 +48,7 @@ def fit_rows(rows: Floats, draw: DataDraw) -> dict[str, Any]:
 
 
 def _fit(values: Floats, draw: DataDraw) -> Any:
-    """Return a distribution fitted to ``values`` [k], limited to their range, in the form of a scenario file.
-
-    ``draw`` is the kind of distribution: ``normal``, ``lognormal`` or ``quantiles``.
-    """
+    """Return a distribution fitted to ``values`` [k], limited to their range, in the form of a scenario file."""
     low, high = float(values.min()), float(values.max())
     if draw == "quantiles" or low == high:
         return {"choice": np.quantile(values, (np.arange(QUANTILES) + 0.5) / QUANTILES).tolist()}

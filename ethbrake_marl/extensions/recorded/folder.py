@@ -1,8 +1,8 @@
 """Read all recordings in a folder; return rows, each with the gaps and speeds of one chain of vehicles at one moment.
 
 Each file is read once. The states of its vehicles at regular times are stored in a temporary database on disk, which
-returns the states in order of time. Therefore memory contains only some lines of a file, the vehicles' states at one
-moment, and the rows of gaps and speeds.
+returns them in order of time. Therefore memory contains only some lines of a file, the vehicles' states at one moment,
+and the rows.
 """
 
 from __future__ import annotations
@@ -44,18 +44,11 @@ def read_rows(
 ) -> Rows:
     """Read the chains of vehicles in all recordings of a folder and its subfolders.
 
-    If a file has an error, none of its chains are used, and the result contains the error message.
-
-    Args:
-        folder: folder with the recordings, or a single file.
-        entry: format of the files.
-        every_s: time between two moments at which chains are formed (s).
-        vehicles: number of vehicles in a chain.
-        progress: function that is called with the name of a file, the amount of data read from it so far (KiB), and its
-            size (KiB).
+    If a file has an error, none of its chains are used, and the result contains the error message. ``folder`` may be a
+    single file. ``every_s`` is the time between two moments at which chains are formed, s. ``progress`` is called with
+    the name of a file, the amount of data read from it so far (KiB), and its size (KiB).
 
     Raises ``InvalidInput`` if the folder contains no recordings of this format.
-
     """
     files, refused, twice = _search(folder, entry)
     if not files and (not refused or not folder.is_dir()):
@@ -100,10 +93,9 @@ def read_rows(
 def _search(folder: Path, entry: Format) -> tuple[dict[str, Path], list[str], list[str]]:
     """Find the files of a format in a folder and its subfolders by their names.
 
-    Returns a dictionary from printable paths to files, the errors for subfolders that cannot be read, and the names of
-    files that are left out because they repeat another file. Copies of a file and links to a file are left out as
-    repetitions. A text file without a header is left out as a repetition if its folder contains a CSV file of the same
-    name. Files and folders whose names begin with a dot are ignored, and links to folders are not followed.
+    Returns the files by printable path, the errors for subfolders that cannot be read, and the names of files that are
+    left out because they repeat another file: copies and links, and a text file without a header beside a CSV file of
+    the same name. Files and folders whose names begin with a dot are ignored, and links to folders are not followed.
     """
     if folder.is_file():
         return {plain_text(folder.name): folder}, [], []
@@ -135,7 +127,7 @@ def _size(file: Path) -> int:
 
 
 def _content(file: Path) -> object:
-    """Return a hash of the content of ``file``, or, if the file cannot be read, its path after following links."""
+    """Return a hash of the content of ``file``, or, if it cannot be read, its path after following links."""
     try:
         with open_plain(file, LARGEST_BYTES) as stream:
             return hashlib.file_digest(stream, "sha256").digest()

@@ -17,7 +17,7 @@ NUMBER = "<number>"  # placeholder for the number of a vehicle in the name of a 
 
 
 class Format(NamedTuple):
-    """One format of recorded traffic: names of its files and columns, its units, and what is known about the data."""
+    """One format of recorded traffic."""
 
     title: str  # name of the data set
     files: tuple[str, ...]  # patterns of the names of its files, in lower case
@@ -104,15 +104,11 @@ _ROLES = {"time": "tick", "vehicle": "id", "lane": "lane", "front": "front", "le
 def format_of(name: DataFormat, columns: str = "") -> Format:
     """Return the format of recorded traffic with the name ``name``.
 
-    Args:
-        name: name of the format.
-        columns: for the format ``table`` only: ``time=t,vehicle=id,lane=lane,front=x,length=l,speed=v,units=m``. All
-            values except the value of ``units`` are names of columns of the file. ``time=t/1000`` means that the column
-            ``t`` contains times in 1/1000 s. ``units`` is ``m`` (lengths in m, speeds in m/s), ``ft`` (lengths in ft,
-            speeds in ft/s) or ``km/h`` (lengths in m, speeds in km/h).
+    ``columns`` is for the format ``table`` only: ``time=t,vehicle=id,lane=lane,front=x,length=l,speed=v,units=m``. All
+    values except ``units`` are names of columns of the file. ``time=t/1000`` means that the column ``t`` contains times
+    in 1/1000 s. ``units`` is ``m`` (lengths in m, speeds in m/s), ``ft`` (ft and ft/s) or ``km/h`` (m and km/h).
 
     Raises ``InvalidInput`` if ``columns`` has missing, repeated or unknown keys, or unknown units.
-
     """
     if name != "table":
         if columns:

@@ -1,7 +1,6 @@
 """Read files of recorded traffic (CSV, text with blanks, Parquet), some lines at a time.
 
-Each row of numbers is stored with its line number, which error messages show. In a Parquet file, which has no lines,
-the row number takes the place of the line number.
+Each row of numbers is stored with its line number for error messages. In a Parquet file this is the row number.
 """
 
 from __future__ import annotations
@@ -54,13 +53,9 @@ class Piece(NamedTuple):
     def refuse(self, bad: Bools, k: int, right: str, shown: Floats | None = None) -> None:
         """Raise ``InvalidInput``, which names file, line and column, if at least one value of column ``k`` is wrong.
 
-        Args:
-            bad: [rows] True for each row whose value is wrong. The error message names the first wrong row.
-            k: index of the checked column.
-            right: end of the error message, which says what a valid value is.
-            shown: [rows] values to show in the error message instead of the values in column ``k``, for instance in
-                another unit; None: the values in column ``k``.
-
+        ``bad`` [rows] is True for wrong rows; the message names the first. ``right`` is the end of the message, which
+        says what a valid value is. ``shown`` [rows] are values to show instead of those in column ``k``, for instance
+        in another unit.
         """
         if bad.any():
             value = (self.values[:, k] if shown is None else shown)[bad][0]
@@ -80,21 +75,14 @@ def read_pieces(
     names: dict[str, float] | None = None,
     progress: Callable[[int, int], None] = lambda *_: None,
 ) -> Iterator[Piece]:
-    """Yield the numbers in the columns ``columns`` of a file, with up to ``PIECE`` rows at a time.
+    """Yield the numbers in the columns ``columns`` of a file, in this order, with up to ``PIECE`` rows at a time.
 
-    All numbers are finite, with one exception: if the format has gaps instead of positions, empty cells become NaN.
-
-    Args:
-        file: path of the file.
-        entry: format of the file.
-        columns: names of the columns to read, in this order.
-        names: dictionary from names of vehicles and lanes to numbers, for columns that contain names instead of
-            numbers; the function adds new names to the dictionary.
-        progress: function that is called with the amount of data read so far (KiB) and the size of the file (KiB).
+    All numbers are finite, but if the format has gaps instead of positions, empty cells become NaN. ``names`` maps
+    names of vehicles and lanes to numbers, for columns that contain names; new names are added to it. ``progress`` is
+    called with the amount of data read so far and the size of the file (KiB).
 
     Raises ``InvalidInput``, which names file, line and column, for a missing column or a cell that is not a number.
     Raises ``NotARecording`` for a table that is not a recording of traffic.
-
     """
     with open_plain(file, LARGEST_BYTES) as stream:
         text, empty = TextIOWrapper(stream, "utf-8-sig"), True
@@ -125,8 +113,7 @@ def _numbers(
 ) -> Iterator[tuple[int, list[float]]]:
     """Yield, for each row, its line number and the numbers in the cells that ``readers`` selects.
 
-    ``readers`` contains, for each cell to read, the index of the cell and the function that converts the text of the
-    cell to a number.
+    ``readers`` has, for each cell to read, its index and the function that converts its text to a number.
     """
     for line, cells in rows:
         if len(cells) != len(shown):
@@ -241,7 +228,7 @@ def _measured(cell: str) -> float:
 
 
 def _number_of(names: dict[str, float], cell: str) -> float:
-    """Return the number of the name in ``cell`` from the dictionary ``names``; a new name gets the next whole number.
+    """Return the number of the name in ``cell``; a new name gets the next whole number.
 
     Raises ``ValueError`` for an empty name.
     """
@@ -253,15 +240,8 @@ def _number_of(names: dict[str, float], cell: str) -> float:
 def _match(file: Path, columns: Sequence[str], shown: Sequence[str]) -> tuple[list[int], list[str]]:
     """Find columns of a file by name; return the indices of these columns, and the names of the missing columns.
 
-    If a name matches numbered columns (Speed1, Speed2, ...), the indices are in the order of the columns' numbers.
-
-    Raises ``InvalidInput`` if two columns of the file have the same name.
-
-    Args:
-        file: path of the file, for the error message.
-        columns: names of the columns to find.
-        shown: names of all columns of the file.
-
+    If a name matches numbered columns (Speed1, Speed2, ...), the indices are in the order of these numbers. ``shown``
+    are the names of all columns. Raises ``InvalidInput`` if two columns of the file have the same name.
     """
     small = [_OTHER_NAMES.get(name.lower(), name.lower()) for name in shown]
     ordered = sorted((len(name), name, k) for k, name in enumerate(small))  # Speed2 before Speed10
@@ -276,8 +256,7 @@ def _match(file: Path, columns: Sequence[str], shown: Sequence[str]) -> tuple[li
 def _unknown(file: Path, entry: Format, missing: list[str], have: Sequence[str]) -> InvalidInput:
     """Return the error for a file that lacks the columns ``missing``.
 
-    The list ``have`` contains the cells of the file's first lines. If these cells are the column names of another
-    format, the error message names the other format.
+    If ``have``, the cells of the file's first lines, are the column names of another format, the message names it.
     """
     small = {name.lower() for name in have}
     for title, (there, absent) in REFUSED.items():

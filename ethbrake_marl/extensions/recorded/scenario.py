@@ -1,4 +1,4 @@
-"""Create a scenario (a scenario file, and a CSV file with gaps and speeds) from a folder of recorded traffic."""
+"""Create a scenario (a YAML file, and a CSV file with gaps and speeds) from a folder of recorded traffic."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _LISTED = 10  # largest number of skipped files that a note names
 
 
 class FromData(NamedTuple):
-    """A scenario that was created from a folder of recordings, and information on the files in the folder."""
+    """A scenario that was created from a folder of recordings, and information on the files."""
 
     text: str  # content of the scenario file (YAML)
     csv: str  # content of the file of its rows (CSV): gaps (m), speeds (m/s), and the column ``recording``
@@ -53,23 +53,21 @@ def scenario_from_data(
 ) -> FromData:
     """Create a scenario from the recordings in a folder and in all its subfolders.
 
-    At regular times, each queue of vehicles in a recording is cut into chains, beginning at the front of the queue. A
-    chain has as many vehicles as the scenario ``based_on``. At one time, a vehicle belongs to at most one chain. Each
-    chain is one row of gaps and speeds. If there are more rows than the table of a scenario may have, only every k-th
-    row is used.
+    At regular times, each queue of vehicles in a recording is cut into chains of as many vehicles as the scenario
+    ``based_on`` has, beginning at the front of the queue. Each chain is one row of gaps and speeds. If there are more
+    rows than the table of a scenario may have, only every k-th row is used.
 
     Args:
         name: name of the scenario.
         folder: folder with the files, or one file.
         format: format of the files.
-        columns: for the format ``table`` only: names of the columns, in the form that ``format_of`` describes.
+        columns: for the format ``table`` only: names of the columns, see ``format_of``.
         based_on: scenario that provides the number of vehicles and all quantities that are not recorded.
-        every_s: time between two moments of a recording at which chains are formed (s).
+        every_s: time between two moments at which chains are formed, s.
         draw: how the scenario draws a world: ``rows`` draws a recorded chain; ``normal``, ``lognormal`` and
             ``quantiles`` draw each quantity from a distribution of this kind, which is fitted to the chains.
-        strict: if True, an error in at least one file raises an exception; if False, files with errors are left out.
-        progress: function that is called with the name of a file, the amount of data read from it so far (KiB), and its
-            size (KiB).
+        strict: True: any error in a file raises an exception; False: files with errors are left out.
+        progress: called with the name of a file, the amount of data read from it so far (KiB), and its size (KiB).
 
     Raises ``InvalidInput``, which names file, line and column, if no file can be used. If several files have errors,
     notes on the exception (``__notes__``) describe the errors of all files but the first.
@@ -135,7 +133,7 @@ def _name(file: str, vehicles: str) -> str:
 
 
 def _found(rows: Rows, vehicles: int, every_s: float) -> list[str]:
-    """Return phrases that say what the recordings in a folder contain, and which data were left out."""
+    """Return phrases that say what the recordings contain, and which data were left out."""
     groups = {2: "pair", 3: "trio"}.get(vehicles, "queue")
     parts = [
         f"{count_of(rows.seen, 'chain')} of {vehicles} vehicles, every {every_s:g} s; at one time, a vehicle is in at"

@@ -1,7 +1,7 @@
 """Convert the numbers of a recording to states of vehicles: position, direction, length and speed, in m and m/s.
 
-The states of all vehicles at regular times are stored in a temporary database on disk, which returns the states in
-order of time.
+The states of all vehicles at regular times are stored in a temporary database on disk. ``every_s`` is the time between
+two moments at which chains of vehicles are formed, s. A *tick* is the interval between two recorded moments.
 """
 
 from __future__ import annotations
@@ -43,10 +43,9 @@ STATE_TABLE = f"CREATE TABLE state({','.join(State._fields)})"
 
 
 def check_every(every_s: float, entry: Format, what: str) -> int:
-    """Return the number of ticks (intervals between recorded moments) in the time ``every_s``.
+    """Return the number of ticks in the time ``every_s``.
 
-    Raises ``InvalidInput`` if ``every_s`` is not a multiple of a tick. ``what`` is the name of the recorded data in the
-    error message.
+    Raises ``InvalidInput`` if ``every_s`` is not a multiple of a tick. ``what`` is the name of the data in the message.
     """
     stride = every_s * entry.hertz
     off = 0.01 * stride if entry.title == "the table" else 1e-6  # video has 29.97 pictures in a second
@@ -66,18 +65,11 @@ def keep_states(
     names: dict[str, float],
     progress: Callable[[int, int], None],
 ) -> None:
-    """Read a recording, and write the states of its vehicles at regular times into the table ``state`` of a database.
+    """Read a recording, and write the states of its vehicles at regular times into the empty table ``state``.
 
-    Args:
-        store: database with an empty table ``state``.
-        file: path of the recording.
-        entry: format of the file.
-        every_s: time between two moments at which chains of vehicles are formed (s).
-        names: dictionary from the name of a vehicle or lane to its number; the function adds new names.
-        progress: function that is called with the amount of data read so far (KiB) and the size of the file (KiB).
-
-    Raises ``InvalidInput``, which names file, line and column, for an impossible value, for instance a length of 0 m.
-
+    ``names`` maps names of vehicles and lanes to numbers; new names are added to it. ``progress`` is called with the
+    amount of data read so far and the size of the file (KiB). Raises ``InvalidInput``, which names file, line and
+    column, for an impossible value, for instance a length of 0 m.
     """
     turned, first, stride, cars, states = np.empty((0, 2)), None, 1, 0, 0
     for piece in read_pieces(file, entry, list(entry.columns.values()), names, progress):
@@ -106,7 +98,7 @@ def keep_states(
 def moments(store: sqlite3.Connection) -> Iterator[tuple[float, list[Any]]]:
     """Yield (time, states) for each moment in the table ``state``, in order of time.
 
-    The time is in units of ``every_s`` (see ``keep_states``). The states of a moment have the order of the file.
+    The time is in units of ``every_s``. The states of a moment have the order of the file.
     """
     for tick, rows in groupby(store.execute("SELECT * FROM state ORDER BY tick, line"), itemgetter(0)):
         yield tick, [State(*row) for row in rows]
@@ -120,12 +112,11 @@ def _directions(file: Path, entry: Format) -> Floats:
 
 
 def _with_rate(entry: Format, times: Floats, every_s: float) -> Format:
-    """Return the format ``entry`` with the sampling rate of a file, computed from the file's times ``times`` [rows].
+    """Return the format ``entry`` with the sampling rate of a file, computed from its ``times`` [rows].
 
     A tick is the smallest difference between two times, and the rate is 1 / tick. If some times are not multiples of
-    the tick, the recorded times were rounded; if the rate is also within 2 % of a whole number, the function returns
-    this whole number as the rate. For example, times of 0.033 s and 0.067 s mean 30 Hz. If all times are equal, the
-    tick is ``every_s``.
+    the tick (because they were rounded), and the rate is within 2 % of a whole number, this number is the rate. For
+    example, times of 0.033 s and 0.067 s mean 30 Hz. If all times are equal, the tick is ``every_s``.
     """
     seconds = np.unique(np.round(times * entry.ticks, 6))
     steps = np.diff(seconds)
@@ -137,14 +128,10 @@ def _with_rate(entry: Format, times: Floats, every_s: float) -> Format:
 
 
 def _states(piece: Piece, entry: Format, ticks: Floats, turned: Floats) -> Floats:
-    """Return the states that the rows ``piece`` of a file contain, one per vehicle and time, [states, fields of State].
+    """Return the states in the rows ``piece`` of a file, one per vehicle and time, [states, fields of State].
 
-    Args:
-        piece: consecutive rows of the file, as numbers.
-        entry: format of the file.
-        ticks: [rows] time of each row since the first row of the file, in units of ``every_s`` (see ``keep_states``).
-        turned: [vehicles, 2] id and driving direction of each vehicle, sorted by id; used for highD only.
-
+    ``ticks`` [rows] is the time since the first row of the file, in units of ``every_s``. ``turned`` [vehicles, 2] is
+    the result of ``_directions``, for highD only.
     """
     if entry.gaps:
         return _of_gaps(piece, entry, ticks)
@@ -176,11 +163,11 @@ def _states(piece: Piece, entry: Format, ticks: Floats, turned: Floats) -> Float
 
 
 def _of_gaps(piece: Piece, entry: Format, ticks: Floats) -> Floats:
-    """Return the states that the rows ``piece`` of an OpenACC file contain, one per car and time, [states, fields].
+    """Return the states in the rows ``piece`` of an OpenACC file, like ``_states``.
 
-    Car k follows car k - 1 if the speeds of both cars and the gap between these cars (column ``IVS`` with the number
-    k - 1) are recorded. The first car of a queue has position 0. The position of every other car is minus the sum of
-    the gaps between this car and the first car of its queue.
+    Car k follows car k - 1 if the speeds of both cars and the gap between these cars (column ``IVS`` with the number k
+    - 1) are recorded. The first car of a queue has position 0. The position of every other car is minus the sum of the
+    gaps between it and the first car of its queue.
     """
     at = {name.lower(): k for k, name in enumerate(piece.columns)}
     cars = sorted(int(name.removeprefix("speed")) for name in at if name.startswith("speed"))

@@ -62,10 +62,10 @@ class DecelerationCurve:
 def deceleration_curve(world: Worlds, task: Task, *, points: int = POINTS) -> DecelerationCurve:
     """Compute predicted, first-impact and total harm of one world at many constant decelerations of one vehicle.
 
-    ``points`` of the decelerations are evenly spaced. The other decelerations are those at which the predicted harm
-    (the pairwise closed form) has a kink, a jump or its minimum. The prediction assumes that all other vehicles brake
-    fully. In the simulation, the other vehicles follow the scripts of the scenario. Raises ``InvalidInput`` if there is
-    not exactly one world, if ``points`` is below 2, or if a script reacts to what happens after the alert.
+    ``points`` of the decelerations are evenly spaced. At the other decelerations the predicted harm (the pairwise
+    closed form) has a kink, a jump or its minimum. The prediction assumes that all other vehicles brake fully. In the
+    simulation, the other vehicles follow the scripts of the scenario. Raises ``InvalidInput`` if there is not exactly
+    one world, if ``points`` is below 2, or if a script reacts to what happens after the alert.
 
     Args:
         world: world at the alert, n = 1.
@@ -112,12 +112,12 @@ def regimes_of(worlds: Worlds, pair: int, deceleration_mps2: Floats) -> NDArray[
     Each vehicle of the pair coasts during its latency and then brakes with a constant deceleration. All other vehicles
     are ignored. The values are ``early`` (contact before the front vehicle brakes), ``A`` (the front vehicle brakes,
     the rear vehicle coasts), ``A'`` (the front vehicle is at rest, the rear vehicle coasts), ``B`` (both vehicles
-    brake), ``C`` (the front vehicle is at rest, the rear vehicle brakes) and ``none`` (no contact). The page
-    docs/internals/proofs/constant-deceleration.md defines each of these kinds of contact by formulas.
+    brake), ``C`` (the front vehicle is at rest, the rear vehicle brakes) and ``none`` (no contact). Formulas:
+    docs/internals/proofs/constant-deceleration.md.
 
     Args:
         worlds: worlds at the alert, [n].
-        pair: index of the front vehicle of the pair; the rear vehicle has the index ``pair + 1``.
+        pair: index of the front vehicle of the pair.
         deceleration_mps2: constant deceleration of each vehicle, [n, N] m/s2.
 
     """
@@ -161,12 +161,12 @@ def deceleration_figure(curve: DecelerationCurve, *, title: str = "") -> Figure:
 
     The upper panel shows the predicted harm, the simulated harm under both counts, and the decelerations that the
     pairwise and the coupled E-V2X-BM choose. Two horizontal lines mark the best known harm of this world over all
-    commands, constant or not: one line for each harm count. The lower panel shows how each pair makes its first contact
-    (see ``regimes_of``).
+    commands, constant or not, under each count. The lower panel shows how each pair makes its first contact (see
+    ``regimes_of``).
 
     Args:
-        curve: harm at each deceleration, as ``deceleration_curve`` returns it.
-        title: title of the figure; if empty, the title is the name of the scenario.
+        curve: result of ``deceleration_curve``.
+        title: title of the figure; empty: the name of the scenario.
 
     """
     scenario, vehicle = curve.task.scenario, curve.task.vehicle

@@ -21,13 +21,12 @@ from ethbrake_marl.game.harm import HARM_COUNTS
 def trajectories(records: Mapping[str, EpisodeRecord], *, caption: str = "") -> Figure:
     """Draw positions with impacts, gaps, and commands of the controlled vehicles over time.
 
-    The figure has one column for each recorded episode. All columns have the same scales, so episodes of different
-    agents can be compared. Raises ``InvalidInput`` if ``records`` is empty.
+    The figure has one column for each recorded episode. All columns have the same scales. Raises ``InvalidInput`` if
+    ``records`` is empty.
 
     Args:
         records: recorded episodes; the key of an episode is the title of its column.
-        caption: text below the figure; if ``caption`` is empty, the text states the gaps, speeds and other parameters
-            of the first world.
+        caption: text below the figure; empty: the gaps, speeds and other parameters of the first world.
 
     """
     if not records:
@@ -121,5 +120,5 @@ def _command(axes: Axes, record: EpisodeRecord) -> None:
 
 
 def _vehicle_style(i: int) -> dict[str, Any]:
-    """Return the colour and dashes in which the curves of Vehicle ``i + 1``, and of the gap ahead of it, are drawn."""
+    """Return the style of the curves of Vehicle ``i + 1`` and of the gap ahead of it."""
     return {"color": vehicle_colour(i), "linestyle": DASHES[i % len(DASHES)], "linewidth": 1.6}

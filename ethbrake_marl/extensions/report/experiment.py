@@ -68,9 +68,8 @@ MakeSection = Callable[[Experiment, OnProgress], RunSection | None]  # None: no 
 def register_run_section(name: str, make: MakeSection) -> None:
     """Register a function that adds a section to the report of every ``ethbrake run``, below the results.
 
-    ``name`` is the unique name of the section. ``make`` is a function that returns the section for a run, or None if
-    the report of this run needs no such section. An installed package can instead declare an entry point in the group
-    ``ethbrake_marl.run_sections``.
+    ``name`` must be unique. ``make`` returns the section for a run, or None if the report needs no such section. An
+    installed package can instead declare an entry point in the group ``ethbrake_marl.run_sections``.
     """
     RUN_SECTIONS.add(name, make, lambda other: other is make)
 
@@ -79,18 +78,12 @@ RUN_SECTIONS: Registry[MakeSection] = Registry("section of a run's report", "run
 
 
 def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
-    """Evaluate the policy on the other two tests, draw figures, write ``report.html``, and return the text to print.
-
-    Args:
-        experiment: results of ``ethbrake run`` so far: the folder, the trained policy and its evaluation.
-        tell: function that is called with a ``Progress`` object at each stage.
-
-    """
+    """Evaluate the policy on the other two tests, draw figures, write ``report.html``, and return the text to print."""
     evaluation, folder = experiment.evaluation, experiment.run.path
     others, done = other_tests(evaluation.scenario) if len(evaluation.vehicles) == 1 else (), count()
 
     def begin(stage: str) -> None:
-        """Report that the stage named ``stage`` begins. An empty ``stage`` means that all stages have ended."""
+        """Report that ``stage`` begins; an empty ``stage`` means that all stages have ended."""
         tell(Progress(f"report{stage and ': '}{stage}", next(done), 2 + len(others)))
 
     is_papers = is_papers_test(evaluation.task, evaluation.seed)
@@ -152,18 +145,10 @@ def write_figures(
 ) -> list[Part]:
     """Draw the three figures, write them as PNG files into ``folder``, and return them as parts of an HTML page.
 
-    Args:
-        folder: folder of the run, into which the PNG files are written.
-        evaluation: evaluation of the trained policy or team and of the baselines.
-        rows: results of the evaluation, one row for each agent.
-        course: evaluations during the training, each with ``steps``, ``first_impact_harm``, ``total_harm`` and
-            ``collision_rate``.
-        course_caption: caption of the learning curve.
-        agents: evaluated agents, by name. The trained policy and two baselines drive a typical world again, and the
-            third figure shows these episodes.
-        learned: name of the trained policy or team in ``agents``.
-        harm_count: harm count by which the typical world is chosen, ``first`` or ``total``.
-
+    ``course`` are evaluations during the training, each with ``steps``, ``first_impact_harm``, ``total_harm`` and
+    ``collision_rate``; ``course_caption`` is the caption of this learning curve. ``learned`` is the name of the trained
+    policy or team in ``agents``; it and two baselines drive a typical world again for the third figure. ``harm_count``
+    is the count by which this world is chosen.
     """
     references = [row for row in rows if row.agent in BESIDE]
     shown = telling_world(evaluation, harm_count, learned)
@@ -195,9 +180,8 @@ def write_figures(
 def telling_world(evaluation: Evaluation, harm_count: HarmCount = "first", learned: str = TRAINED_POLICY) -> int:
     """Return the index of a typical world: the world in which ``learned`` reduces the harm by the median amount.
 
-    The reduction of the harm is the harm of full braking minus the harm of ``learned``, the trained policy or team. The
-    median is taken over the worlds in which full braking does harm. If full braking does no harm in any world, the
-    function returns 0. ``harm_count`` is the harm count for the reduction: ``first`` or ``total``.
+    The reduction is the harm of full braking minus the harm of ``learned``, the trained policy or team. The median is
+    taken over the worlds in which full braking does harm; without such worlds, the function returns 0.
     """
     before = evaluation.outcome(BESIDE[0]).world_harm(harm_count)
     rows = np.flatnonzero(before > 0.0)

@@ -32,16 +32,10 @@ _COLOURS = 64
 def film_scenes(world: Worlds, agent: Driver, *, scenario: Scenario, fps: float = FILM_FPS) -> list[Scene]:
     """Simulate one episode, and return its scenes: ``fps`` scenes per second from the alert on, and the final scene.
 
-    Raises ``InvalidInput`` if there is not exactly one world, and ``PhysicsError`` if the physics cannot simulate the
-    world.
+    Raises ``InvalidInput`` if there is not exactly one world, and ``PhysicsError`` if it cannot be simulated.
 
-    Args:
-        world: world at the alert, n = 1.
-        agent: agent that controls the learner of the scenario, or a team of agents for several learners. The agent is
-            not changed.
-        scenario: scenario of the world; its scripts control the other vehicles.
-        fps: scenes per second.
-
+    ``agent`` controls the learner of the scenario, or is a team of agents for several learners; it is not changed. The
+    scenario's scripts control the other vehicles.
     """
     if world.n != 1:
         raise InvalidInput(
@@ -64,16 +58,10 @@ def film_scenes(world: Worlds, agent: Driver, *, scenario: Scenario, fps: float 
 
 
 def film(world: Worlds, agents: Mapping[str, Driver], ending: str, *, scenario: Scenario) -> bytes:
-    """Let several agents drive the same world, and return a film of their episodes as the bytes of a file.
+    """Let several agents drive the same world; return a film of their episodes as the bytes of a file.
 
-    Raises the exceptions of ``film_scenes`` and ``film_bytes``.
-
-    Args:
-        world: world at the alert, n = 1.
-        agents: agents; the key of an agent is the title above its film.
-        ending: ending of the file name: ``.gif``, ``.mp4`` or ``.svg``.
-        scenario: scenario of the world.
-
+    The keys of ``agents`` are the titles above their films. Raises the exceptions of ``film_scenes`` and
+    ``film_bytes``.
     """
     check_film(ending, len(agents))
     films = {title: film_scenes(world, agent, scenario=scenario) for title, agent in agents.items()}
@@ -84,15 +72,11 @@ def film_bytes(films: Films, ending: str, *, fps: int = FILM_FPS) -> bytes:
     """Return the bytes of a GIF, MP4 or SVG file that shows films of one world in real time, one below the other.
 
     A film that ends before the longest film shows its last scene until the end of the file. GIF and SVG files repeat
-    endlessly. Raises ``InvalidInput`` if there are no films, more than ``MOST_FILMS`` films or more than
-    ``MOST_PICTURES`` pictures, if ``ending`` is unknown, or if 100 is not a multiple of ``fps`` (a GIF stores times in
-    hundredths of a second). Raises ``MissingExtra`` for an MP4 file if the library imageio-ffmpeg is not installed.
-
-    Args:
-        films: scenes of each film; the key of a film is its title.
-        ending: ending of the file name: ``.gif``, ``.mp4`` or ``.svg``.
-        fps: scenes per second.
-
+    endlessly. The keys of ``films`` are titles. ``ending`` is the ending of the file name: ``.gif``, ``.mp4`` or
+    ``.svg``. ``fps`` is the number of scenes per second. Raises ``InvalidInput`` if there are no films, more than
+    ``MOST_FILMS`` films or more than ``MOST_PICTURES`` pictures, if ``ending`` is unknown, or if 100 is not a multiple
+    of ``fps`` (a GIF stores times in hundredths of a second). Raises ``MissingExtra`` for an MP4 file if the library
+    imageio-ffmpeg is not installed.
     """
     check_film(ending, len(films))
     if not films or not all(films.values()):
@@ -122,10 +106,7 @@ def check_film(ending: str, films: int = 1) -> None:
 
 
 def _stacked(films: Films) -> Iterator[Frame]:
-    """Yield the pictures of a GIF or MP4 file in order.
-
-    Each picture shows the scenes of all films at the same time, one below the other.
-    """
+    """Yield the pictures of a GIF or MP4 file in order: the scenes of all films at one time, one below the other."""
     for k in range(max(map(len, films.values()))):
         each = (shown[min(k, len(shown) - 1)]._replace(title=title) for title, shown in films.items())
         yield np.concatenate([scene.frame() for scene in each])

@@ -35,14 +35,9 @@ def harm_by_agent(
 ) -> Figure:
     """Draw the mean harm of each agent as a bar with its 95 % interval.
 
-    A vertical line marks the mean best known harm. Markers show the mean harm of the same agent in other tests. The
-    figure is narrow enough for the screen of a phone. Raises ``InvalidInput`` if ``rows`` is empty.
-
-    Args:
-        rows: results of the evaluation, one row for each agent.
-        harm_count: harm count that the figure shows, ``first`` or ``total``.
-        elsewhere: results of the agents in other tests, by the title of the test; None: no other tests.
-
+    A vertical line marks the mean best known harm. Markers show the mean harm of the same agent in other tests, the
+    results ``elsewhere`` (key: title of the test). The figure is narrow enough for the screen of a phone. Raises
+    ``InvalidInput`` if ``rows`` is empty.
     """
     if not rows:
         raise InvalidInput("harm_by_agent: there are no rows; give the summary of at least one agent")
@@ -70,10 +65,7 @@ def harm_by_agent(
 
 
 def _name_rows(axes: Axes, agents: Sequence[str], most: int = 40) -> None:
-    """Label the rows of a figure with the names of the agents, the first agent in the top row.
-
-    Names with more than ``most`` characters are shortened.
-    """
+    """Label the rows of a figure with the agents' names, at most ``most`` characters each, the first agent on top."""
     axes.set_yticks(range(len(agents)), [label_text(agent, most) for agent in agents])
     axes.invert_yaxis()
 
@@ -81,8 +73,7 @@ def _name_rows(axes: Axes, agents: Sequence[str], most: int = 40) -> None:
 def regret_distribution(evaluation: Evaluation) -> Figure:
     """Draw, for every x, the fraction of worlds in which an agent's regret exceeds x, for each agent and harm count.
 
-    *Regret* is the agent's harm minus the best known harm of the world. If the best known harm of the worlds was not
-    computed, the figure shows the agents' harm instead of their regret.
+    If the best known harm of the worlds was not computed, the figure shows the agents' harm instead of their regret.
     """
     regrets = regrets_of(evaluation)
     figure, panels = new_panels((10.0, 3.8), columns=2, sharey=True)
@@ -110,9 +101,8 @@ def regret_distribution(evaluation: Evaluation) -> Figure:
 def harm_in_parts(evaluation: Evaluation) -> Figure:
     """Draw the mean harm of each agent as a bar of three parts.
 
-    The first part of the bar is the best known harm, the second the regret in worlds with unavoidable contact, and the
-    third the regret in worlds with avoidable contact. *Regret* is the agent's harm minus the best known harm of the
-    world. Raises ``InvalidInput`` if no proof says in which worlds contact is avoidable.
+    The parts are the best known harm, the regret in worlds with unavoidable contact, and the regret in worlds with
+    avoidable contact. Raises ``InvalidInput`` if no proof says in which worlds contact is avoidable.
     """
     regrets = regrets_of(evaluation)
     avoidable = None if regrets is None else regrets.limits.proof.avoidable

@@ -42,10 +42,7 @@ text { font-family: system-ui, sans-serif; font-size: 14px; fill: var(--ink); }
 def animate_films(films: Mapping[str, Sequence[Scene]], *, fps: int) -> str:
     """Return the text of an SVG file that shows films of one world in real time, below each other, to the same scale.
 
-    Args:
-        films: scenes of each film, at least one; the key of a film is its title.
-        fps: scenes per second.
-
+    The keys of ``films`` are titles. ``fps`` is the number of scenes per second.
     """
     frames = max(map(len, films.values())) + round(_HOLD_S * fps)
     every = [scene for film in films.values() for scene in film]
@@ -68,10 +65,9 @@ def animate_films(films: Mapping[str, Sequence[Scene]], *, fps: int) -> str:
 
 
 class _Strip:
-    """Horizontal strip of the SVG picture that shows the film of one agent: a road with vehicles, and a title.
+    """Horizontal strip of the picture that shows the film of one agent: a road with vehicles, and a title.
 
-    ``left_m`` and ``right_m`` are the positions on the road at the left and right edge of the picture. ``fps`` is the
-    number of scenes per second.
+    ``left_m`` and ``right_m`` are the positions on the road at the edges of the picture.
     """
 
     def __init__(self, film: Sequence[Scene], title: str, left_m: float, right_m: float, fps: int) -> None:
@@ -83,7 +79,7 @@ class _Strip:
         return (float(place_m) - self._left) * self._scale
 
     def drawn(self) -> Iterator[str]:
-        """Yield the SVG elements that draw this strip: the road, its vehicles and the title of one film."""
+        """Yield the SVG elements that draw this strip."""
         yield f'<text x="12" y="22" font-weight="bold">{escape(self.title)}</text>'
         texts = [
             f"harm {scene.first_harm:.1f} by first impacts, {scene.total_harm:.1f} in total" for scene in self._film
@@ -113,9 +109,7 @@ class _Strip:
             )
 
     def _vehicle(self, i: int) -> Iterator[str]:
-        """Yield the SVG elements of vehicle ``i``: a moving body with its number, lights that show its command, and
-        stars that show its impacts.
-        """
+        """Yield the SVG elements of vehicle ``i``: its body, lights that show its command, a star for each impact."""
         places = [self._x(scene.front_m[i]) for scene in self._film]
         length, top = BODY_M * self._scale, _FILM_LANE - _HALF_BODY
         yield f'<g transform="translate({places[0]:.1f} 0)">'
@@ -151,8 +145,8 @@ class _Strip:
     def _events(self) -> list[tuple[int, int, Struck]]:
         """Return the impacts to show, each as (start, stop, impact): scenes ``start`` to ``stop - 1`` show the impact.
 
-        Only one impact is shown at a time. If the next impact is at least as strong as the shown impact, the next
-        impact replaces the shown impact. If the next impact is weaker, it is never shown.
+        Only one impact is shown at a time. An impact replaces the shown one if it is at least as strong; otherwise it
+        is never shown.
         """
         known: set[tuple[int, float]] = set()
         events: list[tuple[int, int, Struck]] = []
@@ -186,12 +180,8 @@ class _Strip:
 def _clock(y: int, last: int, frames: int, fps: int) -> Iterator[str]:
     """Yield the SVG elements of the clock: a scale in seconds since the alert, and a bar that grows with time.
 
-    Args:
-        y: vertical position of the clock's bar in the picture.
-        last: index of the last scene of the longest film.
-        frames: number of scenes of the whole animation, after which it starts again.
-        fps: scenes per second.
-
+    ``last`` is the index of the last scene of the longest film; ``frames`` is the number of scenes after which the
+    animation starts again. ``y`` is the vertical position of the bar.
     """
     left, width = 170, _FILM_WIDTH - 200
     yield f'<text class="quiet" x="12" y="{y + 4}">seconds since the alert</text>'

@@ -36,7 +36,7 @@ _STAY = "\u00a0"  # no-break space
 class Part:
     """Part of an HTML page: its HTML text, and the names of the style sheets and scripts that it needs.
 
-    The class methods create common parts, for instance ``Part.paragraph("Text")``.
+    The class methods return common parts, for instance ``Part.paragraph("Text")``.
     """
 
     html: Markup  # HTML text of the part
@@ -45,46 +45,42 @@ class Part:
 
     @classmethod
     def paragraph(cls, text: str, kind: str = "") -> Part:
-        """Return a part of a page: ``text`` as a paragraph.
+        """Return ``text`` as a paragraph.
 
-        ``kind`` is the style of the paragraph: ``quiet`` (small print), ``note`` (important remark), ``alarm``, or
-        empty.
+        ``kind`` is its style: ``quiet`` (small print), ``note`` (important remark), ``alarm``, or empty.
         """
         return cls(Markup('<p class="{}">{}</p>\n').format(kind, shown(text)))
 
     @classmethod
     def heading(cls, text: str) -> Part:
-        """Return a part of a page: ``text`` as a heading inside a section."""
+        """Return ``text`` as a heading inside a section."""
         return cls(Markup("<h3>{}</h3>\n").format(shown(text)))
 
     @classmethod
     def facts(cls, facts: Mapping[str, object]) -> Part:
-        """Return a part of a page that lists the entries of ``facts``, each as a name with its value."""
+        """Return a list of the entries of ``facts``, each as a name with its value."""
         lines = [Markup("<dt>{}</dt><dd>{}</dd>").format(shown(name), _text(value)) for name, value in facts.items()]
         return cls(Markup("<dl>\n{}\n</dl>\n").format(Markup("\n").join(lines)))
 
     @classmethod
     def remarks(cls, texts: Sequence[str]) -> Part:
-        """Return a part of a page with a list of important remarks; the part is empty if ``texts`` is empty."""
+        """Return a list of important remarks; the part is empty if ``texts`` is empty."""
         lines = [Markup("<li>{}</li>").format(shown(text)) for text in texts]
         return cls(Markup('<ul class="remarks">\n{}\n</ul>\n').format(Markup("\n").join(lines)) if lines else Markup())
 
     @classmethod
     def box(cls, title: str, meanings: Mapping[str, str]) -> Part:
-        """Return a part of a page: a box that explains words; ``meanings`` maps each word to its meaning."""
+        """Return a box that explains words; ``meanings`` maps each word to its meaning."""
         return cls(Markup('<aside class="box"><strong>{}</strong>{}</aside>\n').format(title, cls.facts(meanings).html))
 
     @classmethod
     def beside(cls, parts: Sequence[Part]) -> Part:
-        """Return a part of a page that shows ``parts`` side by side, or one below the other on a narrow screen."""
+        """Return a part that shows ``parts`` side by side, or one below the other on a narrow screen."""
         return cls._around('<div class="beside">{}</div>\n', parts)
 
     @classmethod
     def opened(cls, title: str, parts: Sequence[Part]) -> Part:
-        """Return a part of a page that shows ``parts`` under a title.
-
-        The ``parts`` are hidden until the reader clicks on the title.
-        """
+        """Return a part that shows ``parts`` under a title; they are hidden until the reader clicks on the title."""
         return cls._around("<details><summary>{}</summary>\n{}</details>\n", parts, shown(title))
 
     @classmethod
@@ -95,16 +91,11 @@ class Part:
 
     @classmethod
     def data(cls, name: str, content: object, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = ()) -> Part:
-        """Return a part of a page: ``content`` as JSON in an HTML element ``script``, for the scripts of the page.
+        """Return ``content`` as JSON in an HTML element ``script``, for the scripts of the page.
 
-        The characters < > and & are escaped, so the content cannot end the element or begin a new element.
-
-        Args:
-            name: id of the HTML element ``script``.
-            content: plain data: mappings, lists, texts and numbers.
-            styles: names of the style sheets that the scripts need.
-            scripts: names of the scripts that read the data.
-
+        The characters < > and & are escaped, so the content cannot end the element or begin a new element. ``name`` is
+        the id of the element. ``styles`` and ``scripts`` are the names of the style sheets and scripts that read the
+        data.
         """
         text = json.dumps(content, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
         for sign in "<>&":
@@ -114,18 +105,16 @@ class Part:
 
     @classmethod
     def template(cls, file: str, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = (), **values: object) -> Part:
-        """Return a part of a page: the template ``file`` from the folder of this module, filled with ``values``.
+        """Return the template ``file`` from the folder of this module, filled with ``values``.
 
-        Values of the type ``Markup`` (HTML text) are inserted unchanged; other values are escaped. ``styles`` and
-        ``scripts`` are the names of the style sheets and scripts that the part needs, in the same folder.
+        Values of the type ``Markup`` (HTML text) are inserted unchanged; other values are escaped. The part needs the
+        style sheets ``styles`` and the scripts ``scripts`` of the same folder.
         """
         return cls(Markup(_environment().get_template(file).render(**values)), styles, scripts)
 
     @classmethod
     def table(cls, sheet: Sheet) -> Part:
-        """Return a part of a page that shows ``sheet`` as a table.
-
-        A table that is wider than the page can be scrolled.
+        """Return ``sheet`` as a table, which can be scrolled if it is wider than the page.
 
         To put HTML such as a button into a cell, give a ``Shown`` object whose value has the type ``Markup``. The texts
         of all other cells are escaped.
@@ -143,13 +132,13 @@ class Part:
         known: str = "",
         where: object = "",
     ) -> Part:
-        """Return a part of a page that shows a figure with a title and a description.
+        """Return a part that shows a figure with a title and a description.
 
         The caption of the figure becomes text of the page below the figure, because the text of a wide figure is too
         small on a phone. Raises ``InvalidInput`` if ``figure`` is an SVG file that this package did not write.
 
         Args:
-            figure: figure of matplotlib, or the bytes of an SVG file with a figure of this package.
+            figure: figure of matplotlib, or the bytes of an SVG file that this package wrote.
             title: title above the figure.
             description: description of what the figure shows.
             alone: True: the figure, for instance a map, keeps its own colours on a white background; False: the figure
@@ -184,16 +173,16 @@ class Part:
         shown_first: Sequence[int] = (),
         folded: bool = False,
     ) -> Part:
-        """Return a part of a page: the episode player, which shows the same worlds driven by different agents.
+        """Return the episode player, which shows the same worlds driven by different agents.
 
         Args:
             worlds: worlds to show, at least one, with the episode of each agent.
             driven: indices (0 = front) of the controlled vehicles. If different agents control different vehicles, give
                 a mapping from the name of each agent to the indices of its vehicles.
-            focus: name of an agent that is shown at the start if ``shown_first`` is empty.
-            shown_first: indices of the agents that are shown at the start. If ``shown_first`` is empty, up to three
-                agents are shown: ``focus``, the first agent, and agents from the end of the list.
-            folded: whether the curves over time are hidden until the reader clicks on the title above them.
+            focus: agent that is shown at the start if ``shown_first`` is empty.
+            shown_first: indices of the agents that are shown at the start. If empty, up to three agents are shown:
+                ``focus``, the first agent, and agents from the end of the list.
+            folded: True: the curves over time are hidden until the reader clicks on their title.
 
         """
         agents, one = list(worlds[0].motions), next(iter(worlds[0].motions.values())).world
@@ -243,7 +232,7 @@ class Section:
 
     @property
     def parts(self) -> list[Part]:
-        """Body of the section as a list of parts; every string becomes a paragraph."""
+        """Body of the section as a list of parts."""
         return [Part.paragraph(each) if isinstance(each, str) else each for each in self.body]
 
 
@@ -253,8 +242,8 @@ class Page:
 
     Args:
         title: title of the page.
-        sections: sections, in the order of the page; each section has an entry in the table of contents.
-        lead: one or two sentences about the page, below the title.
+        sections: sections in order; each has an entry in the table of contents.
+        lead: one or two sentences below the title.
         opening: parts of the page between the lead and the table of contents.
 
     >>> from ethbrake_marl.extensions.report.page import Page, Part, Section
@@ -275,10 +264,7 @@ class Page:
 
     @cached_property
     def _code(self) -> tuple[str, str]:
-        """Text of all style sheets of the page, and text of all its scripts.
-
-        A file that several parts need is included only once.
-        """
+        """Text of all style sheets of the page, and text of all its scripts, each file once."""
         styles = dict.fromkeys(["page.css", *(name for part in self._parts for name in part.styles)])
         scripts = dict.fromkeys(name for part in self._parts for name in part.scripts)
         return "\n".join(map(read_file, styles)), "\n".join(map(read_file, scripts))

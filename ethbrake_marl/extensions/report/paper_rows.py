@@ -18,7 +18,7 @@ from ethbrake_marl.scenario.task import Task
 class PaperRow:
     """One row of a table of results as printed in the paper.
 
-    The paper has only one count of harm (first-impact harm), and gives no confidence intervals.
+    The paper counts first-impact harm, and gives no confidence intervals.
     """
 
     table: Literal["random test", "hybrid test"]  # title of the table
@@ -68,11 +68,10 @@ _SHOWN_WITH = ("paper-random", "paper-random-early")  # the second is the varian
 
 
 def is_papers_test(task: Task, seed: int | None) -> bool:
-    """Return whether an evaluation can be compared with the rows of the paper's tables of results.
+    """Return whether an evaluation can be compared with the paper's rows.
 
-    The comparison is possible if the scenario is ``paper-random`` or ``paper-random-early`` as shipped, only Vehicle 2
-    is controlled, and the seed is known. ``task`` contains the scenario and the controlled vehicles of the evaluation.
-    ``seed`` is the seed of the list of worlds; None: the seed is unknown.
+    This is true if the scenario is ``paper-random`` or ``paper-random-early`` as shipped, only Vehicle 2 is controlled,
+    and the seed of the list of worlds is known (not None).
     """
     scenario = task.scenario
     return scenario.name in _SHOWN_WITH and seed is not None and task.vehicles == (1,) and is_as_shipped(scenario)
@@ -90,17 +89,17 @@ def check_papers_test(task: Task, seed: int | None) -> None:
 
 
 def summarise_beside_paper(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTable:
-    """Return the summary of an evaluation as a table, with the rows of the paper's tables below the agents.
+    """Return the summary of an evaluation, with the rows of the paper's tables below the agents.
 
-    Raises ``InvalidInput`` if the evaluation cannot be compared with the paper's rows. ``baseline`` is the name of the
-    agent with which all other agents are compared.
+    Raises ``InvalidInput`` if the evaluation cannot be compared with the paper's rows. ``baseline`` is the agent with
+    which all others are compared.
     """
     check_papers_test(evaluation.task, evaluation.seed)
     return with_paper_rows(summarise(evaluation, baseline=baseline))
 
 
 def with_paper_rows(table: SummaryTable) -> SummaryTable:
-    """Return ``table`` with the rows of the paper's tables added at the end."""
+    """Return ``table`` with the rows of the paper's tables at the end."""
     return SummaryTable(table, _beside())
 
 

@@ -23,7 +23,7 @@ _BIN_S = 1e-3  # s; if a pair has several impacts within this time, only the las
 
 @dataclass(frozen=True, slots=True)
 class Played:
-    """One world of the episode player (interactive drawing), with the motion of the vehicles under every agent."""
+    """One world of the episode player, with the motion of the vehicles under every agent."""
 
     number: int  # number of the world in its list
     kind: str  # heading of the group of worlds, which says why the world is shown
@@ -33,28 +33,19 @@ class Played:
 
     @staticmethod
     def drive(played: Sequence[Played], worlds: Worlds, name: str, agent: Driver, scenario: Scenario) -> None:
-        """Let one agent drive the worlds, and store the motion in each world as ``motions[name]``.
+        """Let one agent drive the worlds (at the alert), and store the motion in each world as ``motions[name]``.
 
-        Args:
-            played: one object for each world; the function stores the motion of the vehicles in the dictionary
-                ``motions`` of this object.
-            worlds: worlds at the alert, in the order of ``played``.
-            name: name of the agent, as the page shows it.
-            agent: agent that drives the worlds; the agent is not changed.
-            scenario: scenario of the worlds; its learners are the controlled vehicles.
-
+        ``played`` has one object for each world. The agent is not changed. The scenario's learners are the controlled
+        vehicles.
         """
         for one, motion in zip(played, follow_episodes(worlds, agent, scenario), strict=True):
             one.motions[name] = motion
 
     @staticmethod
     def episode(motion: EpisodeMotion, driven: Sequence[int]) -> dict[str, Any]:
-        """Return the data of one episode as a dictionary, which the script of the player reads.
+        """Return the data of one episode for the script of the player.
 
-        Args:
-            motion: motion of the vehicles in the episode.
-            driven: indices (0 = front) of the controlled vehicles.
-
+        ``driven`` are the indices of the controlled vehicles.
         """
         obstacle = float(motion.world.obstacle_gap_m[0])
         without = 1 + 3 * motion.world.N
@@ -77,9 +68,8 @@ def _impacts(motion: EpisodeMotion) -> list[list[float]]:
 
     The numbers are the time (s), the index of the pair, the closing speed (m/s), 1 for the first impact of the pair and
     0 for a later impact, the number of the impact in the episode (from 1), the first-impact harm so far, and the total
-    harm so far (m2/s2). If a pair has several impacts within the same 1 ms (``_BIN_S``), only the last of these impacts
-    is returned. For the last impact of the episode, the two harms so far equal the recorded harms of the episode
-    exactly.
+    harm so far (m2/s2). If a pair has several impacts within the same 1 ms (``_BIN_S``), only the last one is returned.
+    The two harms so far at the last impact equal the recorded harms of the episode exactly.
     """
     rows = motion.impacts
     order = np.argsort(rows.time_s, kind="stable")

@@ -40,8 +40,8 @@ SHIELD_WORLDS = 200  # number of worlds in which each replacement by a shield is
 def worst_section(evaluation: Evaluation, focus: str, watched: Sequence[int]) -> Section:
     """Return the section that lists the ten worlds in which the agent ``focus`` did worst.
 
-    ``watched`` are the numbers of the worlds that the episode player on the page can show. Each listed world that the
-    player can show gets a button that starts the player.
+    ``watched`` are the numbers of the worlds that the episode player on the page can show; these worlds get a button
+    that starts the player.
     """
     regrets, outcome = regrets_of(evaluation), evaluation.outcome(focus)
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
@@ -118,12 +118,11 @@ _SPLIT: tuple[Column | str, ...] = (
 
 
 def shield_section(rows: ShieldModes, conditions: str) -> Section:
-    """Return the section that compares the modes of the shield.
+    """Return the section that compares the modes of the shield; the section is empty if ``rows`` is empty.
 
     The section also counts the needed, harmless and costly interventions of the mode ``step``. Without an intervention,
-    the harm is higher (needed), equal (harmless) or lower (costly). ``rows`` are the results, one row for each agent
-    and mode of its shield. ``conditions`` is a sentence about the worlds and the harm count. The section is empty if
-    ``rows`` is empty.
+    the harm is higher (needed), equal (harmless) or lower (costly). ``conditions`` is a sentence about the worlds and
+    the harm count.
     """
     if not rows:
         return Section("Shield", ())
@@ -150,11 +149,7 @@ _OTHERS = {"Knows", "sampled_harm", "vehicle_1_shoved_m", "vehicle_1_shoved_far_
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Content of the HTML report of an evaluation.
-
-    ``html`` is the text of the page, and ``write`` writes the page to a file. ``driven`` returns a new report that also
-    has episodes to watch.
-    """
+    """Content of the HTML report of an evaluation."""
 
     title: str  # title of the page
     rows: Sequence[SummaryRow]  # summary of each agent
@@ -176,14 +171,9 @@ class Report:
     def driven(self, agents: Mapping[str, Driver], *, on_agent: Callable[[str], None] | None = None) -> Report:
         """Return a new report that also has episodes to watch and the section about shields.
 
-        For the episodes to watch, every agent drives some worlds again (see ``choose_shown``). The section about
-        shields compares the modes of each shield in the first ``SHIELD_WORLDS`` worlds.
-
-        Args:
-            agents: evaluated agents, by name; they are not changed.
-            on_agent: function that is called with the name of each agent after the agent has driven all worlds that
-                the page shows as episodes.
-
+        For the episodes to watch, every agent drives some worlds again (see ``choose_shown``); the agents are not
+        changed. ``on_agent`` is called with the name of each agent that has finished. The section about shields
+        compares the modes of each shield in the first ``SHIELD_WORLDS`` worlds.
         """
         evaluation, focus, harm_count = self.evaluation, self.about, self.harm_count
         chosen = choose_shown(evaluation, focus)
@@ -208,16 +198,15 @@ class Report:
     def about(self) -> str:
         """Name of the agent that the page is mainly about.
 
-        If ``focus`` is not empty, the page is mainly about the agent ``focus``. If ``focus`` is empty, the page is
-        mainly about the last agent with a trained policy, or about the last agent of all if no agent has a trained
-        policy.
+        This is ``focus``. If ``focus`` is empty, it is the last agent with a trained policy, or the last agent of all
+        if no agent has a trained policy.
         """
         learned = [row.agent for row in self.rows if row.policy_sha256]
         return self.focus or (learned or [row.agent for row in self.rows] or [""])[-1]
 
     @property
     def html(self) -> str:
-        """HTML text of the whole page. The page is a single file, which loads no other file."""
+        """HTML text of the whole page."""
         sections: list[Section | None] = [self._results(), *self.sections, self._episodes()]
         if self.focus:
             sections.append(worst_section(self.evaluation, self.focus, [one.number for one in self.played]))
@@ -257,11 +246,11 @@ class Report:
 
     @property
     def first_sentence(self) -> str:
-        """First sentence of the page, which compares the harm of one agent with full braking and the best known harm.
+        """First sentence of the page, which compares the agent ``about`` with full braking and the best known harm.
 
-        The sentence is about the agent ``about``. The sentence names the tests in ``tests`` in which this agent does
-        about as much harm as full braking, or more. If the agent does clearly less harm than full braking in all of
-        ``tests``, the sentence says in how many worlds of the evaluation the agent does more harm than full braking.
+        The sentence names the tests in ``tests`` in which this agent does about as much harm as full braking, or more.
+        If the agent does clearly less harm than full braking in all of ``tests``, the sentence says in how many worlds
+        of the evaluation the agent does more harm than full braking.
         """
         rows, harm = {row.agent: row for row in self.rows}, NAMES[self.harm_count]
         if self.about not in rows:
@@ -283,12 +272,9 @@ class Report:
         return f"{name} does {words} full braking ({numbers}){joined}{fails or 'in no world more'}."
 
     def _fails(self, harm: str) -> str:
-        """Return the end of ``first_sentence``, which names tests or worlds in which the agent does badly, if any.
+        """Return the end of ``first_sentence``, which names tests or worlds in which the agent does badly.
 
-        The text names the tests in ``self.tests`` in which the agent's harm is not clearly less than the harm of full
-        braking (see ``_change``). If the agent does clearly less harm than full braking in all these tests, the text
-        says in how many worlds of the evaluation the agent does more harm than full braking. ``harm`` is the name of
-        the compared measure, for instance ``total_harm``.
+        ``harm`` is the name of the compared measure, for instance ``total_harm``.
         """
         reasons = []
         for title, _, others in self.tests:
@@ -326,7 +312,7 @@ class Report:
     def _episodes(self) -> Section:
         """Return the section with episodes to watch.
 
-        If an agent drove differently in these episodes than in the evaluation, a note in the section names this agent.
+        A note names each agent that drove differently in these episodes than in the evaluation.
         """
         evaluation, played = self.evaluation, self.played
         if not played:
@@ -364,7 +350,7 @@ def _words(estimate: Estimate | None) -> str:
 
 
 def _change(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
-    """Compare the harm of an agent with the harm of full braking in the same worlds: "less", "more" or "as much".
+    """Compare an agent's harm with full braking in the same worlds: "less", "more" or "as much".
 
     The result is "as much" if the 95 % interval of the difference contains 0, or if no interval is known although there
     are several worlds. ``harm`` is the name of the compared measure, for instance ``total_harm``.
@@ -376,7 +362,7 @@ def _change(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
 
 
 def _table_of(rows: Sequence[SummaryRow]) -> SummaryTable:
-    """Return ``rows`` as a summary table; if ``rows`` is already a summary table, return it unchanged."""
+    """Return ``rows`` as a summary table."""
     return rows if isinstance(rows, SummaryTable) else SummaryTable(rows)
 
 
@@ -387,14 +373,12 @@ def _short_table(rows: SummaryTable) -> Part:
 
 
 def _remarks(rows: SummaryTable) -> list[str]:
-    """Return the important notes about the results ``rows`` as texts, without the notes in small print."""
+    """Return the important notes about ``rows``, without the notes in small print."""
     return [text for kind, text in SummaryTable(rows).notes() if kind == "note"]
 
 
 def _measured(rows: SummaryTable, because: str = "") -> list[Part]:
-    """Return parts of the page: the conditions under which ``rows`` were measured, and tables of all measures.
-
-    The tables of all measures are hidden until the reader clicks on the title above them.
+    """Return the conditions under which ``rows`` were measured, and (folded) tables of all measures.
 
     If ``rows`` also contains results that the paper prints, the first table shows these results. ``because`` is a
     sentence that says why some columns are empty.
@@ -424,10 +408,7 @@ def _empty(rows: SummaryTable) -> list[str]:
 
 
 def _table(sheet: Sheet, caption: str, names: set[str]) -> Part:
-    """Return a table of the agents, with those columns of ``sheet`` that have values and whose name is in ``names``.
-
-    ``caption`` is the title of the table.
-    """
+    """Return those columns of ``sheet`` that have values and whose name is in ``names`` as a table."""
     filled = set(sheet.filled())
     some = sheet.only(k for k, name in enumerate(sheet.names) if k == 0 or (name in names and k in filled))
     rows = [
@@ -448,18 +429,8 @@ def write_evaluation(
 ) -> None:
     """Write the page of ``ethbrake evaluate --report`` to the file ``path``.
 
-    Raises the exceptions of ``Report.write``.
-
-    Args:
-        path: path of the HTML file.
-        evaluation: evaluation that the page describes.
-        rows: results of the evaluation, one row for each agent.
-        agents: evaluated agents, by name. These agents drive some worlds again for the episode player.
-        harm_count: harm count that the agents minimise, ``first`` or ``total``.
-        force: whether an existing file is replaced.
-        tell: function that is called with the number of agents that have driven the worlds again, and the number of all
-            agents.
-
+    The agents drive some worlds again for the episode player. ``tell`` is called with the number of agents that have
+    done so, and the number of all agents. Raises the exceptions of ``Report.write``.
     """
     done: list[str] = []
 

@@ -41,7 +41,7 @@ def learning_curve(
         points: evaluations, earliest first; each has ``steps``, ``first_impact_harm``, ``total_harm`` and
             ``collision_rate``.
         learned: name of the policy or team in the legend.
-        references: results of other agents, drawn as horizontal lines.
+        references: agents whose results are drawn as horizontal lines.
         caption: text below the figure.
 
     """
@@ -67,13 +67,13 @@ def learning_curve(
 def harm_against_total_gap(evaluation: Evaluation, *, agents: Sequence[str] | None = None, bins: int = 12) -> Figure:
     """Draw mean first-impact harm and mean total harm against the sum of the gaps at the alert.
 
-    The figure has one line for each agent. A band around each line shows the 95 % interval of the mean. Raises
-    ``InvalidInput`` if an agent is unknown or ``bins`` is below 1.
+    The figure has a line for each agent, with a band that shows the 95 % interval of the mean. Raises ``InvalidInput``
+    if an agent is unknown or ``bins`` is below 1.
 
     Args:
         evaluation: evaluation of the agents.
         agents: names of the agents to draw; None: all agents.
-        bins: number of intervals of equal width into which the range of the sum of the gaps is divided.
+        bins: number of intervals of equal width into which the sum of the gaps is divided.
 
     """
     if not bins >= 1:

@@ -46,8 +46,7 @@ _SHOWN = {0.0: "shortest line", 0.5: "median line", 1.0: "longest line"}  # by r
 def write_worlds(path: Path, scenario: Scenario, sample: Sample, *, seed: int, force: bool = False) -> None:
     """Write the picture of ``ethbrake scenario sample`` to the file ``path``.
 
-    Raises the exceptions of ``write_picture``. ``seed`` is the seed of the list of worlds in ``sample``. If ``force``
-    is true, an existing file is replaced.
+    ``seed`` is the seed of the list of worlds in ``sample``. Raises the exceptions of ``write_picture``.
     """
     write_picture(path, worlds_figure(scenario, sample, seed=seed), force=force)
 
@@ -55,15 +54,9 @@ def write_worlds(path: Path, scenario: Scenario, sample: Sample, *, seed: int, f
 def worlds_figure(scenario: Scenario, sample: Sample, *, seed: int) -> Figure:
     """Draw distributions and scatter plots of the quantities that vary between the worlds, and three worlds to scale.
 
-    The scatter plots prefer quantities of the first learner and of the gap ahead of this vehicle. If ``scenario`` is a
-    mixture of scenarios, the colour of a point shows from which scenario its world is drawn. If ``scenario`` is a
-    single scenario, the colour of a point shows the vehicle type of the first learner.
-
-    Args:
-        scenario: scenario of the worlds.
-        sample: worlds to draw.
-        seed: seed of the list of worlds, which the caption states.
-
+    The scatter plots prefer quantities of the first learner and of the gap ahead of it. The colour of a point shows the
+    scenario of its world if ``scenario`` is a mixture, and otherwise the vehicle type of the first learner. The caption
+    states ``seed``, the seed of the list of worlds.
     """
     worlds, panels = sample.worlds, drawn_alike(sample.worlds, scenario)
     focus = scenario.learners[0] if scenario.learners else 0
@@ -89,10 +82,10 @@ def worlds_figure(scenario: Scenario, sample: Sample, *, seed: int) -> Figure:
 
 
 def _paired(worlds: Worlds, focus: int) -> dict[str, Floats]:
-    """Return the quantities of n worlds to draw in scatter plots, as a dictionary from label to values [n].
+    """Return the quantities to draw in scatter plots: label -> values [n].
 
-    Quantities that have the same value in all worlds are omitted. At most ``_MOST_PAIRED`` quantities are returned;
-    quantities of vehicles and pairs near the vehicle ``focus`` are chosen first.
+    Quantities that do not vary are omitted. Of the others, at most ``_MOST_PAIRED`` are returned; those near the
+    vehicle ``focus`` are chosen first.
     """
     pairs: list[tuple[int, str, Floats]] = []
     for rule in QUANTITY.of(worlds).values():
@@ -111,10 +104,8 @@ def _paired(worlds: Worlds, focus: int) -> dict[str, Floats]:
 def _distributions(panels: Mapping[str, Mapping[str, Floats]], part: Any) -> None:
     """Draw the distribution of each quantity in its own panel.
 
-    Vehicles with the same distribution of a quantity share one histogram.
-
     ``panels`` maps the key of each quantity to its histograms: name of the vehicles -> values of these vehicles, [n,
-    ...]. ``part`` is the sub-figure of matplotlib to draw in.
+    ...]. Vehicles with the same distribution share one histogram. ``part`` is the sub-figure to draw in.
     """
     columns = min(len(panels), _ABREAST)
     every = part.subplots(-(-len(panels) // columns), columns, squeeze=False).ravel()
@@ -141,8 +132,8 @@ def _distributions(panels: Mapping[str, Mapping[str, Floats]], part: Any) -> Non
 def _pairs(paired: Mapping[str, Floats], kinds: Any, part: Any) -> None:
     """Draw a scatter plot for every two quantities; the colour of a point shows the kind of its world.
 
-    ``paired`` maps the label of each quantity to its values [n]. ``kinds`` [n] contains the name of the kind of each
-    world (its scenario or vehicle type). ``part`` is the sub-figure of matplotlib to draw in.
+    ``paired`` maps labels to values [n]. ``kinds`` [n] are names of scenarios or vehicle types. ``part`` is the
+    sub-figure to draw in.
     """
     labels, values, names = list(paired), list(paired.values()), np.unique(kinds)
     grid = part.subplots(len(paired) - 1, len(paired) - 1, squeeze=False, sharex="col", sharey="row")
@@ -168,7 +159,7 @@ def _lines(sample: Sample, shown: Mapping[int, str], part: Any) -> None:
     """Draw the vehicles of some worlds at the alert, to scale, one world below the other.
 
     ``shown`` maps the index of each drawn world in ``sample`` to words for its title, such as ``shortest line``.
-    ``part`` is the sub-figure of matplotlib to draw in.
+    ``part`` is the sub-figure to draw in.
     """
     worlds, every = sample.worlds, part.subplots(len(shown), 1, squeeze=False, sharex=True).ravel()
     for axes, (row, name) in zip(every, shown.items(), strict=True):

@@ -24,10 +24,10 @@ class SeedCurve:
 
     @classmethod
     def of(cls, trainings: Sequence[Mapping[int, float]]) -> Self:
-        """Return the values of several training runs at the steps that all runs have in common.
+        """Return the values of several training runs at the steps that they all have in common.
 
-        ``trainings`` has one dictionary for each run, from training step to value of the quantity. Raises
-        ``InvalidInput`` if the runs have no step in common.
+        ``trainings`` has a mapping from training step to value for each run. Raises ``InvalidInput`` if the runs have
+        no step in common.
         """
         common = sorted(set.intersection(*(set(training) for training in trainings))) if trainings else []
         if not common:
@@ -54,12 +54,12 @@ def seed_curves(
     Raises ``InvalidInput`` if there are no panels, or if a panel has no curves.
 
     Args:
-        panels: nested mapping: label of a quantity -> name of a recipe -> values of the quantity.
-        logarithmic: labels of the quantities whose panels have a logarithmic axis. If a value in one of these panels is
-            not positive, this panel has a linear axis instead.
+        panels: label of a quantity -> name of a recipe -> values of the quantity.
+        logarithmic: labels of the quantities with a logarithmic axis; a panel with a value that is not positive gets a
+            linear axis instead.
         caption: text below the figure.
         x_label: label of the x axis.
-        known: best known value of each quantity, by the label of the quantity, drawn as a dashed line; None: no lines.
+        known: best known value of each quantity, by label, drawn as a dashed line.
 
     """
     if not panels or not all(panels.values()):

@@ -36,11 +36,10 @@ WORDS = {
 def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS) -> dict[int, Played]:
     """Choose at most ``most`` worlds of an evaluation to show as episodes.
 
-    Return a dictionary from the index of each chosen world in the evaluation to a ``Played`` object. The worlds are
-    chosen in this order: worlds in which the agent ``focus`` did worst, worlds with an avoidable collision, worlds with
-    the largest reduction of harm compared with full braking, worlds with more harm than full braking, worlds with
-    typical harm of the agent ``focus``, and random worlds. The ``Played`` objects contain no motion of vehicles yet;
-    the method ``Played.drive`` adds the motion.
+    Return a dictionary from the index of each chosen world to a ``Played`` object without motion (``Played.drive`` adds
+    the motion). The worlds are chosen in this order: worlds in which the agent ``focus`` did worst, worlds with an
+    avoidable collision, worlds with the largest reduction of harm compared with full braking, worlds with more harm
+    than full braking, worlds with typical harm of the agent ``focus``, and random worlds.
     """
     outcome = evaluation.outcome(focus)
     chosen: dict[int, Played] = {}
@@ -70,8 +69,8 @@ def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS)
 def worst_rows(evaluation: Evaluation, focus: str) -> Ints:
     """Return the indices of at most ten worlds in which the agent ``focus`` did worst, worst first.
 
-    The worst world has the largest regret in total harm. If the best known harm is not available, the worst world has
-    the largest total harm. Worlds whose regret (or harm) is 0 are omitted.
+    The worst world has the largest regret in total harm or, if the best known harm is not available, the largest total
+    harm. Worlds whose regret (or harm) is 0 are omitted.
     """
     outcome, regrets = evaluation.outcome(focus), regrets_of(evaluation)
     value = outcome.total_harm if regrets is None else regrets.regret(outcome, "total")

@@ -46,13 +46,13 @@ _NO_DATES: dict[str, dict[str, None]] = {  # metadata to omit, because they diff
 
 
 class ShownFigure(Figure):
-    """Figure that a notebook displays without pyplot, if the last line of a notebook cell returns the figure."""
+    """Figure that a notebook displays without pyplot."""
 
     def draw(self, renderer: RendererBase) -> None:
         """Draw the figure with matplotlib's ``renderer``.
 
-        When matplotlib saves a figure to a file, it calls ``draw`` twice and uses only the second picture. Therefore
-        the first call of ``draw`` only computes the layout.
+        When matplotlib saves a figure, it calls ``draw`` twice and uses only the second picture. Therefore the first
+        call only computes the layout.
         """
         engine = self.get_layout_engine()
         if self.axes and isinstance(engine, ConstrainedLayoutEngine) and self.canvas.is_saving():
@@ -76,8 +76,7 @@ def series_style(number: int) -> dict[str, Any]:
 def label_text(text: str, most: int = 40) -> str:
     """Return ``text`` as a label of at most ``most`` characters.
 
-    Dollar signs are shown as dollar signs (they do not start a formula), and characters that the font lacks are
-    escaped.
+    Dollar signs do not start a formula, and characters that the font lacks are escaped.
     """
     signs = font_signs()
     label = "".join(c if ord(c) in signs else c.encode("unicode_escape").decode() for c in plain_text(text))
@@ -96,10 +95,7 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 
 
 def style_axes(axes: Axes, labelsize: float = 9) -> None:
-    """Set a thin grid behind the data, and remove the top and right frame lines.
-
-    ``labelsize`` is the font size of the numbers at the ticks.
-    """
+    """Set a thin grid behind the data, and remove the top and right frame lines."""
     axes.grid(visible=True, color="#dddddd", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
@@ -109,8 +105,7 @@ def style_axes(axes: Axes, labelsize: float = 9) -> None:
 def new_panels(size_in: tuple[float, float], rows: int = 1, columns: int = 1, **how: Any) -> tuple[Figure, list[Axes]]:
     """Return a figure with ``rows`` times ``columns`` panels, and the axes of the panels, row by row.
 
-    ``size_in`` is the width and height of the figure in inches. ``how`` are further keyword arguments for matplotlib's
-    ``subplots``.
+    ``size_in`` is width and height in inches. ``how`` are keyword arguments for matplotlib's ``subplots``.
     """
     figure = new_figure(*size_in)
     panels = list(figure.subplots(rows, columns, squeeze=False, **how).ravel())
@@ -122,7 +117,7 @@ def new_panels(size_in: tuple[float, float], rows: int = 1, columns: int = 1, **
 def name_axes(axes: Axes, title: str = "", x: str = "", y: str = "") -> None:
     """Set the title of a panel and the labels ``x`` and ``y`` of its axes.
 
-    If ``title``, ``x`` or ``y`` is empty, this title or label stays unchanged.
+    An empty text leaves the title or label as it is.
     """
     in_style = ((title, partial(axes.set_title, loc="left"), 10), (x, axes.set_xlabel, 9), (y, axes.set_ylabel, 9))
     for text, write, size in in_style:
@@ -139,16 +134,9 @@ def finish(
     fontsize: float = 9,
     loc: Literal["outside upper left", "outside upper right"] = "outside upper left",
 ) -> Figure:
-    """Add a caption and a legend to a figure, and return the figure.
+    """Add a caption and the legend of one panel (None: no legend) to a figure, and return the figure.
 
-    Args:
-        figure: figure to change.
-        caption: text below the figure.
-        legend: panel whose curves the legend of the figure lists; None: no legend.
-        columns: number of columns in the legend.
-        fontsize: font size of the legend.
-        loc: position of the legend.
-
+    ``columns``, ``fontsize`` and ``loc`` are for the legend.
     """
     if legend is not None:
         named = legend.get_legend_handles_labels()
@@ -183,8 +171,7 @@ def picture_ending(path: str | Path) -> str:
 def picture_bytes(figure: Figure, path: str | Path) -> bytes:
     """Return the bytes of a PNG, SVG or PDF file with the figure. The ending of ``path`` selects the format.
 
-    The function writes no file. The same figure always gives the same bytes. Raises ``InvalidInput`` if the ending is
-    not .png, .svg or .pdf.
+    The same figure always gives the same bytes. Raises ``InvalidInput`` if the ending is not .png, .svg or .pdf.
     """
     ending = picture_ending(path)
     buffer = io.BytesIO()
@@ -209,8 +196,5 @@ TITLES = {"first": "First-impact harm (m²/s²)", "total": "Total harm (m²/s²)
 
 
 def plain(value: float, _: int) -> str:
-    """Return ``value``, the number at a tick of an axis, as text such as 1000, not as a power of ten.
-
-    Matplotlib also passes the index of the tick, which is not used.
-    """
+    """Return the number at a tick of an axis as text such as 1000, not as a power of ten."""
     return f"{value:g}"

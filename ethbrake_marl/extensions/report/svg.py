@@ -61,14 +61,13 @@ def inline_svg(figure: Figure | bytes, label: str, *, recolour: bool = True) -> 
     """Return a figure as an SVG element, and its caption as text.
 
     The SVG element contains no caption and no ``style`` attributes, because the security policy of the page forbids
-    such attributes. All ids of SVG elements get a prefix, so that two figures of a page have no id in common. Raises
-    ``InvalidInput`` if ``figure`` is an SVG file with elements or attributes that this package never writes, because
-    somebody may have changed the file.
+    such attributes. All ids get a prefix that depends on ``label``, so that two figures of a page have no id in common.
+    Raises ``InvalidInput`` if ``figure`` is an SVG file with elements or attributes that this package never writes,
+    because somebody may have changed the file.
 
     Args:
         figure: figure of matplotlib, or the bytes of an SVG file with a figure.
-        label: description for readers who cannot see the figure. The ids of the SVG elements depend on this
-            description.
+        label: description for readers who cannot see the figure.
         recolour: True: use the colours of the page, light or dark; False: keep the colours of the figure.
 
     """
@@ -143,7 +142,7 @@ def _is_ours(svg: bytes) -> bool:
 
 
 def _restyle(element: ElementTree.Element, recolour: bool) -> None:
-    """Replace the ``style`` attribute of ``element`` by one attribute for each CSS property in ``style``.
+    """Replace the ``style`` attribute of ``element`` by one attribute for each CSS property.
 
     If ``recolour`` is true, the colours of the figure are replaced by the colours of the page.
     """

@@ -45,13 +45,9 @@ _KEPT = ("collision_rate", "first_impact_harm", "total_harm")  # columns of the 
 def brief(table: SummaryTable, beside: Mapping[str, SummaryTable]) -> Sheet:
     """Return a short table of each agent's collision rate and harms, and of its harms on the other tests.
 
-    *Harms* are first-impact harm and total harm. The table contains no other measures, and no results that the paper
-    prints. The notes about the results are below the table.
+    *Harms* are first-impact harm and total harm. The table contains no results that the paper prints.
 
-    Args:
-        table: summary of the agents' results on the scenario of the run.
-        beside: summaries of the agents' results on the other tests, by name of the test.
-
+    ``table`` is the summary on the scenario of the run; ``beside`` has the summaries on the other tests, by name.
     """
     ours = SummaryTable(table)
     sheet = ours.terminal()

@@ -62,7 +62,7 @@ _NUMBER, _DECISIONS = Column("Final return", digits=3), Column("Decisions", digi
 def _shipped_ends(settings: Reproduction) -> Made:
     """Evaluate shipped policies at low and high delay; return verdicts, a table and data.
 
-    The policies are evaluated under both assumptions on when Vehicle 2 may act (``READINGS``).
+    The policies are evaluated under both ``READINGS``.
     """
     episodes = min(2_000, settings.episodes)
     verdicts, rows, data = [], [], []
@@ -118,17 +118,16 @@ class Course:
     def returns_at(self, shares: Floats) -> Floats:
         """Return the mean return of training episodes at k points of each training run, [seeds, k].
 
-        ``shares`` [k] gives each point as a share of the run: 0 is the start of the run and 1 its end.
+        ``shares`` [k] gives each point as a share of the run: 0 is its start and 1 its end.
         """
         steps = shares * self.returns.steps[-1]
         return np.array([np.interp(steps, self.returns.steps, own) for own in self.returns.values])
 
     def unrest(self, points: int) -> Floats:
-        """Return how much the return of each training run fluctuates in the second half of the run, [seeds].
+        """Return how much the return fluctuates in the second half of each run, [seeds].
 
-        The return is read at ``points`` equally spaced points of the second half of the run, so runs of different
-        lengths can be compared. The result is the standard deviation of the changes of the return from one point to the
-        next, divided by the absolute value of ``rise`` (the rise of the return in the whole run).
+        The return is read at ``points`` equally spaced points, so runs of different lengths can be compared. The result
+        is the standard deviation of its changes from one point to the next, divided by abs(``rise``).
         """
         return np.asarray(np.diff(self.returns_at(np.linspace(0.5, 1.0, points)), axis=1).std(axis=1) / abs(self.rise))
 
@@ -140,7 +139,7 @@ class Course:
 
     @property
     def spread(self) -> Floats:
-        """Standard deviation of the return over the runs, at each of the k steps in the second half of a run, [k]."""
+        """Standard deviation of the return over the runs, at each of k steps in the second half, [k]."""
         return np.asarray(self.returns.values[:, len(self.returns.steps) // 2 :].std(axis=0, ddof=1))
 
 
@@ -150,8 +149,7 @@ Courses = Mapping[str, Course]  # trainings by recipe
 def reproduce_curves(delay: str, settings: Reproduction) -> Made:
     """Reproduce the paper's learning curves at one delay (``high`` or ``low``) from the training runs of ``--full``.
 
-    Returns verdicts, tables, figures and data. If nothing was trained with ``--full``, there are no curves, and the
-    tables show results of shipped policies.
+    Without such training runs, there are no curves, and the tables show results of shipped policies.
     """
     courses = {
         each: {
@@ -225,7 +223,7 @@ def reproduce_curves(delay: str, settings: Reproduction) -> Made:
 def _judge(delay: str, courses: Mapping[str, Courses]) -> list[Verdict]:
     """Return verdicts on the paper's statements about the learning curves at one delay (``high`` or ``low``).
 
-    ``courses`` contains the training runs at each delay, by name of the recipe.
+    ``courses`` has the training runs by delay and name of the recipe.
     """
     own, high, low = courses[delay], courses[HIGH], courses[LOW]
     if not own:

@@ -25,13 +25,8 @@ def estimates_figure(
 ) -> Figure:
     """Draw estimates with their 95 % intervals, in one or more panels.
 
-    Args:
-        panels: nested mapping: title of the panel -> label of the series -> x (a number or a text) -> estimate.
-        y_label: label of the y axis.
-        caption: text below the figure.
-        x_label: label of the x axis. If ``x_label`` is given, the x values must be numbers, and lines with bands are
-            drawn. If ``x_label`` is empty, the x values must be texts, and groups of bars are drawn.
-
+    ``panels`` maps title of the panel -> label of the series -> x -> estimate. With an ``x_label``, x must be numbers,
+    and lines with bands are drawn; without it, x must be texts, and groups of bars are drawn.
     """
     figure, every = new_panels((4.6 * len(panels), 4.2), columns=len(panels), sharey=True)
     for axes, (title, lines) in zip(every, panels.items(), strict=True):
@@ -58,15 +53,8 @@ def estimates_figure(
 def road_figure(records: Mapping[str, EpisodeRecord], *, caption: str) -> Figure:
     """Draw the positions of all vehicles on the road, as in the paper's figure.
 
-    Each episode has a panel, and each vehicle has a row in the panel.
-
-    An arrow marks the position of a vehicle every ten time steps. Dashed lines connect the positions that the vehicles
-    have at the same time.
-
-    Args:
-        records: episodes; the key of an episode is the title of its panel.
-        caption: text below the figure.
-
+    Each episode of ``records`` has a panel with its key as title, and each vehicle has a row in the panel. An arrow
+    marks the position of a vehicle every ten time steps. Dashed lines connect positions at the same time.
     """
     figure, panels = _in_pairs(len(records), 1.9, "Position along the road (m)", "Vehicle")
     for axes, (title, record) in zip(panels, records.items(), strict=False):
@@ -85,16 +73,9 @@ def road_figure(records: Mapping[str, EpisodeRecord], *, caption: str) -> Figure
 
 
 def _in_pairs(panels: int, height_in: float, x: str, y: str) -> tuple[Figure, list[Axes]]:
-    """Return a figure with two panels in each row, and the list of the axes of its panels.
+    """Return a figure with two panels in each row, all with the same scales, and the axes of its panels.
 
-    All panels have the same scales.
-
-    Args:
-        panels: number of panels.
-        height_in: height of one panel in inches.
-        x: label of the x axes.
-        y: label of the y axes.
-
+    ``height_in`` is the height of one panel in inches; ``x`` and ``y`` are labels.
     """
     rows = (panels + 1) // 2
     figure, every = new_panels((10.0, height_in * rows + 1.0), rows, 2, sharex=True, sharey=True)
@@ -108,10 +89,7 @@ def _in_pairs(panels: int, height_in: float, x: str, y: str) -> tuple[Figure, li
 def profiles_figure(panels: Mapping[str, Mapping[str, EpisodeRecord]], *, caption: str) -> Figure:
     """Draw the command of the controlled vehicle against time, in one or more panels.
 
-    Args:
-        panels: nested mapping: title of the panel -> label of the curve -> recorded episode.
-        caption: text below the figure.
-
+    ``panels`` maps title of the panel -> label of the curve -> recorded episode.
     """
     figure, every = _in_pairs(len(panels), 2.3, "Time since Vehicle 1 began to brake (s)", "Command (m/s²)")
     for axes, (title, records) in zip(every, panels.items(), strict=False):
@@ -125,16 +103,9 @@ def profiles_figure(panels: Mapping[str, Mapping[str, EpisodeRecord]], *, captio
 
 
 def changes_figure(changes: Mapping[str, Mapping[str, Estimate]], *, x_label: str, caption: str) -> Figure:
-    """Draw the effects of several changes with their 95 % intervals.
+    """Draw the effects of several changes with their 95 % intervals, one row for each change.
 
-    The figure has one row for each change; in each row, each label has one marker, which shows the effect of the
-    change.
-
-    Args:
-        changes: nested mapping: name of the change -> label (for instance a strategy) -> effect of the change.
-        x_label: label of the x axis.
-        caption: text below the figure.
-
+    ``changes`` maps name of the change -> label (for instance a strategy) -> effect; each label has its own marker.
     """
     rows = list(changes)
     labels = list(dict.fromkeys(label for each in changes.values() for label in each))

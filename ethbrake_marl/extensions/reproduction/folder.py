@@ -62,7 +62,7 @@ class Reproduction:
     def seeds_of(self, wanted: Collection[str]) -> list[tuple[Group, str, list[Path]]]:
         """Return the training runs of some groups, for each recipe as (group, name of the recipe, folder of each seed).
 
-        ``wanted`` are the names of the groups of training runs. In mode ``quick`` the result is empty.
+        ``wanted`` are the names of the groups. In mode ``quick`` the result is empty.
         """
         return [
             (
@@ -76,10 +76,7 @@ class Reproduction:
         ]
 
     def trained(self, wanted: Collection[str]) -> dict[str, list[Path]]:
-        """Return the recipes whose training runs are all finished, as ``group/recipe`` -> folder of each seed.
-
-        ``wanted`` are the names of the groups of training runs that are checked.
-        """
+        """Return the recipes of groups whose training runs are all finished: ``group/recipe`` -> folders of seeds."""
         return {
             f"{group.name}/{name}": paths
             for group, name, paths in self.seeds_of(wanted)
@@ -87,9 +84,9 @@ class Reproduction:
         }
 
     def seconds_left(self, wanted: Collection[str]) -> float:
-        """Estimate the time (s) in which one core does all unfinished training runs of the groups named in ``wanted``.
+        """Estimate the time (s) in which one core does all unfinished training runs of the groups ``wanted``.
 
-        For a training run that has begun but not finished, the whole time is counted, not the remaining time.
+        A run that has begun counts with its whole time.
         """
         return sum(
             group.trained[name][0].decisions / group.trained[name][0].per_s
@@ -99,10 +96,7 @@ class Reproduction:
         )
 
     def train(self, wanted: Collection[str]) -> bool:
-        """Do those training runs of the groups named in ``wanted`` that are not finished.
-
-        Return False if Ctrl-C stopped a training run.
-        """
+        """Do the unfinished training runs of the groups ``wanted``. Return False if Ctrl-C stopped one."""
         from ethbrake_marl.extensions.reproduction.learning_curves import LearningCurves
 
         for group in groups().values():
@@ -114,7 +108,7 @@ class Reproduction:
         return True
 
     def cost(self, items: Sequence[Item]) -> str:
-        """Return a message that says how much work is left for ``items``, and how long this work takes."""
+        """Return a message that says how much work is left for ``items``, and how long it takes."""
         wanted = {group for item in items for group in item.trained} if self.mode == "full" else set()
         cost = (
             f"to do: {count_of(len(items), 'item')}, at most about {sum(item.most_s for item in items)} s of one core"
@@ -125,7 +119,7 @@ class Reproduction:
 
 @model(frozen=True, config=WRITTEN)
 class Parameter:
-    """Name and value of a quantity that affects a figure or table of the paper, and the origin of this value."""
+    """Quantity that affects an item, its value, and the origin of this value."""
 
     name: str  # name of the quantity
     value: str  # its value as text, with unit
@@ -133,10 +127,7 @@ class Parameter:
 
 
 def stated(name: str, value: str, where: str) -> Parameter:
-    """Return a parameter whose value the paper states at the place ``where``.
-
-    If ``where`` is empty, the value is our default.
-    """
+    """Return a parameter that the paper states at ``where``; if ``where`` is empty, the value is our default."""
     return Parameter(name, value, f"stated in the paper ({where})") if where else Parameter(name, value)
 
 
@@ -161,7 +152,7 @@ class Drawn:
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """Reproduction of a figure or table of the paper, before the reproduction is written to files."""
+    """Reproduction of an item, before it is written to files."""
 
     verdicts: Sequence[Verdict]  # verdict on each comparison with the paper
     parameters: Sequence[Parameter]  # quantities that affect the result
@@ -173,7 +164,7 @@ class Made:
 
 @model(frozen=True, config=WRITTEN, kw_only=True)
 class Result:
-    """Reproduction of a figure or table of the paper, as stored in a file and shown on pages."""
+    """Reproduction of an item, as stored in a file and shown on pages."""
 
     name: str  # name on the command line; also the name of the folder
     labels: Sequence[str]  # labels in the source of the paper
@@ -196,7 +187,7 @@ class Result:
     def in_words(self) -> dict[str, Any]:
         """Return the result as mappings, lists and texts, for a JSON file.
 
-        The JSON file contains each cell of a table as one text: the value, and its interval if it has one.
+        A cell of a table becomes one text: the value, and its interval if it has one.
         """
         tables = [
             {**asdict(table), "rows": [[cell.in_words for cell in row] for row in table.rows]} for table in self.tables
@@ -206,7 +197,7 @@ class Result:
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One figure or table of the paper, and the function that reproduces it."""
+    """One item, and the function that reproduces it."""
 
     name: str  # name on the command line; also the name of the folder
     labels: tuple[str, ...]  # labels in the source of the paper
@@ -219,10 +210,9 @@ class Item:
 
 
 def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Return the content of a CSV file with the headings ``head`` and the rows ``rows``.
+    """Return the content of a CSV file with the headings ``head``.
 
-    An ``Estimate`` in a row fills three columns: value, and lower and upper end of the interval. Therefore ``head``
-    contains three headings for an ``Estimate``.
+    An ``Estimate`` in a row fills three columns: value, lower and upper end of the interval.
     """
     parts = ([(e.value, *(e.interval or ("", ""))) if isinstance(e, Estimate) else (e,) for e in row] for row in rows)
     return csv_of([dict(zip(head, chain(*row), strict=True)) for row in parts], head)
@@ -249,16 +239,10 @@ FIRST_IMPACTS = stated("harm", "each pair's first impact", "sec:result, Experime
 
 
 def scenario_parameters(scenario: Scenario, **places: str) -> list[Parameter]:
-    """Return the main quantities of a scenario, such as gaps and masses, as a list of ``Parameter`` objects.
+    """Return the main quantities of a scenario, with the place where the paper states each.
 
-    Each ``Parameter`` names the place where the paper states the value.
-
-    Args:
-        scenario: the scenario.
-        places: for some keys of the scenario, the place where the paper states the value of this key. For the other
-            keys, the place in ``_QUANTITIES`` is used. An empty place means that the paper does not state the value,
-            and that the value is our default.
-
+    ``places`` replaces places of ``_QUANTITIES``, by key of the scenario. An empty place means that the paper does not
+    state the value, which is then our default.
     """
     content = scenario.model_dump(mode="json", exclude_none=True)
     parameters = [
@@ -271,14 +255,9 @@ def scenario_parameters(scenario: Scenario, **places: str) -> list[Parameter]:
 
 
 def list_parameter(episodes: int, where: str = "") -> Parameter:
-    """Return a parameter that states the number of worlds, and the seed of the evaluation list that contains them.
+    """Return a parameter with the number of worlds (stated in the paper at ``where``) and the seed of their list.
 
-    The seed of the list is our choice, because the paper only says "a fixed random seed".
-
-    Args:
-        episodes: number of worlds.
-        where: place where the paper states the number of worlds; if empty, the number is our default.
-
+    The seed is our choice, because the paper only says "a fixed random seed".
     """
     return stated("worlds", f"{episodes:,}, the first of the list of seed {LIST_SEED}", where)
 
@@ -303,13 +282,8 @@ def json_text(content: Mapping[str, Any]) -> bytes:
 def checked_result(content: Mapping[str, Any], where: Path | str, name: str) -> Result:
     """Check the content of a result file, and return the result.
 
-    Raises ``InvalidInput`` if an entry is missing or wrong, or if the result belongs to another figure or table.
-
-    Args:
-        content: content of the file.
-        where: path of the file, for the error message.
-        name: name of the figure or table, such as ``harm-delays``.
-
+    Raises ``InvalidInput`` if an entry is missing or wrong, or if the result belongs to an item other than ``name``.
+    ``where`` is the path of the file, for the message.
     """
     try:
         result = TypeAdapter(Result).validate_json(json.dumps(content))

@@ -58,9 +58,8 @@ _ENDS_M = (10.0, 12.0, 14.0, 16.0, 18.0, 20.0)  # limits of the groups, for the 
 def by_distance(evaluation: Evaluation) -> tuple[list[float], Groups]:
     """Divide the worlds of an evaluation into groups by the sum of the two gaps.
 
-    Return two results. The first result is a list with the mean sum of the two gaps (m) in each group of worlds. The
-    second result is a dictionary ``{"10-12 m": {"PPO": harm, ...}, ...}``. For each group and each strategy, the array
-    ``harm`` contains the harm in each world of the group. Groups without worlds are omitted.
+    Return the mean sum of the gaps (m) in each group, and a dictionary ``{"10-12 m": {"PPO": harm, ...}, ...}``, where
+    ``harm`` is the harm in each world of the group. Groups without worlds are omitted.
     """
     total, each_harm = evaluation.worlds.gaps_m.sum(axis=1), harms(evaluation)
     inner, at, groups = np.digitize(total, _ENDS_M[1:-1]), [], {}
@@ -74,8 +73,7 @@ def by_distance(evaluation: Evaluation) -> tuple[list[float], Groups]:
 def less_in_each(groups: Groups, smaller: str, *larger: str) -> list[Less]:
     """Compare the harm of the strategy ``smaller`` with each strategy in ``larger``, in every group of worlds.
 
-    Each comparison is paired, because the two strategies drive the same worlds. For each group of worlds, ``groups``
-    contains the harm of each strategy in each of the n worlds of the group, [n].
+    The comparisons are paired, because the strategies drive the same worlds.
     """
     return [
         Less.of_harms(group if len(larger) == 1 else f"{group}, {other}", harm, smaller, other)
@@ -85,11 +83,8 @@ def less_in_each(groups: Groups, smaller: str, *larger: str) -> list[Less]:
 
 
 def _harm_table(title: str, groups: Groups, note: str) -> Sheet:
-    """Return a table with the mean harm of each strategy in each group of worlds.
+    """Return a table of mean harms with 95 % intervals: a row for each strategy, a column for each group of worlds.
 
-    Each mean harm has its 95 % interval. The table has a row for each strategy and a column for each group of worlds.
-
-    For each group of worlds, ``groups`` contains the harm of each strategy in each of the n worlds of the group, [n].
     ``note`` is added to the text below the table.
     """
     strategies = next(iter(groups.values()))
@@ -107,14 +102,9 @@ def over_distance(
 ) -> Made:
     """Return the result for a figure of the paper that shows harm against the sum of the two gaps.
 
-    Args:
-        stem: file name of the figure and of the data, without ending.
-        curves: results of ``by_distance``, by the name of the assumption on when Vehicle 2 may act.
-        verdicts: verdicts on the paper's statements about this figure, which become part of the result.
-        lines: names of the strategies that the figure shows.
-        parameters: parameters to list on the page in addition to the quantities of the scenario.
-        episodes: number of worlds.
-
+    ``stem`` is the file name of figure and data, without ending. ``curves`` has results of ``by_distance`` by name of
+    the ``Reading``. ``lines`` are the strategies in the figure. ``parameters`` are listed on the page in addition to
+    those of the scenario.
     """
     panels = {
         reading: {
@@ -151,7 +141,7 @@ def over_distance(
 
 
 def reproduce_distance(settings: Reproduction) -> Made:
-    """Reproduce the paper's figure of harm against the sum of the two gaps; return figure, tables and verdicts."""
+    """Reproduce the paper's figure of harm against the sum of the two gaps."""
     episodes, braking = min(_DISTANCE_WORLDS, settings.episodes), NAMES[FULL_BRAKE]
     curves, verdicts = {}, []
     for reading in READINGS:
@@ -190,10 +180,10 @@ _ONE, _LIST = "d = 7, 7 m; v = 20, 18, 20 m/s", "d = 5-10 m; v = 18-22 m/s"
 
 
 def reproduce_delays(settings: Reproduction) -> Made:
-    """Reproduce the paper's figure of harm at three delays; return figures, tables and verdicts.
+    """Reproduce the paper's figure of harm at three delays.
 
-    The paper's figure is about a single world. Our first figure shows the harm in the world of the paper's figure. Our
-    second figure shows the mean harm in random worlds.
+    Our first figure shows the harm in the single world of the paper's figure, our second the mean harm in random
+    worlds.
     """
     episodes = min(_DELAY_WORLDS, settings.episodes)
     curves: dict[tuple[str, str], Groups] = {}  # (description of the worlds, assumption) -> delay -> harm

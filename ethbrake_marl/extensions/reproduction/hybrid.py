@@ -50,26 +50,16 @@ _ALONE, _REALISED, _AS_PRINTED = "policy alone", "hybrid, realised H*", "hybrid,
 
 
 def _drive_hybrid(name: str, settings: Reproduction, reading: Reading) -> Evaluation:
-    """Evaluate E-V2X-BM, a policy that has not converged, and the paper's hybrid of the two.
-
-    The *hybrid* is the paper's Algorithm 1: at the alert the hybrid chooses whether E-V2X-BM or the policy drives.
-
-    Args:
-        name: name of the shipped scenario.
-        settings: settings of the reproduction, such as the largest number of worlds.
-        reading: assumption on when Vehicle 2 may act.
-
-    """
+    """Evaluate E-V2X-BM, a policy that has not converged, and the paper's hybrid of the two in a shipped scenario."""
     return _driven_hybrid(name, settings, reading, unconverged_policy(settings)[1])
 
 
 @lru_cache(maxsize=2 * len(READINGS))  # figure and table share the evaluations
 def _driven_hybrid(name: str, settings: Reproduction, reading: Reading, about: str) -> Evaluation:
-    """Return the evaluation that ``_drive_hybrid`` describes; a repeated call returns the result from the cache.
+    """Return the evaluation that ``_drive_hybrid`` describes, from the cache if possible.
 
-    ``about`` is the description of the policy that has not converged, and is part of the cache key. Until this policy
-    is trained, a shipped policy is used instead. When the trained policy replaces the shipped policy, the description
-    changes, so the strategies are evaluated again.
+    ``about``, the description of the policy that has not converged, is part of the cache key: it changes when a trained
+    policy replaces the shipped policy, and the strategies are then evaluated again.
     """
     scenario, (policy, _) = reading.scenario(name), unconverged_policy(settings)
     agents: dict[str, Agent] = {
@@ -82,13 +72,12 @@ def _driven_hybrid(name: str, settings: Reproduction, reading: Reading, about: s
 
 
 def reproduce_illustration(settings: Reproduction) -> Made:
-    """Reproduce the paper's illustration of its hybrid; return figure, tables and verdicts.
+    """Reproduce the paper's illustration of its hybrid.
 
     The figure shows the harm of E-V2X-BM, of a policy that has not converged, and of the hybrid of the two, against the
-    sum of the two gaps. The *hybrid* is the paper's Algorithm 1: at the alert the hybrid chooses whether E-V2X-BM or
-    the policy drives. The paper says that the hybrid "consistently selects the strategy that results in lower harm".
-    The verdicts check in each world, and in groups of worlds, whether the hybrid does no more harm than E-V2X-BM and no
-    more harm than the policy.
+    sum of the two gaps. The paper says that the hybrid "consistently selects the strategy that results in lower harm".
+    The verdicts check in each world, and in groups of worlds, whether the hybrid does no more harm than either of the
+    two.
     """
     curves, verdicts = {}, []
     for reading in READINGS:
@@ -114,10 +103,9 @@ def reproduce_illustration(settings: Reproduction) -> Made:
 
 
 def reproduce_hybrid_table(settings: Reproduction) -> Made:
-    """Reproduce the paper's table of 5,000 episodes (``Table:hybrid``); return tables and verdicts.
+    """Reproduce the paper's table of 5,000 episodes (``Table:hybrid``).
 
-    The paper has two sets of initial speeds, and does not say which of them this table uses. Therefore we compute the
-    table for both sets of speeds.
+    The paper has two sets of initial speeds, and does not say which of them this table uses, so we compute both.
     """
     ours = {
         "E-V2X-BM": (NAMES[PAIRWISE], NAMES[COUPLED]),
@@ -151,7 +139,7 @@ def reproduce_hybrid_table(settings: Reproduction) -> Made:
 
 
 def reproduce_random_table(settings: Reproduction) -> Made:
-    """Reproduce the paper's table of the random test (``Table:Random``); return tables and verdicts."""
+    """Reproduce the paper's table of the random test (``Table:Random``)."""
     episodes, besides = min(_RANDOM_WORLDS, settings.episodes), []
     ours: dict[str, tuple[str, ...]] = {
         "Non-E": (NAMES[FULL_BRAKE],),

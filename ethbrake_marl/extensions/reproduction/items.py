@@ -111,7 +111,7 @@ ITEMS = (  # in the order of the paper
 def read_results(folder: Path) -> list[Result]:
     """Return the results that are stored in ``folder``, in the order of the paper.
 
-    Raises ``InvalidInput`` if a result file is damaged, or if it lies in the folder of a different figure or table.
+    Raises ``InvalidInput`` if a result file is damaged, or lies in the folder of a different item.
     """
     files = {item.name: folder / item.name / RESULT for item in ITEMS}
     return [checked_result(read_object(file), file, name) for name, file in files.items() if file.is_file()]

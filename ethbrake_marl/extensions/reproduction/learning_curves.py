@@ -81,16 +81,11 @@ class LearningCurves(NamedTuple):
     ) -> bool:
         """Train every recipe with every seed. Finished training runs are not repeated; unfinished runs continue.
 
-        Returns False if Ctrl-C stopped a training run. Raises the exceptions of ``train_all``, for instance
-        ``InvalidInput`` (before any run begins) if a folder contains a training run with other settings.
-
-        Args:
-            steps: number of steps of each training run; None: the number in the recipe.
-            settings: changes that the scenario and the recipes already contain, as texts ``KEY=VALUE``. The changes are
-                not made again, but only noted in the file ``config.json`` of each training run.
-            jobs: number of training runs at the same time.
-            tell: function that is called with the progress; None: the progress is not reported.
-
+        ``steps`` is the number of steps of each training run; None: the number in the recipe. ``settings`` (texts
+        ``KEY=VALUE``) are changes that the scenario and the recipes already contain; they are only noted in the file
+        ``config.json`` of each run. Returns False if Ctrl-C stopped a training run. Raises the exceptions of
+        ``train_all``, for instance ``InvalidInput`` (before any run begins) if a folder contains a training run with
+        other settings.
         """
         trainings = [
             TrainingJob(
@@ -108,11 +103,11 @@ class LearningCurves(NamedTuple):
             return train_all(trainings, jobs, tell)
 
     def write(self) -> dict[str, Any]:
-        """Draw the curves of the training runs, write figure, table and summary to the folder, and return the summary.
+        """Write the figure of the curves, the table and the summary to the folder, and return the summary.
 
-        For each recipe, the summary contains the harm of the best policy and the harm of the last policy of a training
-        run, as interquartile means over the seeds with bootstrap intervals. The summary also contains hashes of the
-        best policies and of the worlds on which the policies were evaluated.
+        For each recipe, the summary has the harm of the best and of the last policy of a run, as interquartile means
+        over the seeds with bootstrap intervals. It also has hashes of the best policies and of the worlds of their
+        evaluation.
 
         Raises ``InvalidInput`` if the runs of a recipe have no step in common at which each of them was evaluated.
         """

@@ -29,10 +29,9 @@ from ethbrake_marl.files.store import write_file, write_output
 
 
 def choose_items(names: Sequence[str]) -> list[Item]:
-    """Return the items (figures and tables of the paper) with these names, in the order of the paper.
+    """Return the items with these names, in the order of the paper; without names, all items.
 
-    If ``names`` is empty, all items are returned. Raises ``UnknownName``, with a suggestion, if a name is unknown, and
-    ``InvalidInput`` if a name is repeated.
+    Raises ``UnknownName``, with a suggestion, if a name is unknown, and ``InvalidInput`` if a name is repeated.
     """
     known = {item.name: item for item in ITEMS}
     for k, name in enumerate(names):
@@ -44,16 +43,10 @@ def choose_items(names: Sequence[str]) -> list[Item]:
 
 
 def open_folder(asked: Reproduction, *, force: bool = False) -> StudyFolder:
-    """Return a ``StudyFolder`` that checks and locks the folder of a reproduction.
+    """Return the ``StudyFolder`` of a reproduction, in which a reproduction with the same settings continues.
 
-    If the folder contains a reproduction with the same settings, the work continues this reproduction.
-
-    Raises ``InvalidInput`` if the path of the folder is a symbolic link.
-
-    Args:
-        asked: settings of the reproduction.
-        force: whether existing results in the folder are deleted first; training runs are never deleted.
-
+    With ``force``, existing results in the folder are deleted first; training runs are never deleted. Raises
+    ``InvalidInput`` if the path of the folder is a symbolic link.
     """
     path, question = asked.folder, {"episodes": asked.episodes, "version": __version__}
     if path.is_symlink():
@@ -70,22 +63,15 @@ def open_folder(asked: Reproduction, *, force: bool = False) -> StudyFolder:
 
 
 def make_items(asked: Reproduction, items: Sequence[Item], *, force: bool = False) -> tuple[list[Result], bool]:
-    """Reproduce items (figures and tables of the paper).
+    """Reproduce items; return all results in the folder, and whether all training runs are finished.
 
-    Items that need no training runs are reproduced first. An item is not reproduced again if its stored result comes
-    from the same training runs. The HTML page with all results is written again after each item.
+    Items that need no training runs are reproduced first. Without ``force``, an item is not reproduced again if its
+    stored result comes from the same training runs. The HTML page with all results is written again after each item.
 
     Ctrl-C during a training run stops all training runs; the items are then reproduced with the finished training runs.
     A second Ctrl-C stops the command at once.
 
-    Returns all results in the folder, and whether all training runs are finished. Raises the exceptions of
-    ``open_folder`` and ``StudyFolder.work``.
-
-    Args:
-        asked: settings of the reproduction.
-        items: items (figures and tables of the paper) to reproduce.
-        force: whether items whose results exist are reproduced again.
-
+    Raises the exceptions of ``open_folder`` and ``StudyFolder.work``.
     """
     full, finished = asked.mode == "full", True
     with open_folder(asked, force=force).work():
@@ -106,7 +92,7 @@ def make_items(asked: Reproduction, items: Sequence[Item], *, force: bool = Fals
 def _make_item(asked: Reproduction, item: Item, trained: Sequence[str]) -> None:
     """Reproduce an item; write its figures, its data and then its result file, which marks the item as complete.
 
-    ``trained`` are the names of the recipes whose finished training runs the item uses, each as ``group/recipe``.
+    ``trained`` are the recipes whose finished training runs the item uses, as ``group/recipe``.
     """
     place, started = asked.folder / item.name, time.process_time()
     product = item.make(asked)

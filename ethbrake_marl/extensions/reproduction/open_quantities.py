@@ -1,7 +1,7 @@
 """Sensitivity of the random test's results to the quantities that the paper leaves open.
 
-For each quantity that the paper leaves open, a table states what the paper says, our default, and alternative values.
-Another table states, for each alternative value, how much the mean harm changes, and the new collision rates.
+One table states what the paper says about each of these quantities, our default, and alternative values. Another table
+states, for each alternative value, how much the mean harm changes, and the new collision rates.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from ethbrake_marl.training.run_folder import RunDirectory
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alternative:
-    """Alternative value of a quantity that the paper leaves open, and how to repeat the random test with this value."""
+    """Alternative value of a quantity, and how to repeat the random test with this value."""
 
     value: str  # the value in words
     changes: Mapping[str, Any] = field(default_factory=dict)  # keys of the scenario with their new values
@@ -130,9 +130,9 @@ class Headline:
     collided: Mapping[str, Bools]  # strategy -> [n] whether each world has a collision
 
     def change(self, base: Headline, strategy: str) -> Estimate:
-        """Return the mean harm of ``strategy`` in this object minus its mean harm in the results ``base``, m2/s2.
+        """Return the mean harm of ``strategy`` minus its mean harm in ``base``, m2/s2.
 
-        If this object and ``base`` contain results for the same worlds, the difference is computed world by world.
+        If both objects are for the same worlds, the difference is computed world by world.
         """
         own, other = self.harm[strategy], base.harm[strategy]
         if np.array_equal(self.gaps_m, base.gaps_m):
@@ -143,8 +143,7 @@ class Headline:
 def reproduce_gaps(settings: Reproduction) -> Made:
     """Measure how results of the random test change if a quantity that the paper leaves open gets another value.
 
-    The paper leaves a quantity open if it does not state the quantity, or states it ambiguously (``GAPS``). Returns a
-    figure, verdicts and tables; one table lists all quantities that the paper leaves open.
+    One table lists all such quantities (``GAPS``).
     """
     episodes, scenario = min(2_000, settings.episodes), load_scenario(RANDOM)
     base = _measure(scenario, Alternative("default"), episodes)
@@ -243,16 +242,10 @@ def reproduce_gaps(settings: Reproduction) -> Made:
 
 
 def _measure(scenario: Scenario, alternative: Alternative, episodes: int) -> Headline:
-    """Evaluate the strategies in the random test with an alternative value of a quantity that the paper leaves open.
+    """Evaluate the strategies in the random test with an alternative value of a quantity.
 
-    Returns the harm and the collisions of each strategy in each world. If ``alternative.harm`` is ``predicted``, only
-    the pairwise E-V2X-BM has predicted harm; for the other strategies, first-impact harm is returned.
-
-    Args:
-        scenario: scenario of the random test, before ``alternative.changes`` are applied.
-        alternative: alternative value of the quantity, and how to repeat the random test with this value.
-        episodes: number of worlds.
-
+    ``scenario`` is the scenario before ``alternative.changes`` are applied. If ``alternative.harm`` is ``predicted``,
+    only the pairwise E-V2X-BM has predicted harm; for the other strategies, first-impact harm is returned.
     """
     own = scenario.replace(**alternative.changes) if alternative.changes else scenario
     agents: dict[str, Agent] = lineup(own, *_SPECS)

@@ -28,11 +28,10 @@ _NUMERAL = re.compile(r"[-+−]?\d[\d,.]*( ?%)?|–|")
 
 
 def _account(results: Sequence[Result]) -> tuple[str, str, str, list[str]]:
-    """Return four results: the page's first sentence, the command, the origin of the results, and remarks.
+    """Return the page's first sentence, the command line, the origin of the results, and remarks.
 
-    The second result is the command line with which a reader can reproduce the results. The origin of the results
-    states dates, machines and processor time. If the results use fewer worlds than the paper, the list of remarks has
-    one entry. If the results use as many worlds as the paper, the list is empty.
+    The origin states dates, machines and processor time. There is one remark if the results use fewer worlds than the
+    paper, otherwise none.
     """
     every = len(results) == len(ITEMS)
     most = max((result.episodes for result in results), default=MOST_EPISODES)
@@ -54,7 +53,7 @@ def _account(results: Sequence[Result]) -> tuple[str, str, str, list[str]]:
 
 
 def render_page(folder: Path, results: Sequence[Result]) -> str:
-    """Return the page with all results as HTML text. ``folder`` contains the figures of the results.
+    """Return the page with all results as HTML text. ``folder`` contains their figures.
 
     Raises ``InvalidInput`` if a figure is missing, or if its file is not an SVG figure of this package.
     """
@@ -119,15 +118,9 @@ FIGURES, PREFIX = "figures", "reproduction-"  # folder and file prefix of the fi
 
 
 def write_docs(file: Path, folder: Path, results: Sequence[Result]) -> None:
-    """Write the results to a JSON file, and copies of the figures into a folder ``figures`` next to this file.
+    """Write the results to a JSON file, and copies of the figures in ``folder`` to a folder ``figures`` next to it.
 
     Existing files are replaced.
-
-    Args:
-        file: JSON file to write.
-        folder: folder of the reproduction, which contains the figures.
-        results: results of all reproduced figures and tables.
-
     """
     figures = file.parent / FIGURES
     figures.mkdir(exist_ok=True)

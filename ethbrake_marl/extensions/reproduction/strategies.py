@@ -1,7 +1,6 @@
 """The paper's strategies, and two assumptions on the time at which Vehicle 2 may act.
 
-The first assumption gives Vehicle 2 the latency that the paper states. The second assumption gives Vehicle 2 a latency
-of 0.2 s.
+The first assumption (``Reading``) gives Vehicle 2 the latency that the paper states, the second a latency of 0.2 s.
 """
 
 from __future__ import annotations
@@ -46,20 +45,15 @@ NAMES = {  # names of the strategies in tables and figures
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """An assumption on the time at which Vehicle 2 may act.
-
-    The list ``READINGS`` contains two assumptions, because the paper is not clear about the time at which Vehicle 2 may
-    act.
-    """
+    """An assumption on the time at which Vehicle 2 may act, about which the paper is not clear."""
 
     name: str  # name of the assumption
     acts_s: float | None = None  # time at which Vehicle 2 may act (s); None: the latency of the scenario
 
     def scenario(self, name: str, **changes: object) -> Scenario:
-        """Load the shipped scenario ``name``, set Vehicle 2's latency to ``acts_s``, and return the scenario.
+        """Return the shipped scenario ``name``, with Vehicle 2's latency ``acts_s`` unless this is None.
 
-        If ``acts_s`` is None, the latency stays unchanged. ``changes`` contains new values for other keys of the
-        scenario.
+        ``changes`` are new values for other keys of the scenario.
         """
         scenario = load_scenario(name).replace(**changes) if changes else load_scenario(name)
         if self.acts_s is None:
@@ -72,19 +66,12 @@ READINGS = (Reading("as stated"), Reading("Vehicle 2 acts at 0.2 s", 0.2))
 
 
 def lineup(scenario: Scenario, *specs: str) -> dict[str, Agent]:
-    """Return the agents that ``specs`` describe, as a dictionary by name.
-
-    Each of ``specs`` is a text that describes an agent, such as ``"full_brake"``. If ``NAMES`` contains a name for this
-    text, the agent has this name in the result. If ``NAMES`` contains no name for the text, the text is the name.
-    """
+    """Return the agents with these specs, such as ``"full_brake"``, by their name in ``NAMES`` or else by spec."""
     return {NAMES.get(spec, spec): agent for spec, agent in make_agents(specs, scenario).items()}
 
 
 def drive_list(scenario: Scenario, agents: Mapping[str, Agent], episodes: int, settings: Reproduction) -> Evaluation:
-    """Evaluate every agent in the first ``episodes`` worlds of the scenario's evaluation list.
-
-    The function ``settings.tell`` is called with the progress.
-    """
+    """Evaluate every agent in the first ``episodes`` worlds of the scenario's evaluation list."""
     return evaluate(
         scenario.sample(episodes, LIST_SEED),
         agents,
@@ -98,8 +85,8 @@ def drive_list(scenario: Scenario, agents: Mapping[str, Agent], episodes: int, s
 def harms(evaluation: Evaluation) -> dict[str, Floats]:
     """Return the first-impact harm of each strategy: name of the strategy -> [n] harm in each world (m2/s2).
 
-    If the harm that E-V2X-BM predicts is known, the result also contains this harm (key ``PREDICTED``). If a proven
-    lower bound of the harm is known, the result also contains this bound (key ``PROVEN``).
+    The harm that E-V2X-BM predicts (key ``PREDICTED``) and a proven lower bound (key ``PROVEN``) are added if they are
+    known.
     """
     each_harm = {name: outcome.first_impact_harm for name, outcome in evaluation.outcomes.items()}
     pairwise = evaluation.outcomes.get(NAMES[PAIRWISE])
@@ -117,9 +104,8 @@ _STAND_IN = "ppo-obstacle"  # shipped policy that is used if no policy stopped e
 def unconverged_policy(settings: Reproduction) -> tuple[Policy, str]:
     """Return a policy that has not converged, and its description.
 
-    The paper uses a "PPO model obtained from training before convergence occurred". With the option ``--full``, the
-    command ``ethbrake reproduce`` trains such a policy, and this function returns it. If the policy has not been
-    trained, this function returns a shipped policy instead.
+    The paper uses a "PPO model obtained from training before convergence occurred". ``ethbrake reproduce --full``
+    trains such a policy. If it has not been trained, a shipped policy is returned instead.
     """
     for (path,) in settings.trained([STOPPED]).values():
         about = f"PPO stopped early: the last policy of {EARLY.decisions:,} decisions on paper-random"
@@ -131,8 +117,7 @@ def unconverged_policy(settings: Reproduction) -> tuple[Policy, str]:
 def hybrid(policy: Policy, scenario: Scenario, bound: Literal["coupled", "pairwise"]) -> Agent:
     """Return the paper's hybrid (Algorithm 1).
 
-    At the alert the hybrid chooses ``policy`` if the policy's harm is at most H*, otherwise E-V2X-BM. H* is the harm of
-    E-V2X-BM. H* is simulated if ``bound`` is ``coupled``, and predicted by a closed form if ``bound`` is ``pairwise``.
+    H* is simulated if ``bound`` is ``coupled``, and predicted by a closed form if ``bound`` is ``pairwise``.
     """
     return HybridAgent(LearnedAgent(policy, "policy"), scenario, bound=bound)
 

@@ -28,10 +28,7 @@ _UNDERCUT = {_RATE: "worlds in which no command avoids an impact", _MEAN_HARM: "
 
 
 def collision_rate(collided: Bools) -> Estimate:
-    """Return the share of worlds with an impact, with its 95 % interval.
-
-    ``collided`` [n] is True for each world with an impact.
-    """
+    """Return the share of worlds with an impact (mask ``collided``, [n]), with its 95 % interval."""
     return rate(int(collided.sum()), len(collided))
 
 
@@ -48,7 +45,7 @@ class Beside:
     def numbers(self) -> dict[str, dict[str, Estimate]]:
         """Our results: strategy -> quantity (such as "collision rate") -> estimate.
 
-        If lower bounds for all strategies are proven, these bounds have the key "least possible (proven)" (``NOBODY``).
+        Proven lower bounds for all strategies have the key ``NOBODY``.
         """
         numbers, braking = {}, self.evaluation.outcomes.get(NAMES[FULL_BRAKE])
         for name, outcome in self.evaluation.outcomes.items():
@@ -67,15 +64,11 @@ class Beside:
         return numbers
 
     def candidates(self, row: str, quantity: str) -> Iterator[tuple[str, Estimate]]:
-        """Yield our results that may correspond to a printed number of the paper, each as (name, estimate).
+        """Yield our results that may correspond to a printed number, each as (name, estimate).
 
-        The printed number is compared with the first of the yielded results. If the printed number and the first
-        yielded result differ, the verdict also names the yielded result that is nearest to the printed number.
-
-        Args:
-            row: name of the strategy in the paper's table.
-            quantity: quantity that the paper prints: "collision rate", "average harm" or "harm decrease".
-
+        ``row`` is the paper's name of the strategy, and ``quantity`` is "collision rate", "average harm" or "harm
+        decrease". The printed number is compared with the first result; if the two differ, the verdict also names the
+        nearest result.
         """
         for name in self.ours[row]:
             if quantity in self.numbers[name]:
@@ -88,13 +81,7 @@ class Beside:
 
 
 def compare_rows(printed: Sequence[PaperRow], besides: Sequence[Beside]) -> list[Verdict]:
-    """Compare each number in a table of the paper with our results under each assumption, and return the verdicts.
-
-    Args:
-        printed: rows of the paper's table.
-        besides: our results under each assumption on when Vehicle 2 may act.
-
-    """
+    """Compare each number in a table of the paper with our results under each assumption."""
     verdicts = []
     for beside in besides:
         least = beside.numbers.get(NOBODY, {})
@@ -119,17 +106,10 @@ def compare_rows(printed: Sequence[PaperRow], besides: Sequence[Beside]) -> list
 
 
 def selection_verdict(one: PaperRow, other: PaperRow, chosen: PaperRow) -> Verdict:
-    """Return a verdict on the printed number of collisions of the hybrid, which chooses between two strategies.
+    """Return a verdict on the printed number of collisions of the hybrid ``chosen``.
 
-    In each world the hybrid chooses one of two strategies: E-V2X-BM or a policy. Therefore the hybrid avoids a
-    collision only in worlds in which at least one of the two strategies avoids a collision. So the hybrid cannot avoid
-    more collisions than E-V2X-BM and the policy together.
-
-    Args:
-        one: row of the paper's table for the first of the two strategies between which the hybrid chooses.
-        other: row of the paper's table for the second of the two strategies between which the hybrid chooses.
-        chosen: row of the paper's table for the hybrid.
-
+    In each world the hybrid chooses between the strategies ``one`` and ``other``, so it avoids a collision only in
+    worlds in which at least one of them does. Therefore it cannot avoid more collisions than both together.
     """
     avoided = [row.episodes - row.collisions for row in (one, other, chosen)]
     together = avoided[0] + avoided[1]
@@ -144,12 +124,8 @@ def selection_verdict(one: PaperRow, other: PaperRow, chosen: PaperRow) -> Verdi
 def decrease_verdict(row: PaperRow, baseline: PaperRow) -> Verdict:
     """Return a verdict on whether the decrease of harm that the paper prints follows from the printed mean harms.
 
-    The verdict is "agrees" if the printed and the computed decrease differ by less than 0.01 percentage points.
-
-    Args:
-        row: row of the paper's table in which the decrease is printed.
-        baseline: row of the paper's table for the strategy relative to whose harm the decrease is printed.
-
+    The decrease is relative to ``baseline``. The verdict is "agrees" if the printed and the computed decrease differ by
+    less than 0.01 percentage points.
     """
     follows = 1.0 - row.average_harm / baseline.average_harm
     printed = row.harm_decrease or 0.0
@@ -183,14 +159,9 @@ def beside_printed(
 ) -> Made:
     """Compare a table of the paper with our results, and return verdicts, tables and data.
 
-    Args:
-        stem: name of the CSV file with the data, without ending.
-        printed: rows of the paper's table.
-        besides: our results under each assumption on when Vehicle 2 may act.
-        arithmetic: verdicts on whether the paper's printed numbers are consistent; they need none of our results.
-        parameters: quantities that affect our results, to list on the page.
-        notes: sentences that say what was run and what was not.
-
+    ``stem`` is the name of the CSV file, without ending. ``arithmetic`` are verdicts on whether the paper's printed
+    numbers are consistent, which need none of our results. ``parameters`` are quantities that affect our results.
+    ``notes`` say what was run and what was not.
     """
     columns: dict[str, list[str]] = {
         "Strategy": [row.agent for row in printed],

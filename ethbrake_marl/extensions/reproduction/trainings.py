@@ -1,7 +1,7 @@
 """Training runs of ``ethbrake reproduce --full``: for learning curves, an unconverged policy, and open settings.
 
-*Open settings* are settings that the paper does not state. The runs of a group are stored in one folder, which
-``learning_curves.LearningCurves`` manages.
+*Open settings* are settings that the paper does not state. ``learning_curves.LearningCurves`` manages the folder of a
+group.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _STATED_STATE = (  # the paper's state: positions and speeds of all vehicles, an
 
 @dataclass(frozen=True, slots=True)
 class TrainedRecipe:
-    """Name of a recipe, length of its training run, and number of updates between two evaluations of the policy."""
+    """A recipe, and the length of its training run."""
 
     recipe: str  # name of a shipped recipe
     decisions: int  # length of the training, in decisions
@@ -34,11 +34,7 @@ class TrainedRecipe:
     per_s: int  # decisions per second on one core (Intel Xeon), to estimate the time of the training
 
     def load(self, name: str, **changes: Any) -> TrainingRecipe:
-        """Load the recipe of this object, and return the recipe with the new name ``name``.
-
-        The returned recipe trains for ``decisions`` decisions, with ``every_updates`` updates between two evaluations.
-        ``changes`` contains new values for other keys of the recipe.
-        """
+        """Return the recipe under the name ``name``, with this object's numbers and new values ``changes``."""
         recipe = load_recipe(self.recipe)
         evaluation = {**recipe.evaluation.model_dump(), "every_updates": self.every_updates}
         if "log_every_updates" in type(recipe).model_fields:  # otherwise the table has a row for every update
@@ -63,7 +59,7 @@ class Group:
 
 
 def groups() -> dict[str, Group]:
-    """Return all groups of training runs by name, in the order in which they are trained: the quickest group first."""
+    """Return all groups of training runs by name, in the order in which they are trained: the quickest first."""
     base = PPO_PAPER.load("ppo-paper").reward.model_dump(exclude_defaults=True)
     changed = {
         "risk-0": {"risk": 0.0},

@@ -54,7 +54,7 @@ Records = dict[tuple[Reading, int, str], EpisodeRecord]  # (assumption, number o
 
 
 def reproduce_trajectories(settings: Reproduction) -> Made:
-    """Reproduce the trajectories in the paper's Scenarios 1 and 2; return figures, a table and verdicts."""
+    """Reproduce the trajectories in the paper's Scenarios 1 and 2."""
     records, figures, verdicts = _record_all(settings), {}, []
     for reading, stem in zip(READINGS, ("stated", "early"), strict=True):
         own = {f"{name}, Scenario {k}": records[reading, k, name] for name in _POLICIES for k in _SCENARIOS}
@@ -91,7 +91,7 @@ def reproduce_trajectories(settings: Reproduction) -> Made:
 
 
 def reproduce_accelerations(settings: Reproduction) -> Made:
-    """Reproduce the commands of Vehicle 2 in the paper's Scenarios 1 and 2; return figure, table and verdicts."""
+    """Reproduce the commands of Vehicle 2 in the paper's Scenarios 1 and 2."""
     records, verdicts = _record_all(settings), []
     commands = {key: _asked_of_vehicle_2(record) for key, record in records.items()}
     panels = {
@@ -147,8 +147,7 @@ def _record_all(settings: Reproduction) -> Records:
 def play() -> Part:
     """Return an interactive player of the episodes in Scenarios 1 and 2, as a part of the page.
 
-    At the start the player shows PPO and SAC. The player has one episode for each scenario, strategy and assumption on
-    when Vehicle 2 may act.
+    The player has one episode for each scenario, strategy and ``Reading``; at the start it shows PPO and SAC.
     """
     records = []
     for reading, number in _CELLS:
@@ -177,16 +176,8 @@ def _parameters() -> list[Parameter]:
 def _both(records: Records, reading: Reading, number: int, what: str, column: int) -> tuple[Floats, Floats]:
     """Return the values over time of one recorded quantity: under PPO, and under SAC at the same times.
 
-    Both results end with the longer of the two episodes. After the end of the shorter episode, the last value of the
-    shorter episode is repeated.
-
-    Args:
-        records: recorded episodes.
-        reading: assumption on when Vehicle 2 may act.
-        number: number of the scenario, 1 or 2.
-        what: name of the quantity, an attribute of ``EpisodeRecord`` such as ``gaps_m``.
-        column: index (0 = front) of the vehicle or pair of vehicles whose quantity is returned.
-
+    ``what`` is an attribute of ``EpisodeRecord`` such as ``gaps_m``, and ``column`` the index (0 = front) of the
+    vehicle or pair. After the end of the shorter episode, its last value is repeated.
     """
     pair = [records[reading, number, name] for name in _POLICIES]
     times = np.arange(0.0, float(max(record.time_s[-1] for record in pair)), 0.02)
@@ -197,14 +188,8 @@ def _both(records: Records, reading: Reading, number: int, what: str, column: in
 def _apart(records: Records, reading: Reading, what: str) -> list[float]:
     """Return how far a quantity of Vehicle 2 differs between PPO and SAC, in Scenario 1 and in Scenario 2.
 
-    The result for each scenario is the root mean square, over the times of the episode, of the difference between the
-    value of the quantity under PPO and its value under SAC.
-
-    Args:
-        records: recorded episodes.
-        reading: assumption on when Vehicle 2 may act.
-        what: name of the quantity, an attribute of ``EpisodeRecord`` such as ``positions_m``.
-
+    The result is the root mean square, over the times of the episode, of the difference. ``what`` is an attribute of
+    ``EpisodeRecord`` such as ``positions_m``.
     """
     pairs = (_both(records, reading, number, what, 1) for number in _SCENARIOS)
     return [float(np.sqrt(np.mean((one - other) ** 2))) for one, other in pairs]
@@ -213,12 +198,8 @@ def _apart(records: Records, reading: Reading, what: str) -> list[float]:
 def _judge_one_world(claims: Mapping[str, tuple[str, float, float]], reading: Reading, show: Column) -> list[Verdict]:
     """Return a verdict on each claim of the paper about a single world. Numbers for a single world have no intervals.
 
-    Args:
-        claims: dictionary from each claim to three values: a text for the verdict, the number that is smaller according
-            to the claim, and the number that is larger according to the claim.
-        reading: assumption on when Vehicle 2 may act, for the text of the verdict.
-        show: format in which the verdict writes the smaller minus the larger number.
-
+    ``claims`` maps each claim to a text for the verdict, the number that is smaller according to the claim, and the
+    number that is larger.
     """
     return [
         judge_statement(f"{claim} ({reading.name})", [Less(value, Estimate(smaller - larger, None))], show=show)
@@ -229,9 +210,8 @@ def _judge_one_world(claims: Mapping[str, tuple[str, float, float]], reading: Re
 def _asked_of_vehicle_2(record: EpisodeRecord) -> tuple[float, float, float]:
     """Return three numbers that describe the commands of Vehicle 2 in one episode.
 
-    The first number is the first command after the latency of Vehicle 2 (m/s2). The second number is the sum of the
-    absolute changes of the command (m/s2). The third number is the time in which Vehicle 2 brakes while it moves,
-    divided by the time in which it moves.
+    These are the first command after its latency (m/s2), the sum of the absolute changes of the command (m/s2), and the
+    time in which it brakes while it moves, divided by the time in which it moves.
     """
     acting = record.time_s >= float(record.initial.vehicles.latency_s[0, 1])
     command, moving = record.command_mps2[acting, 1], record.speeds_mps[acting, 1] > 0.0

@@ -72,16 +72,9 @@ def compare_number(
 ) -> Verdict:
     """Return a verdict on whether a number that the paper prints agrees with our result.
 
-    Args:
-        what: name of the printed number, as the verdict shows it.
-        printed: number that the paper prints.
-        ours: our result for the quantity whose value the paper prints, with its 95 % interval.
-        show: format in which the verdict writes our number and the printed number.
-        least: description and value of a proven lower bound for all strategies in our worlds; None: no bound.
-        others: our results for the same quantity under other assumptions, by the description of the assumption. If
-            ``ours`` differs from the printed number, the verdict names the assumption under which our result is nearest
-            to the printed number.
-
+    ``what`` is the name of the number, and ``show`` its format. ``least`` is the description and the value of a proven
+    lower bound for all strategies in our worlds. ``others`` are our results under other assumptions; if ``ours``
+    differs from the printed number, the verdict names the assumption with the nearest result.
     """
     text = f"ours {show.show(ours).in_words}, printed {show.scale * printed:.{show.digits + 1}f}{show.unit}"
     if least is not None and least[1].value - printed > _chance(least[1]):
@@ -104,12 +97,7 @@ def compare_number(
 
 
 def _off(printed: float, ours: Estimate) -> str:
-    """Return how far ``ours`` is from the printed number, as text such as "+3.1 %"; empty if the two numbers agree.
-
-    Two numbers agree if they differ by at most 2 % of the printed number (``TOLERANCE``). Two numbers also agree if
-    they differ by no more than the chance difference (``_chance``), and the chance difference is at most 15 %
-    (``WIDE``) of the larger number.
-    """
+    """Return how far ``ours`` is from the printed number, as text such as "+3.1 %"; empty if the two numbers agree."""
     chance = _chance(ours)
     off = chance if chance <= WIDE * max(abs(printed), abs(ours.value)) else 0.0
     if abs(ours.value - printed) <= max(off, TOLERANCE * abs(printed)):
@@ -118,9 +106,9 @@ def _off(printed: float, ours: Estimate) -> str:
 
 
 def _chance(estimate: Estimate) -> float:
-    """Return by how much ``estimate`` may differ, by chance, from an estimate in equally many other worlds.
+    """Return the chance difference: by how much ``estimate`` may differ from one in equally many other worlds.
 
-    The result is sqrt(2) times half the width of the 95 % interval of ``estimate``.
+    It is sqrt(2) times half the width of the 95 % interval.
     """
     low, high = estimate.ends
     return math.sqrt(2.0) * 0.5 * (high - low)
@@ -128,7 +116,7 @@ def _chance(estimate: Estimate) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Less:
-    """Comparison of two quantities, to judge a statement of the paper that one of them is smaller than the other.
+    """Comparison of two quantities, of which one is smaller according to a statement of the paper.
 
     A statement can need several comparisons, for example one for each group of worlds.
     """
@@ -142,22 +130,14 @@ class Less:
 
     @classmethod
     def of_lists(cls, where: str, smaller: Floats, larger: Floats) -> Less:
-        """Compare the means of two independent samples, ``smaller`` [n] and ``larger`` [m].
-
-        ``where`` is a text that says which worlds or strategies are compared.
-        """
+        """Compare the means of two independent samples, ``smaller`` [n] and ``larger`` [m]."""
         return cls(where, unpaired_difference(mean(smaller), len(smaller), mean(larger), len(larger)))
 
     @classmethod
     def of_harms(cls, where: str, harm: Mapping[str, Floats], smaller: str, larger: str) -> Less:
         """Compare the harms of two strategies in the same worlds, and with the proven lower bound if it is known.
 
-        Args:
-            where: text that says which worlds or strategies are compared.
-            harm: harm of each strategy in each world, [n], by the name of the strategy.
-            smaller: name of the strategy whose harm is smaller according to the paper.
-            larger: name of the strategy whose harm is larger according to the paper.
-
+        ``harm`` has the harm of each strategy, [n]. ``smaller`` and ``larger`` are names of strategies.
         """
         low, high = harm[smaller], harm[larger]
         least = paired_difference(harm[PROVEN], high) if PROVEN in harm else None
@@ -167,14 +147,8 @@ class Less:
 def judge_statement(what: str, parts: Sequence[Less], *, or_equal: bool = False, show: Column = HARM) -> Verdict:
     """Return a verdict on a statement of the paper.
 
-    The statement agrees if the 95 % interval of every difference in ``parts`` is below 0.
-
-    Args:
-        what: statement of the paper, in words.
-        parts: all comparisons that must be right if the statement is right.
-        or_equal: True: an interval whose upper end is exactly 0 also agrees with the statement.
-        show: format in which the verdict writes the differences.
-
+    The statement agrees if the 95 % interval of every difference in ``parts`` is below 0; with ``or_equal``, the upper
+    end may also be 0.
     """
     compared, ties = [part for part in parts if not part.neither], [part.where for part in parts if part.neither]
     places = ", ".join(ties) if len(ties) <= 2 else f"{len(ties)} more"
@@ -206,10 +180,9 @@ def judge_statement(what: str, parts: Sequence[Less], *, or_equal: bool = False,
 
 
 def summarise_verdicts(verdicts: Sequence[Verdict]) -> Verdict:
-    """Combine all verdicts on a figure or table into one verdict with the worst outcome.
+    """Combine all verdicts on an item into one verdict with the worst outcome.
 
-    The text of the combined verdict states how often each outcome occurs, and quotes the first verdict with the worst
-    outcome.
+    Its text states how often each outcome occurs, and quotes the first verdict with the worst outcome.
     """
     if not verdicts:
         return Verdict("all", "not run", "nothing was compared")

@@ -1,6 +1,4 @@
-"""The agent ``AGENT+search``: at the alert it improves the commands of AGENT by a search, and then it drives the best
-commands.
-"""
+"""The agent ``AGENT+search``: at the alert it improves the commands of AGENT by a search, and drives the result."""
 
 from __future__ import annotations
 
@@ -24,8 +22,7 @@ from ethbrake_marl.scenario.schema import Scenario
 
 
 class Searched(AgentAround):
-    """Agent that improves the commands of another agent by a search at the alert, and then drives the best commands
-    found.
+    """Agent that improves another agent's commands by a search at the alert, and then drives the best commands.
 
     The search simulates the line; all vehicles but the controlled one follow their scripts. After the search the agent
     does not react to what it observes. ``predicted_harm`` [n] (m2/s2) is never above the harm of the agent ``policy``.
@@ -61,15 +58,7 @@ class Searched(AgentAround):
         self._outlook = Outlook(harm_count, scenario.horizon_s, scenario.time_step_s, scenario.objective)
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Simulate the policy's episode from the alert, improve its commands by a search, and return the best commands
-        as memory.
-
-        Args:
-            alert: the worlds at the alert, [n].
-            vehicle: index of the controlled vehicle.
-            scripts: maps the index of each other vehicle to its script.
-
-        """
+        """Simulate the policy's episode, improve its commands by a search, and return the best commands as memory."""
         others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)
         problem = self._outlook.problem(alert, vehicle, others)
         own = record_commands(self.policy, alert, self.scenario, vehicle, int(problem.last_step.max()))
@@ -81,22 +70,12 @@ class Searched(AgentAround):
         }
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """Return the command of the present step, [n] m/s2, and the unchanged memory.
-
-        Args:
-            worlds: worlds in their present state, [n]; only the time is read.
-            memory: memory that ``begin`` returned.
-            vehicle: not used.
-
-        """
+        """Return the command of the present step, [n] m/s2, and the unchanged memory. ``vehicle`` is not used."""
         return self._outlook.command(worlds, memory), memory
 
 
 def search_around(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
-    """Return the agent ``+search``, which improves the commands of ``policy`` by a search at the alert.
-
-    ``argument`` has no effect. ``settings`` contain the scenario and the harm count to minimise.
-    """
+    """Return the agent ``+search``; ``argument`` has no effect."""
     return Searched(policy, settings.needed_scenario(), harm_count=settings.harm_count)
 
 

@@ -1,7 +1,9 @@
 """Compute the best known harm of each world by a search over command profiles.
 
-A *profile* consists of the commands of the controlled vehicles over a whole episode. A profile is a sequence of
-*phases*: time intervals of constant commands.
+Arguments that several functions share: ``worlds`` are n worlds at t = 0. ``task`` has the scenario, the controlled
+vehicles, and the harm count to minimise. ``others`` [n, N] are the constant commands of the vehicles that follow
+scripts, m/s2. ``budget`` is the number of profiles that are simulated in each world for each harm count. A *chunk* is a
+part of a list of worlds: at most ``CHUNK`` worlds.
 """
 
 from __future__ import annotations
@@ -56,30 +58,25 @@ def best_harm(
     known: BestHarmTable | None = None,
     objective: Declared = "total",
 ) -> BestHarmTable:
-    """Search for the profile with the least harm in each world and under each count. Return the profiles with the least
-    harm as a table.
+    """Search each world for the profile with the least harm under each count; return a table of these profiles.
 
-    With two harm counts, there are two searches; for each count, the table stores the profile with the least harm under
-    this count. The harm in the table is at most the harm in ``known`` and, with one controlled vehicle, the harm of the
-    best constant deceleration. With several controlled vehicles, the harm is also at most the harm that the same search
-    reaches if it controls only one of these vehicles and the others brake fully. The result for a world does not depend
-    on ``threads`` or on the other worlds. Raises ``InvalidInput`` if ``vehicles`` or ``counts`` is empty, if the
+    There is one search for each count. The harm in the table is at most the harm in ``known`` and, with one controlled
+    vehicle, the harm of the best constant deceleration. With several controlled vehicles, the harm is also at most the
+    harm that the search reaches with only one of them while the others brake fully. The result for a world does not
+    depend on ``threads`` or on the other worlds. Raises ``InvalidInput`` if ``vehicles`` or ``counts`` is empty, if the
     command of a script is not fixed at the alert, or if ``budget`` is below 1.
 
     Args:
         scenario: scenario of the worlds.
         worlds: worlds at t = 0, [n].
         counts: harm counts to minimise: ``first``, ``total``, or both.
-        vehicles: indices of the controlled vehicles; None: the learners of the scenario. All other
-            vehicles follow scripts.
-        budget: number of profiles that are simulated in each world for each harm count.
+        vehicles: indices of the controlled vehicles; None: the learners of the scenario.
+        budget: number of profiles to simulate in each world for each count.
         seed: seed of the random search.
-        threads: number of threads; None: one for each core.
-        known: table of best known harm for the same controlled vehicles; the search starts from the profiles in this
-            table. None: no table.
-        objective: objective to minimise, as under a scenario's key ``objective``. If the objective is not ``total``,
-            the table contains the objective's values instead of the harm of the line, and its header names the
-            objective.
+        threads: None: one thread for each core.
+        known: table for the same controlled vehicles; the search also starts from its profiles.
+        objective: objective to minimise, as under a scenario's key ``objective``. If it is not ``total``, the table
+            contains values of this objective instead of harm, and its header names the objective.
 
     """
     if not counts or not set(counts) <= set(HARM_COUNTS) or len(set(counts)) != len(counts):
@@ -137,29 +134,15 @@ def search_list(
     on_progress: Progress | None = None,
     objective: Declared = "total",
 ) -> BestHarmTable:
-    """Run ``best_harm`` on a long list of worlds, ``CHUNK`` worlds at a time. An interrupted run of ``search_list`` can
-    be continued.
+    """Run ``best_harm`` on a long list of worlds, chunk by chunk; an interrupted run can be continued.
 
-    The table leaves out worlds that cannot be simulated because of a defect of the physics. The table's header names
-    the worlds that are left out, under the key ``LEFT_OUT``. Raises ``InvalidInput`` in the same cases as
-    ``best_harm``, and if ``known`` contains no world of the list. Raises ``PhysicsError`` if no world of the list can
-    be simulated.
+    The table leaves out worlds that cannot be simulated because of a defect of the physics. The header names these
+    worlds under the key ``LEFT_OUT``. Raises ``InvalidInput`` in the same cases as ``best_harm``, and if ``known``
+    contains no world of the list. Raises ``PhysicsError`` if no world of the list can be simulated.
 
-    Args:
-        scenario: scenario of the worlds.
-        sample: the worlds to search, with the number of each world in its list.
-        counts: harm counts to minimise: ``first``, ``total``, or both.
-        vehicles: indices of the controlled vehicles; None: the learners of the scenario.
-        budget: number of profiles that are simulated in each world for each harm count.
-        seed: seed of the random search.
-        threads: number of threads; None: one for each core.
-        known: table of best known harm; the search starts from the profiles in this table. None: no table.
-        chunks: folder in which the table of each finished chunk (``CHUNK`` worlds of the list) is stored as a file. A
-            later call with the same arguments reads the stored files; a later call with other arguments overwrites the
-            stored files. If ``chunks`` is None, no files are read or written.
-        on_progress: function that is called with the number of finished worlds and the number of all worlds.
-        objective: objective to minimise, as in ``best_harm``.
-
+    ``chunks`` is the folder for the tables of the finished chunks, one file each; None: no files. A later call with the
+    same arguments reads these files; a call with other arguments overwrites them. ``on_progress`` is called with the
+    number of finished worlds and the number of all worlds. The other arguments mean the same as in ``best_harm``.
     """
     parts: list[BestHarmTable] = []
     left_out: dict[int, str] = {}
@@ -195,19 +178,10 @@ def search_list(
 def _kept_or_searched(
     task: Task, every: Worlds, file: Path | None, options: dict[str, Any], rows: Ints
 ) -> BestHarmTable:
-    """Return the table of best known harm for one chunk (at most ``CHUNK`` worlds of the list).
+    """Return the table of one chunk: from ``file`` if it has the same worlds and options, otherwise from a search.
 
-    If ``file`` contains a table of the chunk's worlds that was made with the same options, this table is returned. If
-    ``file`` contains no table of these worlds with these options, the worlds are searched, and the new table is written
-    to ``file``.
-
-    Args:
-        task: scenario and controlled vehicles.
-        every: all worlds that ``search_list`` searches.
-        file: file for the table of the chunk; None: no file is read or written.
-        options: keyword arguments with which ``best_harm`` is called.
-        rows: indices of the chunk's worlds in the list of worlds.
-
+    A new table is written to ``file`` (None: no file is read or written). ``every`` are all worlds of the list, and
+    ``rows`` the indices of the chunk's worlds among them. ``options`` are keyword arguments of ``best_harm``.
     """
     worlds = every.take(rows)
     known = options["known"]
@@ -227,16 +201,7 @@ def _kept_or_searched(
 
 
 def chunks_left(scenario: Scenario, sample: Sample, *, budget: int, chunks: Path) -> tuple[int, list[Path]]:
-    """Return the number of worlds that ``search_list`` still has to search, and the paths of the damaged files in the
-    folder ``chunks``.
-
-    Args:
-        scenario: scenario of the worlds.
-        sample: the worlds that ``search_list`` searches.
-        budget: number of profiles that are simulated in each world for each harm count.
-        chunks: folder with the files that ``search_list`` has written, one file for each ``CHUNK`` worlds.
-
-    """
+    """Return how many worlds ``search_list`` still has to search, and the damaged files in ``chunks``."""
     left, damaged = 0, []
     identity = task_problem(sample.worlds, Task(scenario, scenario.learners)).identity
     question = {"counts": list(HARM_COUNTS), "budget": budget, "search_seed": 0}
@@ -259,13 +224,8 @@ def chunk_file(chunks: Path, first: int) -> Path:
 def kept_chunk(file: Path, identity: UInt64s, question: Mapping[str, object]) -> BestHarmTable | None:
     """Return the table in ``file``; None if the file is missing or was made for other worlds or with other options.
 
-    Raises ``CorruptBundle`` if the file is damaged.
-
-    Args:
-        file: file with the table of best known harm for one chunk (at most ``CHUNK`` worlds of the list).
-        identity: hash of each world of the chunk.
-        question: options of the search (counts, budget, seed), which are compared with the options in the file.
-
+    ``identity`` are the hashes of the chunk's worlds. ``question`` are the options of the search (counts, budget,
+    seed). Raises ``CorruptBundle`` if the file is damaged.
     """
     if not file.is_file():
         return None
@@ -278,18 +238,18 @@ def kept_chunk(file: Path, identity: UInt64s, question: Mapping[str, object]) ->
 def scripted_commands(worlds: Worlds, task: Task) -> Floats:
     """Return the constant command of each vehicle that follows a script, [n, N] m/s2.
 
-    For the controlled vehicles, which ``task`` names, the command is full braking. Raises ``InvalidInput`` if the
-    command of a script is not fixed at the alert.
+    For the controlled vehicles the command is full braking. Raises ``InvalidInput`` if the command of a script is not
+    fixed at the alert.
     """
     others = {i: script for i, script in script_agents(task.scenario).items() if i not in task.vehicles}
     return fixed_commands(others, worlds, f"scenario {task.scenario.name!r}, search for the best profiles")
 
 
 def task_problem(worlds: Worlds, task: Task) -> ProfileProblem:
-    """Return the problem of a search for the best profiles of the controlled vehicles, in worlds at t = 0.
+    """Return the problem of a search for the best profiles of the controlled vehicles.
 
     The field ``identity`` [n] of the problem is a hash of everything that affects the harm of a world. The hash does
-    not depend on the harm count (``first`` or ``total``).
+    not depend on the harm count.
     """
     return _problem(worlds, task, scripted_commands(worlds, task), task.vehicles)
 
@@ -309,17 +269,9 @@ def _searched(
     """Search each world; return the profiles with the least harm, and their harm under each harm count.
 
     With several controlled vehicles, the search also starts from the best profile of each controlled vehicle while the
-    others brake fully.
-
-    Args:
-        worlds: worlds at t = 0, [n].
-        task: scenario, controlled vehicles and harm count to minimise.
-        others: commands of the vehicles that follow scripts, [n, N] m/s2.
-        given: additional profiles from which the search starts.
-        deciders: indices of vehicles; the first decision comes when the first of these vehicles may act.
-        effort: keyword arguments ``budget``, ``seed`` and ``threads`` of ``search_profiles``.
-        aimed: function that replaces the harm that a problem minimises by the objective of the controlled vehicles.
-
+    others brake fully. ``given`` are additional starting profiles. The first decision comes when the first vehicle of
+    ``deciders`` may act. ``effort`` are the arguments ``budget``, ``seed`` and ``threads`` of ``search_profiles``.
+    ``aimed`` replaces the harm that a problem minimises by the objective of the controlled vehicles.
     """
     problem = aimed(_problem(worlds, task, others, deciders))
     starts = starting_profiles(problem, worlds, task, others, given)
@@ -336,18 +288,10 @@ def _searched(
 def starting_profiles(
     problem: ProfileProblem, worlds: Worlds, task: Task, others: Floats, given: Sequence[Profiles] = ()
 ) -> list[Profiles]:
-    """Return the profiles from which a search starts: constant commands and the profiles ``given``.
+    """Return the profiles from which a search starts: constant commands and ``given``.
 
     With one controlled vehicle, the result also contains the profiles of coupled E-V2X-BM and the extreme profiles
     (full drive and full braking).
-
-    Args:
-        problem: search problem that was made from ``worlds``.
-        worlds: worlds at t = 0, [n].
-        task: scenario, controlled vehicles and harm count to minimise.
-        others: commands of the vehicles that follow scripts, [n, N] m/s2.
-        given: additional profiles from which the search starts.
-
     """
     starts = [problem.constant(problem.even_grid(CONSTANTS)), *given]
     if len(task.vehicles) == 1:
@@ -363,11 +307,7 @@ def starting_profiles(
 
 
 def startable(profiles: Profiles) -> Profiles:
-    """Return the profiles in a form from which a search can start: with at most ``MOST_PHASES`` phases (intervals of
-    constant command).
-
-    A profile with more than ``MOST_PHASES`` phases is replaced by its first command for the whole episode.
-    """
+    """Replace each profile of more than ``MOST_PHASES`` phases by its first command for the whole episode."""
     ends, commands = Profiles.padded([profiles], MOST_PHASES)[0]
     last = ends[:, -1:]
     short = ends[:, MOST_PHASES - 1 : MOST_PHASES] == last
@@ -378,10 +318,9 @@ def startable(profiles: Profiles) -> Profiles:
 
 
 def joined(parts: list[Profiles], n: int) -> Profiles:
-    """Join several arrays of profiles into one: array j has Q_j profiles of each of n worlds, and the result has Q =
-    sum of Q_j profiles of each world.
+    """Join arrays of profiles: array j has Q_j profiles of each of n worlds, and the result has Q = sum of Q_j.
 
-    Each array lists the profiles of world 0 first, then the profiles of world 1, and so on.
+    An array lists the profiles of world 0 first, then the profiles of world 1, and so on.
     """
     parts = Profiles.padded(parts, MOST_PHASES)
     ends = np.concatenate([part.ends.reshape(n, -1, MOST_PHASES) for part in parts], axis=1)
@@ -393,14 +332,8 @@ def joined(parts: list[Profiles], n: int) -> Profiles:
 def driven_profiles(agent: Driver, worlds: Worlds, task: Task, last_step: Ints) -> Profiles:
     """Let ``agent`` drive the n worlds, and return its commands as one profile for each world, [n].
 
-    Neighbouring steps with equal commands become one phase (interval of constant command).
-
-    Args:
-        agent: agent that drives the controlled vehicle.
-        worlds: worlds at t = 0, [n].
-        task: scenario and controlled vehicle.
-        last_step: number of time steps of the episode in each world, [n].
-
+    Neighbouring steps with equal commands become one phase. ``last_step`` [n] is the number of time steps of each
+    episode.
     """
     commands = record_commands(agent, worlds, task.scenario, task.vehicle, int(last_step.max()))
     # one phase for each change of command
@@ -415,21 +348,15 @@ def driven_profiles(agent: Driver, worlds: Worlds, task: Task, last_step: Ints) 
 def fold_episodes(
     table: BestHarmTable, scenario: Scenario, worlds: Worlds, name: str, agents: Mapping[HarmCount, Agent]
 ) -> BestHarmTable:
-    """Let agents drive the worlds; return a copy of ``table`` with the lower harm in each world in which an agent does
-    less harm than ``table``.
+    """Let agents drive the worlds; return a copy of ``table`` with the agents' harm where it is lower.
 
     The agents' commands are recorded and simulated again; the table stores the harm of the second simulation. The
-    table's header says in how many worlds the harm was lowered. If the simulation with an agent fails in a world, the
-    harm of this world stays as it was. Raises ``InvalidInput`` unless the scenario has exactly one learner.
+    table's header says in how many worlds the harm was lowered, under the agent's name ``name``. Worlds with best known
+    harm 0 are skipped. If the simulation with an agent fails in a world, the harm of this world stays as it was. Raises
+    ``InvalidInput`` unless the scenario has exactly one learner.
 
-    Args:
-        table: table to improve.
-        scenario: scenario of the worlds.
-        worlds: worlds at t = 0; worlds with best known harm 0 are skipped.
-        name: name of the agent, which the table's header mentions.
-        agents: for each harm count, an agent that minimises this count. The harm of every episode is compared with the
-            harm in the table, under both harm counts.
-
+    ``agents`` has, for each harm count, an agent that minimises this count. Each episode is compared with the table
+    under both counts.
     """
     if OBJECTIVE in table.header:
         raise InvalidInput(

@@ -1,9 +1,12 @@
-"""Starting profiles for a search; they consist of full drive and full braking.
+"""Starting profiles for a search, which consist of full drive and full braking.
 
 The proof of the lower bound shows that profiles with the least harm have one of two forms. In the first form, the
 vehicle drives fully for a while, brakes fully until it meets the vehicle ahead, and drives fully again. In the second
 form, the vehicle brakes fully, drives fully until the vehicle behind meets it, and brakes fully again. A random search
-seldom finds profiles of these two forms.
+seldom finds such profiles.
+
+Arguments that several functions share: ``ends`` [..., K] are the time steps at which the phases of a profile end, and
+``commands`` [..., K, 1] are the commands of the phases, m/s2; both are changed in place.
 """
 
 from __future__ import annotations
@@ -47,10 +50,10 @@ def extreme_profiles(problem: ProfileProblem, states: Floats, has_front: Bools, 
     of the controlled vehicle braked fully. If a neighbour brakes less, other extreme profiles may have less harm.
 
     Args:
-        problem: worlds, with the commands of the other vehicles and the harm to minimise.
+        problem: n worlds with one controlled vehicle.
         states: state of each world at the first decision, [n, WIDTH]; the columns are named in ``proofs.line.LINE``.
-        has_front: True if there is a vehicle ahead of the controlled one, [n].
-        has_rear: True if there is a vehicle behind the controlled one, [n].
+        has_front: True if there is a vehicle ahead of the controlled vehicle, [n].
+        has_rear: True if there is a vehicle behind the controlled vehicle, [n].
 
     """
     n, last = problem.n, problem.last_step
@@ -64,17 +67,7 @@ def extreme_profiles(problem: ProfileProblem, states: Floats, has_front: Bools, 
 def _fill_extremes(
     problem: ProfileProblem, states: Floats, has_front: Bools, has_rear: Bools, ends: Ints, commands: Floats
 ) -> None:
-    """Write the extreme profiles with the least harm in each world to ``ends`` and ``commands``.
-
-    Args:
-        problem: worlds, with the commands of the other vehicles and the harm to minimise.
-        states: state of each world at the first decision, [n, WIDTH]; the columns are named in ``proofs.line.LINE``.
-        has_front: True if there is a vehicle ahead of the controlled one, [n].
-        has_rear: True if there is a vehicle behind the controlled one, [n].
-        ends: output: time step at which each phase ends, [n, KEPT, K].
-        commands: output: command of each phase, [n, KEPT, K, 1] m/s2.
-
-    """
+    """Write the extreme profiles with the least harm in each world to ``ends`` and ``commands``."""
     no_random = np.zeros(states.shape[0], np.uint64)
     for k in range(states.shape[0]):
         world = make_search_world(problem, k, no_random)
@@ -92,23 +85,13 @@ def try_changes(
     world: SearchWorld, kind: int, at: Floats, start: Floats, low: float, high: float, ends: Ints, commands: Floats,
     values: Floats,
 ) -> float:  # fmt: skip
-    """Simulate profiles whose first change of command is between ``low`` and ``high``; keep the profiles with the least
-    harm.
+    """Simulate profiles that first change the command between ``low`` and ``high`` (s); keep those with the least harm.
 
-    Returns the time (s) at which the command first changes in the profile with the least harm.
-
-    Args:
-        world: world to simulate, with the bounds of the commands and a random stream.
-        kind: ``FRONT_FIRST`` if the controlled vehicle meets the vehicle ahead, ``REAR_FIRST`` if it meets the vehicle
-            behind.
-        at: state of the world at the first decision, [WIDTH]; ``proofs.line.LINE`` names the columns.
-        start: state of the simulation at the first decision, [S].
-        low: earliest time at which the command first changes, s.
-        high: latest time at which the command first changes, s.
-        ends: time step at which each phase of the best profiles ends, [KEPT, K]; changed in place.
-        commands: commands of the best profiles, [KEPT, K, 1] m/s2; changed in place.
-        values: harm of the best profiles, [KEPT] m2/s2; changed in place.
-
+    Returns the time (s) at which the command first changes in the profile with the least harm. ``kind`` is
+    ``FRONT_FIRST`` if the controlled vehicle meets the vehicle ahead, ``REAR_FIRST`` if it meets the vehicle behind.
+    ``at`` [WIDTH] is the state of the world at the first decision, with the columns ``proofs.line.LINE``; ``start`` [S]
+    is the same state in the form of the simulation. ``values`` [KEPT] is the harm of the best profiles, m2/s2; it is
+    changed in place.
     """
     plan, other = empty_plan(), empty_plan()
     states = np.zeros((_PHASES + 1, start.shape[0]))
@@ -141,20 +124,12 @@ def fill_extreme(
     """Write one profile: a first command, the opposite command from ``change`` to ``meeting``, the first command again.
 
     Commands can change only between time steps. If the time ``change`` is within a time step, the command of this step
-    is the mean of the two commands, weighted with their durations. With this mean command, the speed at the end of the
-    step is exact.
+    is the mean of the two commands, weighted with their durations. The speed at the end of the step is then exact.
 
-    Args:
-        world: world of the profile, with the bounds of the commands and the time step.
-        kind: the first command: ``FRONT_FIRST`` for full drive, ``REAR_FIRST`` for full braking.
-        change: time at which the command first changes, s.
-        meeting: time of the second change of the command if ``early`` is 0, s.
-        early: number of time steps by which the second change of the command comes before the time ``meeting``.
-        share: the command of the time step between the second command and the return to the first command is a weighted
-            mean of the two commands; ``share`` is the weight of the first command in this mean, from 0 to 1.
-        ends: output: time step at which each phase ends, [5].
-        commands: output: command of each phase, [5, 1] m/s2.
-
+    The first command is full drive if ``kind`` is ``FRONT_FIRST``, and full braking if it is ``REAR_FIRST``. ``change``
+    and ``meeting`` are times in s. The second change comes ``early`` time steps before ``meeting``. In the time step
+    before the return to the first command, the command is a weighted mean of both; ``share`` (0 to 1) is the weight of
+    the first command.
     """
     low, high, step = world.bounds[0, 0], world.bounds[0, 1], world.episode.clock[CLOCK.TIME_STEP]
     last = int(world.episode.clock[CLOCK.LAST_STEP])

@@ -22,11 +22,7 @@ KNOWN, BELOW = "known", "below_best_known"
 
 
 class LimitMeasures(MeasureSet):
-    """Measures of unavoidable contact, of the best known harm, and of each agent's regret.
-
-    Each measure is computed from the outcome of an agent and a ``Regrets`` object, which contains the best known harm
-    of every world.
-    """
+    """Measures of unavoidable contact, of the best known harm, and of each agent's regret."""
 
     measures = (
         Measure(
@@ -124,15 +120,9 @@ class LimitMeasures(MeasureSet):
 
         ``known_best_share`` is the share of the worlds for which a best known harm existed before the evaluation.
         ``below_best_known`` is the number of worlds in which the agent does less harm than the best harm known before
-        the evaluation. ``best_known_warning`` is the warning that a table contains the best known harm of only some of
-        the worlds; None if there is no warning. ``impact_unproven`` describes the worlds in which contact is proven
-        unavoidable, but an impact is not proven unavoidable, with the fields of ``Between``.
-
-        Args:
-            tally: counts and means over the agent's episodes.
-            worlds: number of worlds in the evaluation.
-            context: value that ``prepare`` returned.
-
+        the evaluation. ``best_known_warning`` is the text ``Limits.warning``; None if there is no warning.
+        ``impact_unproven`` describes the worlds in which contact is proven unavoidable, but an impact is not proven
+        unavoidable, with the fields of ``Between``.
         """
         between = None if isinstance(context, Silent) else context.between
         return {
@@ -143,18 +133,12 @@ class LimitMeasures(MeasureSet):
         }
 
     def warnings(self, rows: Sequence[SummaryRow]) -> Sequence[str]:
-        """Return a list with a warning if the best known harm is known for only some of the worlds; else an empty list.
-
-        ``rows`` are the summaries, one for each agent.
-        """
+        """Return a list with a warning if the best known harm is known for only some of the worlds; else empty."""
         warning = rows[0].more[NAME]["best_known_warning"]
         return [warning] if warning else []
 
     def notes(self, rows: Sequence[SummaryRow]) -> Sequence[str]:
-        """Return a list with one note about unavoidable harm and the best known harm; empty if nothing is proven.
-
-        ``rows`` are the summaries, one for each agent.
-        """
+        """Return a list with one note about unavoidable harm and the best known harm; empty if nothing is proven."""
         row, first, total = rows[0], rows[0]["best_known_first_impact_harm"], rows[0]["best_known_total_harm"]
         if first is None or total is None:
             return []
@@ -173,10 +157,7 @@ class LimitMeasures(MeasureSet):
 
 
 def best_known_words(row: SummaryRow) -> str:
-    """Return the label of the best known harm in ``row``: "best known", or "best of these agents".
-
-    The label is "best of these agents" if some worlds were not searched before the evaluation.
-    """
+    """Return "best known", or "best of these agents" if some worlds were not searched before the evaluation."""
     share = row.more[NAME]["known_best_share"]
     return "best known" if share is None or share == 1.0 else "best of these agents"
 
@@ -197,7 +178,7 @@ def _unavoidable(row: SummaryRow) -> str:
 def _best(row: SummaryRow, first: float, total: float) -> str:
     """Return a sentence with the best known harm, the proven bound, and the difference between them.
 
-    ``first`` is the mean best known first-impact harm, and ``total`` is the mean best known total harm, m2/s2.
+    ``first`` and ``total`` are the means of the best known first-impact and total harm, m2/s2.
     """
     least = 0.0 if row["proven_harm"] is None else row["proven_harm"].value
     gaps = [

@@ -43,7 +43,7 @@ class Proof:
 
     @property
     def impact(self) -> Bools:
-        """True for worlds in which no commands avoid an impact (contact with a closing speed above 0), [n]."""
+        """True for worlds in which no commands avoid an impact, [n]."""
         return np.asarray(self.harm > 0.0, np.bool_)
 
     @property
@@ -63,7 +63,7 @@ class Limits:
 
     @property
     def known(self) -> Bools:
-        """True for worlds for which a best known harm, under both harm counts, existed before the evaluation, [n]."""
+        """True for worlds with a best known harm under both harm counts, [n]."""
         return np.isfinite(self.first_impact_harm) & np.isfinite(self.total_harm)
 
     @property
@@ -85,7 +85,7 @@ class Limits:
 def known_limits(worlds: Worlds, task: Task) -> Limits | Unproven:
     """Return the proven facts and the best known harm of worlds at the alert.
 
-    Returns ``Unproven`` if the proofs do not cover the scenario and the controlled vehicles, which ``task`` names.
+    Returns ``Unproven`` if the proofs do not cover ``task``.
     """
     proof = prove(worlds, task)
     if isinstance(proof, Unproven):
@@ -99,7 +99,7 @@ def known_limits(worlds: Worlds, task: Task) -> Limits | Unproven:
 def prove(worlds: Worlds, task: Task) -> Proof | Unproven:
     """Return what is proven about each world at the alert: whether contact is avoidable, and a lower bound on harm.
 
-    Returns ``Unproven`` if the proofs do not cover the scenario and the controlled vehicles, which ``task`` names.
+    Returns ``Unproven`` if the proofs do not cover ``task``.
     """
     because = unproven_because(worlds, task)
     if because is not None:
@@ -118,10 +118,7 @@ def prove(worlds: Worlds, task: Task) -> Proof | Unproven:
 
 
 def unproven_because(worlds: Worlds, task: Task) -> str | None:
-    """Return the reason why nothing is proven for ``task`` in these worlds; None if a lower bound on harm is proven.
-
-    The reason is a clause without a full stop. ``task`` names the scenario and the controlled vehicles.
-    """
+    """Return, as a clause, the reason why nothing is proven for ``task``; None if a lower bound on harm is proven."""
     if worlds.vehicles.in_pieces.any() or (_is_team(task) and worlds.vehicles.build_up.any()):
         return _uneven_because(worlds)
     if not _is_team(task):
@@ -130,19 +127,17 @@ def unproven_because(worlds: Worlds, task: Task) -> str | None:
 
 
 def undecided_because(worlds: Worlds, task: Task) -> str | None:
-    """Return, as a clause, the reason why it is not known whether contact is avoidable; None if it is known whether
-    contact is avoidable.
+    """Return, as a clause, the reason why avoidability of contact is unknown; None if it is known.
 
-    ``worlds`` must be at the alert. ``task`` names the scenario and the controlled vehicles.
+    ``worlds`` must be at the alert.
     """
     return _uneven_because(worlds) if worlds.vehicles.build_up.any() else _uncovered_because(worlds, task)
 
 
 def _uncovered_because(worlds: Worlds, task: Task) -> str | None:
-    """Return, as a clause, the reason why the proof ``avoidability`` does not cover ``task``; None if the proof covers
-    ``task``.
+    """Return, as a clause, the reason why the proof ``avoidability`` does not cover ``task``; None if it does.
 
-    The proof ``avoidability`` assumes that brakes act at once; the function does not check this assumption.
+    The proof assumes that brakes act at once; the function does not check this.
     """
     scenario, names = task.scenario, task.scenario.vehicle_names
     if not task.vehicles or (len(task.vehicles) > 1 and set(task.vehicles) not in _DECIDED):
@@ -171,17 +166,14 @@ def _uneven_because(worlds: Worlds) -> str:
 
 
 def _is_team(task: Task) -> bool:
-    """Return True if several vehicles are controlled, or if one vehicle is controlled in a line of more than three
-    vehicles.
-    """
+    """Return True for several controlled vehicles, or for one in a line of more than three vehicles."""
     return len(task.vehicles) > 1 or (len(task.vehicles) == 1 and task.scenario.vehicles > _VEHICLES)
 
 
 def _script_because(task: Task, proven: str) -> str | None:
     """Return a clause that names a vehicle with a script other than full_brake; None if there is no such vehicle.
 
-    ``task`` names the scenario and the controlled vehicles. ``proven`` says what is proven if the vehicle follows
-    full_brake, for instance "avoidability is proven"; this text becomes part of the clause.
+    ``proven`` says what is proven if the vehicle follows full_brake, for instance "avoidability is proven".
     """
     scenario = task.scenario
     for i in range(scenario.vehicles):

@@ -27,7 +27,7 @@ MOST_CANDIDATES = 1_000_000  # most candidates per world and decision
 
 
 class Outlook(NamedTuple):
-    """Settings of an agent that searches for commands, and methods that read the agent's plan at the present time."""
+    """Settings of an agent that searches for commands, with methods that read the agent's plan."""
 
     harm_count: HarmCount  # harm count to minimise: ``first`` or ``total``
     horizon_s: float  # end of the simulated episode, s
@@ -53,8 +53,8 @@ class Outlook(NamedTuple):
     def due(self, worlds: Worlds, planned_s: Floats) -> Ints:
         """Return the indices of worlds that need a new plan.
 
-        A world needs a new plan if a vehicle moves, the horizon is not reached, and the last plan was made before the
-        present time. ``planned_s`` [n] is the time at which the last plan was made, s.
+        A world needs a new plan if a vehicle moves, the horizon is not reached, and the last plan was made (at
+        ``planned_s`` [n], s) before the present time.
         """
         moving = (worlds.speeds_mps != 0.0).any(axis=1)
         return np.flatnonzero((worlds.time_s > planned_s) & (worlds.time_s < self.horizon_s) & moving)
@@ -62,11 +62,8 @@ class Outlook(NamedTuple):
     def command(self, worlds: Worlds, memory: Memory) -> Floats:
         """Return the command of the agent's plan for the present time of each world, [n] m/s2.
 
-        Args:
-            worlds: worlds in their present state, [n]; only the time is read.
-            memory: memory with ``commands_mps2`` [n, decisions], one command for each decision, and ``start_s`` [n],
-                the time of the first decision, s.
-
+        ``memory`` has ``commands_mps2`` [n, decisions], one command for each decision, and ``start_s`` [n], the time of
+        the first decision, s.
         """
         step = Decisions(memory["start_s"], self.time_step_s).latest(worlds.time_s)
         now: Floats = memory["commands_mps2"][np.arange(worlds.n), np.clip(step, 0, self.decisions - 1)]
@@ -133,14 +130,7 @@ class Planner:
         self._outlook = Outlook(harm_count, horizon_s, time_step_s, objective)
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Search for the first plan of each world, and return these plans as memory.
-
-        Args:
-            alert: the worlds at the alert, [n].
-            vehicle: index of the controlled vehicle.
-            scripts: maps the index of each other vehicle to its script.
-
-        """
+        """Search for the first plan of each world, and return these plans as memory."""
         others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)
         problem = self._outlook.problem(alert, vehicle, others)
         pairwise = -optimise_pairwise(alert, vehicle).deceleration_mps2
@@ -152,12 +142,6 @@ class Planner:
         """Return the first command of each world's plan, [n] m/s2, and the new memory.
 
         Worlds in which a decision is due get a new plan from a new search.
-
-        Args:
-            worlds: worlds in their present state, [n].
-            memory: memory from ``begin`` or the previous ``act``.
-            vehicle: index of the controlled vehicle.
-
         """
         rows = self._outlook.due(worlds, memory["planned_s"])
         if rows.size:
@@ -168,14 +152,7 @@ class Planner:
         return Profiles(*memory["plan"]).commands_mps2[:, 0, 0], memory
 
     def _rest(self, held: Memory, time_s: Floats, problem: ProfileProblem) -> Profiles:
-        """Return the rest of each stored plan, from the present time on, as profiles [m].
-
-        Args:
-            held: memory of the m worlds that need a new plan, with the stored plans.
-            time_s: present time, [m] s.
-            problem: problem of the search for the new plans, from the present time to the horizon.
-
-        """
+        """Return the rest of each plan in ``held``, from the present time ``time_s`` [m] (s) on, as profiles [m]."""
         plan = Profiles(*held["plan"])
         passed = np.rint((time_s - held["planned_s"]) / self._outlook.time_step_s).astype(np.int64)[:, np.newaxis]
         ends = np.minimum(np.maximum(plan.ends - passed, 0), problem.last_step[:, np.newaxis])
@@ -183,9 +160,7 @@ class Planner:
         return Profiles(ends, plan.commands_mps2)
 
     def _search(self, problem: ProfileProblem, plan: Profiles) -> tuple[Profiles, Floats]:
-        """Search each world, starting from ``plan`` and constant commands; return the profile with the least harm in
-        each world, and its harm, [n] m2/s2.
-        """
+        """Search from ``plan`` and constant commands; return each world's best profile and its harm, [n] m2/s2."""
         constants = problem.constant(problem.even_grid(15))
         n, K = plan.ends.shape  # [n * Q]: for each world its plan, then constants
         ends = np.concatenate([plan.ends[:, np.newaxis], constants.ends.reshape(n, -1, K)], axis=1)
@@ -197,9 +172,7 @@ class Planner:
 
 
 def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
-    """Return the agent ``planner`` or ``planner:CANDIDATES``. ``argument`` is the number of profiles that are simulated
-    in each world at each decision, as text; None means the default number.
-    """
+    """Return the agent ``planner`` or ``planner:CANDIDATES``."""
     return Planner(
         argument, harm_count=settings.harm_count, horizon_s=settings.horizon_s,
         most_candidates=settings.most_candidates, time_step_s=settings.time_step_s,
@@ -208,12 +181,7 @@ def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
 
 
 def make_estimating_planner(argument: str | None, settings: AgentSettings) -> Agent:
-    """Return the agent ``planner:estimated`` or ``planner:CANDIDATES:estimated``, which searches in the world as it is
-    estimated from messages and sights.
-
-    ``argument`` is the number of profiles that are simulated in each world at each decision, as text; None means the
-    default number.
-    """
+    """Return the agent ``planner:estimated`` or ``planner:CANDIDATES:estimated``; it searches the estimated world."""
     return Estimating(make_planner(argument, settings), settings.needed_scenario(), shows=True)
 
 

@@ -30,14 +30,8 @@ def minimising(problem: ProfileProblem, worlds: Worlds, declared: Declared, vehi
     """Return a copy of ``problem`` in which the search minimises the objective of the controlled vehicles.
 
     Raises ``InvalidInput`` if the objective is neither a weighted sum of the vehicles' harm nor ``maximin``, or if the
-    controlled vehicles have different objectives.
-
-    Args:
-        problem: search problem of n worlds, in which the search minimises the harm of the line.
-        worlds: the n worlds of ``problem``.
-        declared: one objective for all vehicles, or one for each vehicle, as under a scenario's key ``objective``.
-        vehicles: indices of the controlled vehicles, from 0.
-
+    controlled vehicles have different objectives. ``declared`` is one objective for all vehicles or one for each
+    vehicle, as under a scenario's key ``objective``.
     """
     objectives = objectives_of(declared, worlds.N)
     if all(objectives[vehicle].kind == "total" for vehicle in vehicles):
@@ -56,21 +50,15 @@ Found = tuple[Profiles, dict[HarmCount, Floats]]
 
 
 def search_profiles(problem: ProfileProblem, given: Profiles, *, budget: int, seed: int = 0, threads: int = 1) -> Found:
-    """Search each world; return the profile with the least harm in each world, and the harm [n] (m2/s2) of this profile
-    under each harm count.
+    """Search each world for the profile with the least harm; return it and its harm [n] (m2/s2) under each harm count.
 
-    A profile has at most ``MOST_PHASES`` phases of constant command. The harm of the returned profile is at most the
-    harm of each profile of ``given``. The harm is the quantity that ``problem`` minimises. Raises ``InvalidInput`` if
-    ``budget`` or ``threads`` is below 1, or if ``seed`` is negative. Raises ``PhysicsError``, which names the worlds in
-    which the physics could simulate no profile.
+    A profile has at most ``MOST_PHASES`` phases. The harm of the returned profile is at most the harm of each profile
+    of ``given``. The harm is the quantity that ``problem`` minimises. Raises ``InvalidInput`` if ``budget`` or
+    ``threads`` is below 1, or if ``seed`` is negative. Raises ``PhysicsError``, which names the worlds in which the
+    physics could simulate no profile.
 
-    Args:
-        problem: n worlds, with the commands of the other vehicles and the harm to minimise.
-        given: starting profiles, [n * Q]: first the Q profiles of world 0, then the Q profiles of world 1, and so on.
-        budget: approximate number of profiles that are simulated in each world.
-        seed: seed of the random search.
-        threads: number of threads.
-
+    ``given`` [n * Q] are the starting profiles: first the Q profiles of world 0, then the Q profiles of world 1, and so
+    on. ``budget`` is the approximate number of profiles that are simulated in each world.
     """
     for name, value, least in (("budget", budget, 1), ("threads", threads, 1), ("seed", seed, 0)):
         check_whole_number(name, value, least)

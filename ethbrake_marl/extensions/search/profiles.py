@@ -1,8 +1,10 @@
 """Compiled random search for the profile with the least harm in one world. Each world has its own random stream.
 
-A *profile* has at most K phases (intervals of constant command). ``ends`` [K] are the time steps at which the phases
-end, and ``commands`` [K, C] are the commands of the C controlled vehicles in each phase (m/s2). ``bounds`` [C, 2] are
-the least and the largest command of each vehicle (m/s2). The state of one world is an array of S numbers.
+Arguments that several functions share: a profile has at most K phases. ``ends`` [K] are the time steps at which the
+phases end, and ``commands`` [K, C] are the commands of the C controlled vehicles in each phase, m/s2. ``seed_ends`` [Q,
+K] and ``seed_commands`` [Q, K, C] are Q starting profiles. ``world`` has the ``bounds`` [C, 2], which are the least and
+the largest command of each vehicle (m/s2), and the state of its random stream, ``random`` [1]. ``states`` [K + 1, S]
+receives the state of the world at the start of each phase, S numbers; row 0 is the state at the first decision.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ CHANGE_WIDTH = 4
 
 @compiled
 def draw(random: UInt64s) -> float:
-    """Return the next random number, uniform in [0, 1), of a splitmix64 generator whose state is ``random`` [1]."""
+    """Return the next random number, uniform in [0, 1), of a splitmix64 generator."""
     random[0] += np.uint64(0x9E3779B97F4A7C15)
     z = random[0]
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -46,7 +48,7 @@ def draw(random: UInt64s) -> float:
 
 @compiled
 def draw_below(random: UInt64s, n: int) -> int:
-    """Return a random whole number from 0 to ``n`` - 1. ``random`` [1] is the state of the random stream."""
+    """Return a random whole number from 0 to ``n`` - 1."""
     return min(int(draw(random) * n), n - 1)
 
 
@@ -61,9 +63,8 @@ def allowed(command: float, low: float, high: float) -> float:
 def draw_command(random: UInt64s, low: float, high: float) -> float:
     """Return a random command, m/s2.
 
-    The command is ``low`` with probability 0.35, ``high`` with probability 0.15, and 0 with probability 0.1. With the
-    remaining probability 0.4, the command is uniformly distributed between ``low`` and ``high``. ``random`` [1] is the
-    state of the random stream.
+    The command is ``low`` with probability 0.35, ``high`` with probability 0.15, 0 with probability 0.1, and otherwise
+    uniformly distributed between ``low`` and ``high``.
     """
     u = draw(random)
     if u < 0.35:
@@ -79,17 +80,10 @@ def draw_command(random: UInt64s, low: float, high: float) -> float:
 def apply_change(change: Floats, bounds: Floats, ends: Ints, commands: Floats) -> bool:
     """Apply one change to a profile, in place. Return False if the change leaves the profile as it was.
 
-    There are four kinds of change to a profile. COMMAND_CHANGE adds an amount to the command of one phase. TRADE adds
-    an amount to the command of one phase, and changes the command of the next phase so that the vehicle has the same
-    speed after both phases, but another position. SET_COMMAND replaces the command of one phase. MOVE_END moves the
-    border between two phases by whole time steps.
-
-    Args:
-        change: four numbers that describe the change: KIND, VEHICLE, PHASE and AMOUNT (in m/s2; for MOVE_END in steps).
-        bounds: least and largest command of each vehicle, [C, 2] m/s2.
-        ends: time steps at which the phases end, [K]; changed in place.
-        commands: commands of the phases, [K, C] m/s2; changed in place.
-
+    The four numbers of ``change`` are KIND, VEHICLE, PHASE and AMOUNT (m/s2; for MOVE_END steps). COMMAND_CHANGE adds
+    an amount to the command of one phase. TRADE adds an amount to the command of one phase, and changes the command of
+    the next phase so that the vehicle has the same speed after both phases, but another position. SET_COMMAND replaces
+    the command of one phase. MOVE_END moves the border between two phases by whole time steps.
     """
     kind, c, k, amount = int(change[KIND]), int(change[VEHICLE]), int(change[PHASE]), change[AMOUNT]
     low, high, before = bounds[c, 0], bounds[c, 1], commands[k, c]
@@ -117,14 +111,9 @@ def apply_change(change: Floats, bounds: Floats, ends: Ints, commands: Floats) -
 
 @compiled
 def compact(ends: Ints, commands: Floats, phases: int) -> int:
-    """Remove the empty phases of a profile, join neighbouring phases with equal commands, and return the number of
-    phases that remain.
+    """Remove empty phases and join neighbouring phases with equal commands, in place; return how many phases remain.
 
-    Args:
-        ends: time steps at which the phases end, [K]; changed in place.
-        commands: commands of the phases, [K, C] m/s2; changed in place.
-        phases: number of phases that the profile uses before the call.
-
+    ``phases`` is the number of phases that the profile uses before the call.
     """
     last, count = ends[ends.shape[0] - 1], 0
     for k in range(phases):
@@ -163,7 +152,7 @@ ATTENTION_STEPS = 30  # phases are divided within this number of steps from the 
 
 
 class Population(NamedTuple):
-    """The *field*: M profiles that the search improves at the same time. A profile has up to K phases."""
+    """The *field*: M profiles that the search improves at the same time."""
 
     ends: Ints  # [M, K] steps at which the phases end
     commands: Floats  # [M, K, C] commands of the C controlled vehicles in each phase, m/s2
@@ -177,18 +166,9 @@ def search_world(
 ) -> int:
     """Search for the profile with the least harm in one world, and write the profile to ``ends`` and ``commands``.
 
-    Returns the number of phases of the profile with the least harm; 0 if the physics could simulate no profile. The
-    harm of the written profile is at most the harm of each starting profile.
-
-    Args:
-        world: world to simulate, with the bounds of the commands and a random stream.
-        start: state of the world at the first decision, [S].
-        seed_ends: time steps at which the phases of the Q starting profiles end, [Q, K].
-        seed_commands: commands of the starting profiles, [Q, K, C] m/s2.
-        budget: number of profiles to simulate.
-        ends: output: time steps at which the phases end, [K].
-        commands: output: commands of the phases, [K, C] m/s2.
-
+    Returns the number of phases of this profile; 0 if the physics could simulate no profile. The harm of the written
+    profile is at most the harm of each starting profile. ``start`` [S] is the state of the world at the first decision.
+    ``budget`` is the number of profiles to simulate.
     """
     K, C = commands.shape
     states = np.zeros((K + 1, start.shape[0]))
@@ -229,7 +209,7 @@ def search_world(
 
 @compiled
 def copy_profile(ends: Ints, commands: Floats, to_ends: Ints, to_commands: Floats) -> None:
-    """Copy the phases of one profile over the first phases of another profile (``to_ends``, ``to_commands``)."""
+    """Copy the phases of one profile over the first phases of another profile."""
     for k in range(ends.shape[0]):
         to_ends[k] = ends[k]
     copy_rows(commands, to_commands, commands.shape[0])
@@ -237,18 +217,9 @@ def copy_profile(ends: Ints, commands: Floats, to_ends: Ints, to_commands: Float
 
 @compiled(apart=True)
 def improve(world: SearchWorld, ends: Ints, commands: Floats, states: Floats, budget: int) -> float:
-    """Improve a profile in place by ``budget`` random changes, and return the harm of the improved profile, m2/s2.
+    """Improve a profile in place, simulating ``budget`` changed profiles; return the new harm, m2/s2.
 
     Returns infinity if the physics could not simulate the profile.
-
-    Args:
-        world: world to simulate, with the bounds of the commands and a random stream.
-        ends: time steps at which the phases end, [K]; changed in place.
-        commands: commands of the phases, [K, C] m/s2; changed in place.
-        states: [K + 1, S] state of the world at the start of each phase; row 0: state at the first decision;
-            overwritten.
-        budget: number of changed profiles to simulate.
-
     """
     new_ends, new_commands, new_states = ends.copy(), commands.copy(), states.copy()
     change = np.zeros(CHANGE_WIDTH)
@@ -299,19 +270,9 @@ def improve(world: SearchWorld, ends: Ints, commands: Floats, states: Floats, bu
 def gather(
     world: SearchWorld, seed_ends: Ints, seed_commands: Floats, states: Floats, drawn: int, field: Population
 ) -> None:
-    """Fill the field (profiles to improve) with the best of the starting profiles and of ``drawn`` random profiles.
+    """Fill ``field`` with the best of the starting profiles and of ``drawn`` random profiles.
 
     No two profiles in the field have the same harm.
-
-    Args:
-        world: world to simulate, with the bounds of the commands and a random stream.
-        seed_ends: time steps at which the phases of the Q starting profiles end, [Q, K].
-        seed_commands: commands of the starting profiles, [Q, K, C] m/s2.
-        states: [K + 1, S] state of the world at the start of each phase; row 0: state at the first decision;
-            overwritten.
-        drawn: number of random profiles to simulate.
-        field: output: the profiles with the least harm.
-
     """
     Q, K = seed_ends.shape
     last = int(world.episode.clock[CLOCK.LAST_STEP])
@@ -373,9 +334,7 @@ def is_among(value: float, values: Floats) -> bool:
 
 @compiled
 def largest(values: Floats) -> int:
-    """Return the index of the largest number in ``values``. If several numbers are equally large, return the index of
-    the first of them.
-    """
+    """Return the index of the largest number in ``values``, the first one if several are equally large."""
     place = 0
     for k in range(values.shape[0]):
         if values[k] > values[place]:
@@ -388,7 +347,7 @@ def divide(world: SearchWorld, field: Population) -> None:
     """Halve phases of the best profile of ``field``, in place, until this profile has K phases.
 
     The longest phase is halved first. The length of a phase is counted only within the first ``ATTENTION_STEPS`` steps
-    of the episode. ``world`` contains the number of steps of the episode.
+    of the episode.
     """
     used = field.phases[0]
     if used > 0 and field.values[0] > 0.0:
@@ -417,22 +376,12 @@ def divide(world: SearchWorld, field: Population) -> None:
 def select_stepwise(
     world: SearchWorld, seed_ends: Ints, seed_commands: Floats, states: Floats, field: Population
 ) -> None:
-    """Switch ``world`` to stepwise simulation, and write the profile with the least harm to the first place of
-    ``field``.
+    """Switch ``world`` to stepwise simulation; write the profile with the least harm to the first place of ``field``.
 
     The function compares the harm of the first ``SMALLEST_FIELD`` profiles of ``field`` and of all starting profiles.
     Stepwise simulation computes one decision after the other, with the same rounding errors as the engine. The rounding
     errors matter if harm is a discontinuous function of the commands: rounding may then decide how much harm a profile
     causes.
-
-    Args:
-        world: world to simulate, with the bounds of the commands and a random stream.
-        seed_ends: time steps at which the phases of the Q starting profiles end, [Q, K].
-        seed_commands: commands of the starting profiles, [Q, K, C] m/s2.
-        states: [K + 1, S] state of the world at the start of each phase; row 0: state at the first decision;
-            overwritten.
-        field: profiles that the search improves; the function overwrites the first profile with the result.
-
     """
     world.episode.clock[CLOCK.STEPWISE] = 1.0
     Q, K = seed_ends.shape

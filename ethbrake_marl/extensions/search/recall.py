@@ -35,15 +35,14 @@ class BestHarm:
     """Agent that drives the command profile with the least known harm.
 
     In a world without a stored profile, the agent searches for a profile at the alert. If the controlled vehicle is the
-    only learner, the agent searches a second time after this search. The second search starts from the better one of
-    two profiles: the result of the first search, and the commands of the shipped policy ``universal``. Therefore the
-    result is never worse than ``universal``. If the environment has the agent's time step, the simulated harm is
-    exactly ``predicted_harm`` [n] (m2/s2). Raises ``InvalidInput`` if ``budget`` is below 1 or ``harm_count`` is
-    unknown. ``begin`` raises ``InvalidInput`` if the command of another vehicle's script is not fixed at the alert.
+    only learner, a second search follows. It starts from the better one of two profiles: the result of the first
+    search, and the commands of the shipped policy ``universal``. Therefore the result is never worse than
+    ``universal``. If the environment has the agent's time step, the simulated harm is exactly ``predicted_harm`` [n]
+    (m2/s2). Raises ``InvalidInput`` if ``budget`` is below 1 or ``harm_count`` is unknown. ``begin`` raises
+    ``InvalidInput`` if the command of another vehicle's script is not fixed at the alert.
 
     Args:
-        recall: function that returns the stored profile of each world, and a mask: True for worlds that have a stored
-            profile.
+        recall: function that returns the stored profiles, see ``Recall``.
         scenario: scenario of the worlds; the agent minimises the scenario's objective. If ``scenario`` is None, the
             agent minimises the harm of the line, and does not search a second time.
         harm_count: harm count to minimise, ``first`` or ``total``.
@@ -76,14 +75,8 @@ class BestHarm:
     def make(cls, argument: str | None, settings: AgentSettings, recall: Recall) -> BestHarm:
         """Return the agent ``best_harm`` or ``best_harm:CANDIDATES``.
 
-        Raises ``InvalidInput`` if ``argument`` is not a whole number from 1 to ``MOST_CANDIDATES``.
-
-        Args:
-            argument: number of profiles that a search simulates, as text; None: ``PROFILE_BUDGET``.
-            settings: scenario, harm count to minimise and other settings of agents.
-            recall: function that returns the stored profile of each world, and a mask: True for worlds that have a
-                stored profile.
-
+        ``argument`` is the number of profiles that a search simulates, as text; None: ``PROFILE_BUDGET``. Raises
+        ``InvalidInput`` if ``argument`` is not a whole number from 1 to ``MOST_CANDIDATES``.
         """
         budget = PROFILE_BUDGET if argument is None else budget_of(argument)
         if budget is None:
@@ -98,14 +91,7 @@ class BestHarm:
         )  # fmt: skip
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Read the stored profiles, search the worlds without a stored profile, and return the commands as memory.
-
-        Args:
-            alert: the worlds at the alert, [n].
-            vehicle: index of the controlled vehicle.
-            scripts: maps the index of each other vehicle to its script.
-
-        """
+        """Read the stored profiles, search the worlds without a stored profile, and return the commands as memory."""
         others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)
         problem, outlook = self._outlook.problem(alert, vehicle, others), self._outlook
         profiles, known = self._recall(problem, outlook.harm_count)
@@ -124,22 +110,11 @@ class BestHarm:
         }
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """Return the command of the present step, [n] m/s2, and the unchanged memory.
-
-        Args:
-            worlds: worlds in their present state, [n]; only the time is read.
-            memory: memory that ``begin`` returned.
-            vehicle: not used.
-
-        """
+        """Return the command of the present step, [n] m/s2, and the unchanged memory. ``vehicle`` is not used."""
         return self._outlook.command(worlds, memory), memory
 
     def _search(self, worlds: Worlds, vehicle: int, others: Floats) -> tuple[Floats, Floats]:
-        """Search each world; return the commands with the least harm, one for each decision, [n, decisions] m/s2, and
-        their harm, [n] m2/s2.
-
-        ``others`` [n, N] are the commands of the other vehicles, m/s2.
-        """
+        """Search each world; return the command of each decision, [n, decisions] m/s2, and the harm, [n] m2/s2."""
         problem, outlook = self._outlook.problem(worlds, vehicle, others), self._outlook
         coupled = optimise_coupled(
             worlds, vehicle, harm_count=outlook.harm_count, horizon_s=outlook.horizon_s, others_mps2=others

@@ -1,10 +1,14 @@
 """Compiled random search that improves the commands of an episode.
 
-The search improves two sequences of commands by random changes of a few neighbouring steps. The caller gives the first
-sequence of commands. The second sequence is the best of some random *templates*; it is needed because small changes of
-the caller's commands may miss the best commands. A template is a random braking profile of three phases: one command,
-then another command for a short while, then full braking. The search simulates one decision after the other, as the
-engine does, and therefore computes exactly the same harm as the engine.
+The search improves two sequences of commands by random changes of a few neighbouring steps. The first sequence comes
+from the caller. The second is the best of some random *templates*, because small changes of the caller's commands may
+miss the best commands. A template is a random braking profile of three phases: one command, then another command for a
+short while, then full braking. The search simulates one decision after the other, as the engine does, and therefore
+computes exactly the same harm as the engine.
+
+Arguments that several functions share: ``budget`` is the number of candidates (sequences of commands) to simulate in
+each world. ``room`` has arrays for intermediate results. ``world`` is the world to simulate; a ``SearchWorld`` also has
+the bounds of the commands and a random stream.
 """
 
 from __future__ import annotations
@@ -53,21 +57,15 @@ class Plan(NamedTuple):
 
 
 def refine(problem: ProfileProblem, commands_mps2: Floats, *, budget: int, seed: int = 0) -> tuple[Floats, Floats]:
-    """Improve given commands by a search. Return the commands with the least harm, [n, T] m/s2, and their harm, [n]
-    m2/s2.
+    """Improve commands by a search; return the commands with the least harm, [n, T] m/s2, and their harm, [n] m2/s2.
 
     The harm of the returned commands is at most the harm of the given commands. The harm is the quantity that
     ``problem`` minimises, and equals the harm that the engine computes. The result for a world does not depend on the
     other worlds. Raises ``InvalidInput`` if several vehicles are controlled, if the commands have a wrong shape or
-    exceed a capacity, or if ``budget`` is below 1. Raises ``PhysicsError``, which names the worlds in which the physics
-    cannot simulate the given commands.
+    exceed a capacity, or if ``budget`` is below 1. Raises ``PhysicsError``, which names the worlds, if the given
+    commands cannot be simulated.
 
-    Args:
-        problem: n worlds with one controlled vehicle, the commands of the other vehicles, and the harm to minimise.
-        commands_mps2: command of the controlled vehicle in each step, [n, T]; the search starts with these commands.
-        budget: number of candidates (sequences of commands) that are simulated in each world.
-        seed: seed of the random search.
-
+    ``commands_mps2`` [n, T] is the command of the controlled vehicle in each step, with which the search starts.
     """
     check_whole_number("budget", budget, 1)
     n, steps = problem.n, int(problem.last_step.max(initial=0))
@@ -93,16 +91,10 @@ def refine(problem: ProfileProblem, commands_mps2: Floats, *, budget: int, seed:
 def _refine_worlds(
     problem: ProfileProblem, random: UInt64s, budget: int, commands: Floats, value: Floats, failed: Bools
 ) -> None:
-    """Improve the commands of each world, in place.
+    """Improve the commands [n, T] of each world, in place.
 
-    Args:
-        problem: n worlds, with the commands of the other vehicles and the harm to minimise.
-        random: initial state of each world's random stream, [n].
-        budget: number of candidates (sequences of commands) that are simulated in each world.
-        commands: command of each step, [n, T] m/s2; changed in place.
-        value: output: for the improved commands, the harm that ``problem`` minimises, [n] m2/s2.
-        failed: output: True for worlds in which the physics cannot simulate the commands, [n].
-
+    ``random`` [n] is the initial state of each world's random stream. Outputs: ``value`` [n], the harm of the improved
+    commands, m2/s2; ``failed`` [n], True for worlds in which the given commands cannot be simulated.
     """
     start, T, S = problem.start, commands.shape[1], problem.start.shape[1]
     mine, other = Plan(np.zeros(T), np.zeros((T + 1, S))), Plan(np.zeros(T), np.zeros((T + 1, S)))
@@ -122,10 +114,9 @@ def _refine_worlds(
 
 @compiled(apart=True)
 def _refine_world(world: SearchWorld, mine: Plan, other: Plan, room: Plan, budget: int) -> bool:
-    """Improve the commands ``mine`` of one world in place. Return False if the physics cannot simulate these commands.
+    """Improve the commands ``mine`` in place. Return False if the given commands cannot be simulated.
 
-    ``other`` and ``room`` are arrays for intermediate results. ``budget`` is the number of candidates (sequences of
-    commands) to simulate.
+    ``other`` is for intermediate results, like ``room``.
     """
     templates, theirs = int(TEMPLATE_SHARE * budget), int(THEIR_CLIMB_SHARE * budget)
     value, reached = follow_steps(world.episode, mine, 0, math.inf)
@@ -146,14 +137,8 @@ def _refine_world(world: SearchWorld, mine: Plan, other: Plan, room: Plan, budge
 def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[float, int]:
     """Simulate the commands of ``plan`` from step ``begin`` on, and write the state after each step into ``plan``.
 
-    Returns the harm (m2/s2) and the number of steps of the episode; -1 steps if the simulation fails.
-
-    Args:
-        world: world to simulate, with the commands of the other vehicles.
-        plan: commands to simulate; ``plan`` also contains the state at step ``begin``.
-        begin: first step to simulate.
-        bound: the simulation stops as soon as the harm is at least this number, m2/s2.
-
+    Returns the harm (m2/s2) and the number of steps of the episode; -1 steps if the simulation fails. ``plan`` must
+    contain the state at step ``begin``. The simulation stops as soon as the harm is at least ``bound``, m2/s2.
     """
     table, clock = world.table, world.clock
     grid, restitution, last = grid_of(clock), clock[CLOCK.RESTITUTION], int(clock[CLOCK.LAST_STEP])
@@ -174,21 +159,11 @@ def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[
 
 @compiled(apart=True)
 def climb(world: SearchWorld, plan: Plan, room: Plan, value: float, reached: int, budget: int) -> tuple[float, int]:
-    """Improve ``plan`` in place by random changes; return the harm (m2/s2) of the improved plan and the number of steps
-    of its episode.
+    """Improve ``plan`` in place by random changes; return its new harm (m2/s2) and the number of steps of its episode.
 
-    Most changes add an amount to the commands of some neighbouring steps; the other changes replace the commands of
-    some neighbouring steps. If adding an amount lowers the harm, the next change adds twice this amount to the commands
-    of the same steps.
-
-    Args:
-        world: world to simulate, with the bounds of the commands and a random stream.
-        plan: commands to improve, with their simulated states.
-        room: arrays for intermediate results.
-        value: harm of ``plan``, m2/s2.
-        reached: number of steps of the episode that ``plan`` leads to.
-        budget: number of candidates (sequences of commands) to simulate.
-
+    Most changes add an amount to the commands of some neighbouring steps; the others replace these commands. If adding
+    an amount lowers the harm, the next change adds twice this amount to the commands of the same steps. ``value`` and
+    ``reached`` are the harm and the number of steps before the improvement.
     """
     low, high = world.bounds[0, 0], world.bounds[0, 1]
     longest = steps_in(world.episode, LONGEST_CHANGE_S)
@@ -229,19 +204,10 @@ def climb(world: SearchWorld, plan: Plan, room: Plan, value: float, reached: int
 
 @compiled(apart=True)
 def draw_templates(world: SearchWorld, best: Plan, room: Plan, bound: float, number: int) -> tuple[float, int]:
-    """Simulate random templates (braking profiles), and write the one with the least harm to ``best``.
+    """Simulate ``number`` random templates, and write the one with the least harm to ``best``.
 
-    A *template* has three phases: one command, then another command for a short while, then full braking. Returns the
-    harm of the template with the least harm (m2/s2), and the number of steps of the episode under this template. The
-    number of steps is 0 if no template does less harm than ``bound``.
-
-    Args:
-        world: world to simulate, with the bounds of the commands and a random stream.
-        best: output: commands and states of the template (random braking profile) with the least harm.
-        room: arrays for intermediate results.
-        bound: a template with at least this harm is rejected, m2/s2.
-        number: number of templates (random braking profiles) to draw.
-
+    Returns the least harm (m2/s2) and the number of steps of this template's episode; 0 steps if no template does less
+    harm than ``bound``.
     """
     low, high, T = world.bounds[0, 0], world.bounds[0, 1], room.commands.shape[0]
     attention, longest = steps_in(world.episode, ATTENTION_S), steps_in(world.episode, LONGEST_WHILE_S)
@@ -268,6 +234,6 @@ def steps_in(world: Episode, duration_s: float) -> int:
 
 @compiled
 def copy_steps(commands: Floats, to: Floats, first: int) -> None:
-    """Copy the commands of step ``first`` and of all later steps into the array ``to``."""
+    """Copy the commands from step ``first`` on into the array ``to``."""
     for t in range(first, commands.shape[0]):
         to[t] = commands[t]

@@ -40,18 +40,13 @@ class Regrets:
         return self.first_impact_harm if harm_count == "first" else self.total_harm
 
     def regret(self, outcome: Outcome, harm_count: HarmCount) -> Floats:
-        """Return an agent's harm minus the best known harm, [n] m2/s2; the result is never negative.
-
-        ``outcome`` is the agent's outcome in these worlds; ``harm_count`` is ``first`` or ``total``.
-        """
+        """Return an agent's harm minus the best known harm, [n] m2/s2; the result is never negative."""
         return outcome.ledger.world_harm(harm_count) - self.best(harm_count)
 
     def below(self, outcome: Outcome) -> Bools:
-        """Return a mask [n]: True for worlds in which an agent does less harm than the best harm known before the
-        evaluation.
+        """Return a mask [n]: True where an agent does less harm than the best harm known before the evaluation.
 
-        True means that the agent's harm is smaller by more than ``TOLERANCE``, under at least one of the two harm
-        counts.
+        Less means: by more than ``TOLERANCE``, under at least one of the two harm counts.
         """
         first, total = self.limits.first_impact_harm, self.limits.total_harm
         return (outcome.first_impact_harm < first - TOLERANCE) | (outcome.total_harm < total - TOLERANCE)
@@ -63,10 +58,7 @@ class Regrets:
 
     @property
     def between(self) -> Between | None:
-        """Summary of the worlds in which contact is proven unavoidable, but an impact is not proven unavoidable.
-
-        The result is None if it is not known whether contact is avoidable.
-        """
+        """Summary of the worlds with unavoidable contact but no proven impact; None if avoidability is unknown."""
         if self.avoidable is None:
             return None
         return Between.of(~self.avoidable, self.limits.proof.impact, self.first_impact_harm, self.total_harm)
@@ -74,9 +66,7 @@ class Regrets:
 
 @dataclass(frozen=True, slots=True)
 class Between:
-    """Summary of the worlds in which contact is proven unavoidable, but an impact is not proven unavoidable: share and
-    best known harm.
-    """
+    """Summary of the worlds in which contact is proven unavoidable, but an impact is not proven unavoidable."""
 
     rate: float  # share of all worlds
     mean_first: float | None  # mean best known first-impact harm; None if unknown in all of them
@@ -85,7 +75,7 @@ class Between:
 
     @property
     def text(self) -> str:
-        """Sentence about the worlds with unavoidable contact but no proven impact; empty if no such world exists."""
+        """Sentence about these worlds; empty if there are none."""
         if self.rate == 0.0:
             return ""
         text = f" In {100 * self.rate:.1f} % of the worlds, contact is proven unavoidable but an impact is not."
@@ -98,15 +88,9 @@ class Between:
 
     @classmethod
     def of(cls, contact: Bools, impact: Bools, first: Floats, total: Floats) -> Between:
-        """Return the summary of the worlds in which contact is proven unavoidable, but an impact is not proven
-        unavoidable.
+        """Return the summary of the worlds in which ``contact`` [n] is proven unavoidable, but not ``impact`` [n].
 
-        Args:
-            contact: [n] True if contact is proven unavoidable.
-            impact: [n] True if an impact is proven unavoidable.
-            first: [n] best known first-impact harm, m2/s2; NaN if unknown.
-            total: [n] best known total harm, m2/s2; NaN if unknown.
-
+        ``first`` and ``total`` [n] are the best known harm, m2/s2; NaN if unknown.
         """
         there = contact & ~impact
         known = there & np.isfinite(first) & np.isfinite(total)
@@ -131,11 +115,10 @@ KNOWN_OF_WORLDS: dict[str, Callable[[Outcome, Regrets], Values | None]] = {
 
 
 def limits_of(evaluation: Evaluation) -> Limits | Unproven:
-    """Return what is proven about each world, and the best harm that was known before the agents of this evaluation
-    drive.
+    """Return what is proven about each world, and the best harm known before the agents of this evaluation drive.
 
-    Returns ``Unproven`` if the proofs do not cover the evaluation. The result is computed once per evaluation. Warns
-    with ``IncompleteTable`` if a table contains the best known harm of only some of the worlds.
+    Returns ``Unproven`` if the proofs do not cover the evaluation. Warns with ``IncompleteTable`` if a table contains
+    the best known harm of only some of the worlds.
     """
     return evaluation.once(_limits)
 

@@ -28,12 +28,11 @@ def shipped_tables() -> tuple[BestHarmTable, ...]:
 
 
 def best_known(worlds: Worlds, task: Task) -> dict[HarmCount, Floats]:
-    """Return the best known harm of worlds at t = 0 from the shipped tables: an array [n] in m2/s2 for each harm count.
+    """Return the best known harm of worlds at t = 0 from the shipped tables, for each harm count, [n] m2/s2.
 
-    The best known harm of a world is NaN if no shipped table contains the world. The tables identify a world by a hash
-    of everything that affects its harm: state, parameters, scripts of the other vehicles, time step, horizon and
-    controlled vehicles. Raises ``InvalidInput`` if a script's command is not fixed at the alert. ``task`` names the
-    scenario and the controlled vehicles.
+    The harm is NaN if no shipped table contains the world. The tables identify a world by a hash of everything that
+    affects its harm: state, parameters, scripts of the other vehicles, time step, horizon and controlled vehicles.
+    Raises ``InvalidInput`` if a script's command is not fixed at the alert.
     """
     identity = task_problem(worlds, task).identity
     known = {harm_count: np.full(worlds.n, np.nan) for harm_count in HARM_COUNTS}
@@ -43,11 +42,9 @@ def best_known(worlds: Worlds, task: Task) -> dict[HarmCount, Floats]:
 
 
 def shipped_profiles(problem: ProfileProblem, harm_count: HarmCount) -> tuple[Profiles, Bools]:
-    """Return the stored profile of each of the n worlds of ``problem``, and a mask [n]: True for worlds that have a
-    stored profile.
+    """Return the stored profile of each world of ``problem``, and a mask [n]: True for worlds with a stored profile.
 
-    ``problem`` has one controlled vehicle. ``harm_count`` is the harm count that the profiles minimise: ``first`` or
-    ``total``.
+    ``problem`` has one controlled vehicle.
     """
     last_step, least = problem.last_step, np.full(problem.n, np.inf)
     profiles, known = Profiles(last_step[:, np.newaxis].copy(), np.zeros((problem.n, 1, 1))), np.zeros(problem.n, bool)
@@ -66,8 +63,7 @@ def shipped_profiles(problem: ProfileProblem, harm_count: HarmCount) -> tuple[Pr
 def make_best_harm(argument: str | None, settings: AgentSettings) -> Agent:
     """Return the agent ``best_harm`` or ``best_harm:CANDIDATES``, which drives the shipped profile of each world.
 
-    In a world without a shipped profile, the agent searches for a profile at the alert. ``argument`` is the number of
-    profiles that this search simulates, as text; None: the default number.
+    In a world without a shipped profile, the agent searches at the alert.
     """
     return BestHarm.make(argument, settings, shipped_profiles)
 

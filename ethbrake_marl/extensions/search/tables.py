@@ -61,7 +61,7 @@ class BestHarmTable:
 
     @classmethod
     def load(cls, path: Path) -> BestHarmTable:
-        """Return the table that is stored in the file ``path``.
+        """Read a table from the file ``path``.
 
         Raises ``InvalidInput`` if the file does not exist, and ``CorruptBundle`` if the file is not a table. The names,
         types, shapes and sizes of the arrays are checked before the file is unpacked. The stored harm is not checked by
@@ -85,7 +85,7 @@ class BestHarmTable:
         return cls(arrays["identity"].astype(np.uint64), best, header)
 
     def save(self, path: Path) -> None:
-        """Write the table to the file ``path``. If writing fails, the old file stays unchanged."""
+        """Write the table to the file ``path``; if writing fails, the old file stays unchanged."""
         write_file(path, table_bytes(self))
 
     @property
@@ -94,7 +94,7 @@ class BestHarmTable:
         return dict(self.header.get(LEFT_OUT, {}))
 
     def rows(self, identity: UInt64s) -> NDArray[np.int64]:
-        """Return the index in the table of each world with hash ``identity`` [m]; -1 if the table lacks the world."""
+        """Return the index in the table of each world with hash ``identity`` [m], [m]; -1: not in the table."""
         order = np.argsort(self.identity, kind="stable")
         place = np.minimum(np.searchsorted(self.identity[order], identity), len(order) - 1)
         rows = order[place]
@@ -118,10 +118,7 @@ class BestHarmTable:
                 raise InvalidInput(f"table of best known harm, {harm_count}: {error}") from None
 
     def harm(self, identity: UInt64s, harm_count: HarmCount) -> Floats:
-        """Return the best known harm of each world with hash ``identity`` [m], as an array [m] in m2/s2.
-
-        The harm is NaN if the table does not contain the world.
-        """
+        """Return the best known harm of each world with hash ``identity`` [m], [m] m2/s2; NaN: not in the table."""
         rows = self.rows(identity)
         if harm_count not in self.best:
             return np.full(rows.shape, np.nan)
@@ -130,13 +127,8 @@ class BestHarmTable:
     def profiles(self, identity: UInt64s, harm_count: HarmCount, last_step: Ints) -> tuple[Profiles, Bools]:
         """Return the stored profile of each world, [m], and a mask [m]: True for worlds that have a stored profile.
 
-        A world without a stored profile gets the profile of coasting.
-
-        Args:
-            identity: hash of each world, [m].
-            harm_count: harm count that the profiles minimise, ``first`` or ``total``.
-            last_step: number of time steps of each world's episode, [m].
-
+        A world without a stored profile gets the profile of coasting. ``identity`` [m] are the hashes of the worlds,
+        and ``last_step`` [m] the number of time steps of each world's episode.
         """
         rows = self.rows(identity)
         if harm_count not in self.best:
@@ -151,19 +143,14 @@ class BestHarmTable:
     def improved(
         self, identity: UInt64s, harm_count: HarmCount, harm: Floats, profiles: Profiles | None = None
     ) -> tuple[BestHarmTable, Bools]:
-        """Return a copy of the table in which smaller values from ``harm`` replace the old values, and a mask [m]: True
-        for the changed worlds.
+        """Return a copy of the table with the smaller values from ``harm``, and a mask [m] of the changed worlds.
 
-        A value in ``harm`` replaces the value in the table only if the value in ``harm`` is smaller by more than
-        ``TOLERANCE``. Worlds that are not in the table are ignored. Raises ``InvalidInput`` if the table does not
-        contain ``harm_count``, or if ``harm`` and ``identity`` have different shapes.
+        A value in ``harm`` replaces the value in the table only if it is smaller by more than ``TOLERANCE``. Worlds
+        that are not in the table are ignored. Raises ``InvalidInput`` if the table does not contain ``harm_count``, or
+        if ``harm`` and ``identity`` have different shapes.
 
-        Args:
-            identity: hash of each world, [m].
-            harm_count: harm count of ``harm``: ``first`` or ``total``.
-            harm: harm of each world, [m] m2/s2.
-            profiles: command profiles with the harm ``harm``, [m]; None: the table gets the harm without a profile.
-
+        ``identity`` [m] are the hashes of the worlds, ``harm`` [m] is their harm in m2/s2, and ``profiles`` [m] are
+        command profiles with this harm; None: the table gets the harm without profiles.
         """
         if harm_count not in self.best:
             raise InvalidInput(
@@ -192,8 +179,8 @@ class BestHarmTable:
 def table_bytes(table: BestHarmTable) -> bytes:
     """Return the content of a table file: a compressed .npz without pickles.
 
-    The unused phases of a profile are left out. The file first contains the first byte of every command, then the
-    second byte of every command, and so on, because the file is then smaller.
+    The unused phases of a profile are left out. The file contains the first byte of every command, then the second byte
+    of every command, and so on, because it is smaller that way.
     """
     arrays: dict[str, NDArray[Any]] = {
         "header": np.frombuffer(json.dumps({"format": TABLE_FORMAT, **table.header}).encode(), np.uint8),
@@ -216,8 +203,7 @@ def table_bytes(table: BestHarmTable) -> bytes:
 def _rows(harm_count: HarmCount) -> list[ArrayRow]:
     """Return the name, type and shape of each array that a table file contains for one harm count.
 
-    In the shapes, n is the number of worlds, m the number of phases of all worlds together, and C the number of
-    controlled vehicles.
+    n is the number of worlds, m the number of phases of all worlds together, C the number of controlled vehicles.
     """
     return [
         ArrayRow("header", "|u1", ("bytes",)),
@@ -246,10 +232,7 @@ class _Header(BaseModel):
 
 
 def _read_best(arrays: Mapping[str, NDArray[Any]], harm_count: HarmCount) -> BestKnown:
-    """Return the harm and the profiles of one harm count from the arrays of a table file.
-
-    Raises ``ValueError`` if a number in the file is not possible, for instance a negative harm.
-    """
+    """Return the harm and the profiles of one harm count; raise ``ValueError`` for an impossible number."""
     harm = arrays[f"{harm_count}_harm"].astype(np.float64)
     used = arrays[f"{harm_count}_phases"].astype(np.int64)
     planes = arrays[f"{harm_count}_commands"]
@@ -288,8 +271,5 @@ def _read_best(arrays: Mapping[str, NDArray[Any]], harm_count: HarmCount) -> Bes
 
 
 def _used(ends: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the number of phases that each profile uses, [n]; 0 for a world without a profile.
-
-    ``ends`` [n, K] are the time steps at which the phases of each profile end.
-    """
+    """Return the number of phases that each profile uses, [n]; 0 for a world without a profile. ``ends`` is [n, K]."""
     return np.where(ends[:, -1] > 0, np.argmax(ends == ends[:, -1:], axis=1) + 1, 0)

@@ -1,9 +1,8 @@
 """Draw random templates of commands, and return the best template of each world.
 
 A *template* is a random braking profile of three phases: one command, then another command for a short while, then full
-braking. From templates a policy can learn different ways to drive in a world. The best template is not improved by a
-search: a random template with little harm tolerates small errors of the commands, so a policy can imitate this
-template.
+braking. From templates a policy can learn different ways to drive. The best template is not improved by a search: a
+random template with little harm tolerates small errors of the commands, so a policy can imitate it.
 """
 
 from __future__ import annotations
@@ -19,19 +18,13 @@ from ethbrake_marl.physics.state import Floats, Ints, UInt64s
 
 
 def best_templates(problem: ProfileProblem, bound: Floats, *, number: int, seed: int = 0) -> tuple[Floats, Ints]:
-    """Draw random templates (braking profiles) in each world, and return the template with the least harm.
+    """Draw random templates in each world, and return the template with the least harm.
 
-    Returns, for each world, the commands of the template with the least harm, [n, T] m/s2, and the number of steps of
-    the episode under these commands, [n]. The number of steps is 0 if no template does less harm than ``bound``. The
-    result for a world does not depend on the other worlds. Raises ``InvalidInput`` if several vehicles are controlled,
-    or if ``number`` is below 1.
+    Returns the commands of this template, [n, T] m/s2, and the number of steps of the episode under these commands,
+    [n]. The number of steps is 0 if no template does less harm than ``bound``. The result for a world does not depend
+    on the other worlds. Raises ``InvalidInput`` if several vehicles are controlled, or if ``number`` is below 1.
 
-    Args:
-        problem: n worlds, with the commands of the other vehicles and the harm to minimise.
-        bound: a template with at least this harm is rejected, [n] m2/s2.
-        number: number of templates that are drawn in each world.
-        seed: seed with which the templates are drawn.
-
+    A template whose harm is at least ``bound`` [n] (m2/s2) is rejected. ``number`` templates are drawn in each world.
     """
     check_whole_number("templates", number, 1)
     if len(problem.vehicles) != 1:
@@ -49,11 +42,9 @@ def best_templates(problem: ProfileProblem, bound: Floats, *, number: int, seed:
 def _best_templates(
     problem: ProfileProblem, random: UInt64s, bound: Floats, number: int, commands: Floats, steps: Ints
 ) -> None:
-    """Write the template with the least harm in each world to ``commands`` [n, T].
+    """Write the commands and the number of steps of each world's best template to ``commands`` and ``steps``.
 
-    The number of steps of the episode under this template is written to ``steps`` [n]. ``random`` [n] is the initial
-    state of each world's random stream. A template whose harm is at least ``bound`` [n] is rejected. ``number``
-    templates are drawn in each world.
+    ``random`` [n] is the initial state of each world's random stream.
     """
     start, T, S = problem.start, commands.shape[1], problem.start.shape[1]
     best, room = Plan(np.zeros(T), np.zeros((T + 1, S))), Plan(np.zeros(T), np.zeros((T + 1, S)))

@@ -17,12 +17,11 @@ _SILENT = ("ray.tune.tune", "ray.tune.analysis.experiment_analysis")  # loggers 
 def connected(address: str, cores: int | None) -> Iterator[None]:
     """Context manager that connects to Ray while its block runs, and disconnects afterwards, also after an error.
 
-    Inside the block, the signal SIGTERM acts like Ctrl-C. After the block, SIGTERM and Ctrl-C act as they did before
-    the block.
+    Inside the block, the signal SIGTERM acts like Ctrl-C; after the block, both signals act as before.
 
     Args:
-        address: address of a running cluster, or ``local`` to start Ray on this machine.
-        cores: number of cores that Ray may use if it is started on this machine; None: all cores.
+        address: address of a running cluster, or ``local``: start Ray on this machine.
+        cores: number of cores of a local Ray; None: all cores.
 
     """
     with own_signals():

@@ -333,8 +333,7 @@ def falsify_command(
 def _spelled(**options: Any) -> str:
     """Return the command line ``ethbrake study falsify`` with these options.
 
-    Options with the value None are omitted. If the value of an option is a tuple, the command line repeats the option
-    for each element of the tuple.
+    Options with the value None are omitted. An option whose value is a tuple is repeated for each element.
     """
     words = ["ethbrake", "study", "falsify"]
     for option, value in options.items():
@@ -347,8 +346,8 @@ def _spelled(**options: Any) -> str:
 def _drive_again(out: Out, file: Path, agent: str | None) -> None:
     """Let an agent drive the worlds in a file of ``study falsify``, and compare the scores with those in the file.
 
-    ``agent`` is the agent that drives the worlds; None: the agent that the file names. The exit status is 1 if the new
-    score of at least one world is larger than its score in the file, or if the agent cannot drive at least one world.
+    If ``agent`` is None, the agent that the file names drives. The exit status is 1 if the new score of at least one
+    world is larger than its score in the file, or if the agent cannot drive at least one world.
     """
     import numpy as np
 

@@ -56,7 +56,7 @@ def search(
         budget: number of points to try.
         seed: seed of the random numbers.
         adaptive: True: search around the best points; False: all points are uniform random points.
-        on_round: function that is called after each round with the number of points tried so far and ``budget``.
+        on_round: called after each round with the number of points tried so far and ``budget``.
 
     """
     check_whole_number("search: budget", budget, 1)
@@ -81,7 +81,7 @@ def search(
 def _spread(dimensions: int, seed: int) -> Iterator[Floats]:
     """Yield, without end, points [d] that are spread evenly over the unit cube (scrambled Sobol points).
 
-    ``dimensions`` is d. The same seed gives the same points.
+    The same seed gives the same points.
     """
     from scipy.stats import qmc  # imported here, because it takes a second to load
 
@@ -93,10 +93,9 @@ def _spread(dimensions: int, seed: int) -> Iterator[Floats]:
 def far_apart(scored: Scored, count: int) -> Ints:
     """Choose at most ``count`` points of ``scored`` that have high scores and are far apart.
 
-    Return the row numbers of the chosen points in ``scored``, highest score first.
+    Return their row numbers, highest score first.
 
-    Any two of the chosen points differ by at least 0.1 in some coordinate. Points whose score is not finite are never
-    chosen.
+    Any two of them differ by at least 0.1 in some coordinate. Points whose score is not finite are never chosen.
     """
     order = np.argsort(-scored.scores, kind="stable")
     order = order[np.isfinite(scored.scores[order])]

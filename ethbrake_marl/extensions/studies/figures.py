@@ -49,9 +49,9 @@ def is_done(job: TrainingJob) -> bool:
 def finish(job: TrainingJob, stop_at: StopAt | None = None) -> bool:
     """Start or continue the training run of ``job`` until it ends. Return False if ``stop_at`` stopped the run early.
 
-    ``stop_at`` is a function that is called with each evaluation; it returns a reason to stop, or None to continue.
-    Raises the exceptions of ``train`` and ``resume``, ``InvalidInput`` if the folder contains a training run with other
-    settings, and ``BlockingIOError`` if another process has just begun the same training run.
+    ``stop_at`` is called with each evaluation; it returns a reason to stop, or None to continue. Raises the exceptions
+    of ``train`` and ``resume``, ``InvalidInput`` if the folder contains a training run with other settings, and
+    ``BlockingIOError`` if another process has just begun the same training run.
     """
     run = RunDirectory(job.folder)
     if run.status.is_file():
@@ -66,9 +66,9 @@ def finish(job: TrainingJob, stop_at: StopAt | None = None) -> bool:
 
 
 def evaluations_of(job: TrainingJob) -> list[dict[str, float]]:
-    """Return the evaluations so far of the training run ``job``, each as a dictionary with ``steps`` and the measures.
+    """Return the evaluations of ``job`` so far, each as a dictionary with ``steps`` and the measures.
 
-    Raises ``InvalidInput`` if the file ``progress.csv`` in the folder of ``job`` is damaged.
+    Raises ``InvalidInput`` if the file ``progress.csv`` is damaged.
     """
     run, names = RunDirectory(job.folder), (*_MEASURED, RunDirectory.OBJECTIVE)
     try:
@@ -89,8 +89,8 @@ def evaluations_of(job: TrainingJob) -> list[dict[str, float]]:
 def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     """Return the values for the table's row of ``job``, by column, computed from the ``evaluations`` so far.
 
-    The columns are ``harm`` (the least harm in any of the evaluations) and all ``FIGURES`` except ``policy_sha256``.
-    Example: ``{"harm": 7.1, "steps": 400000, "total_harm": 9.8, ...}``.
+    The columns are ``harm`` (the least harm in any evaluation) and all ``FIGURES`` except ``policy_sha256``. Example:
+    ``{"harm": 7.1, "steps": 400000, "total_harm": 9.8, ...}``.
     """
     harm = RunDirectory.chosen_by(evaluations, job.training.recipe.reward.harm_count)
     lowest, last = min(evaluations, key=lambda each: each[harm]), evaluations[-1]
@@ -106,7 +106,7 @@ def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, An
 def final_figures(job: TrainingJob) -> dict[str, Any]:
     """Return the values for the table's row of the finished ``job``, by column: ``harm`` and all ``FIGURES``.
 
-    Raises ``InvalidInput`` if a file in the folder of ``job`` is damaged.
+    Raises ``InvalidInput`` if a file of the run is damaged.
     """
     run, evaluations = RunDirectory(job.folder), evaluations_of(job)
     if not evaluations:

@@ -22,17 +22,17 @@ class StudyFolder:
     """Folder for the results of a study. After an interruption, the same command continues the work in this folder.
 
     Args:
-        path: path of the folder, which the method ``work`` creates if necessary.
+        path: folder, which ``work`` creates if necessary.
         kind: words for the content of the folder in messages, such as ``a sweep``.
-        question: all settings and software versions that the results depend on, as plain data. If the folder already
-            stores other settings, ``check`` and ``work`` raise ``InvalidInput``. If ``question`` is None, the folder
-            stores no common settings, because each result in the folder stores its own settings.
-        record: name of the file in the folder that stores ``question``.
-        more: additional entries for the file ``record``; they are stored, but never compared.
-        advice: last words of an error message about the folder, which say what the user can do.
-        beside: names of the files that an existing folder without the file ``record`` may contain. If the folder
-            contains any other file, ``check`` raises an error. If ``beside`` is None, every file is allowed.
-        writes: names of those files in the folder that the study will overwrite; these files must be writable.
+        question: all settings and software versions on which the results depend, as plain data. If the folder stores
+            other settings, ``check`` and ``work`` raise ``InvalidInput``. None: the folder stores no common settings,
+            because each result stores its own.
+        record: name of the file that stores ``question``.
+        more: additional entries of the file ``record``, which are never compared.
+        advice: last words of an error message, which say what the user can do.
+        beside: names of the only files that an existing folder without the file ``record`` may contain; None: any
+            files.
+        writes: names of the files that the study will overwrite; they must be writable.
 
     """
 
@@ -55,9 +55,9 @@ class StudyFolder:
     def check(self) -> bool:
         """Check that the study may use this folder, and return whether the file ``record`` must still be written.
 
-        The method writes nothing. Raises ``InvalidInput`` if the path is not a folder, if the folder or a file in
-        ``writes`` is not writable, or if other settings are stored in the folder. Raises ``AlreadyExists`` if the
-        folder contains the files of another command.
+        The method writes nothing. Raises ``InvalidInput`` if the path is not a folder, if it or a file in ``writes`` is
+        not writable, or if the folder stores other settings. Raises ``AlreadyExists`` if the folder contains the files
+        of another command.
         """
         check_folder(self.path, self._writes, force=True)
         if self._question is None:
@@ -108,8 +108,7 @@ class StudyFolder:
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> list[str]:
     """Return the differences between the settings ``before`` and ``now`` as texts: ``["seeds 2, now 5", "recipes"]``.
 
-    If the value of a setting is a list or a mapping, the text contains only the name of the setting. ``inside`` is put
-    before the name of each setting.
+    If a value is a list or a mapping, the text is only the name of the setting. ``inside`` is put before each name.
     """
     differences: list[str] = []
     for name in dict.fromkeys([*now, *before]):

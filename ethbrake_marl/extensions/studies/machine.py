@@ -13,7 +13,7 @@ import ethbrake_marl as eb
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """Processor, load and software versions of this machine, which are printed with every measured time."""
+    """Processor, load and software versions of this machine."""
 
     processor: str  # model of the processor
     cores_usable: int  # number of cores that this process may use
@@ -25,7 +25,7 @@ class Machine:
     ethbrake_marl: str  # version of this package
 
     def __str__(self) -> str:
-        """Return the description of the machine in one line, for captions."""
+        """Return one line, for captions."""
         return (
             f"{self.processor}, {self.cores_usable} of {self.cores} cores usable, load {self.load:.1f};"
             f" Python {self.python}, numpy {self.numpy}, numba {self.numba}, ethbrake_marl {self.ethbrake_marl}"
@@ -33,7 +33,6 @@ class Machine:
 
 
 def this_machine() -> Machine:
-    """Return the processor, number of cores, present load and software versions of this machine."""
     information = Path("/proc/cpuinfo")
     lines = information.read_text("utf-8").splitlines() if information.is_file() else []
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

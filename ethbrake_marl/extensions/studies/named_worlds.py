@@ -63,7 +63,7 @@ class NamedWorlds(FileModel):
     def of(cls, scenario: Scenario, /, **fields: Any) -> NamedWorlds:
         """Return the content of a file of worlds that were drawn from ``scenario``.
 
-        ``fields`` contains every field of this class by name, except ``format``, ``version`` and ``scenario_sha256``.
+        ``fields`` are all fields of this class except ``format``, ``version`` and ``scenario_sha256``.
         """
         return cls(format="ethbrake-worlds", version=1, scenario_sha256=scenario_sha256(scenario), **fields)
 
@@ -82,7 +82,7 @@ class NamedWorlds(FileModel):
 
     @property
     def text(self) -> str:
-        """YAML text of the file of named worlds. Reading this text gives the same worlds, bit for bit."""
+        """YAML text of the file. Reading this text gives the same worlds, bit for bit."""
         head = self.model_dump(exclude={"worlds"}, exclude_none=True)
         lines = [f"{key}: {flow_text(value)}" for key, value in head.items() if value != []]
         lines.append("worlds:")
@@ -92,14 +92,10 @@ class NamedWorlds(FileModel):
         return "\n".join(lines) + "\n"
 
     def worlds_of(self, scenario: Scenario, where: str) -> Worlds:
-        """Return the worlds of the file, in their states at the alert.
+        """Return the worlds of the file at the alert.
 
-        Raises ``InvalidInput`` if the content of ``scenario`` has changed since the search found the worlds.
-
-        Args:
-            scenario: scenario from which the worlds were drawn, with its present content.
-            where: path of the file, for error messages.
-
+        Raises ``InvalidInput`` if the content of ``scenario`` has changed since the search. ``where`` is the path of
+        the file, for messages.
         """
         if scenario_sha256(scenario) != self.scenario_sha256:
             raise InvalidInput(

@@ -29,14 +29,13 @@ Proposal = Mapping[str, Any]  # key -> value in Optuna's form
 class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
     """Search algorithm of Ray Tune that asks Optuna for proposals, and stores each proposal in a file.
 
-    A *proposal* contains the values to try in one trial, by key, in the form in which Optuna stores values. The
-    configuration of a trial consists of its number, ``trial``, and its proposal, ``values``.
+    A *proposal* contains the values to try in one trial, by key, as Optuna stores values.
 
     Args:
         file: JSON file of the proposals; it is created with the first proposal.
-        known: proposals that the file already contains, in order; trial number k gets proposal number k of this list.
-        space: dictionary from each searched key to Optuna's distribution of its values.
-        sampler: function that is called with the number of a trial, and returns the Optuna sampler for this trial.
+        known: proposals that the file already contains; trial number k gets proposal number k.
+        space: Optuna's distribution of each searched key.
+        sampler: function from the number of a trial to its Optuna sampler.
         first: proposal of the first trial, used only if ``known`` is empty; None: Optuna makes the first proposal.
 
     """
@@ -63,7 +62,7 @@ class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
     def suggest(self, trial_id: str) -> dict[str, Any] | None:
         """Return the configuration of the next trial: ``{"trial": number, "values": proposal}``.
 
-        A new proposal is stored in the file. ``trial_id`` is Ray's name of the trial.
+        A new proposal is stored in the file.
         """
         values, number = super().suggest(trial_id), self._asked
         if number == len(self.known):

@@ -31,14 +31,8 @@ class StudyFile(FileModel):
     def read_as(cls, path: str | Path, needed: str) -> Self:
         """Read and check a YAML file with the content of this class.
 
-        Raises ``InvalidInput`` if the content is invalid; the message names the file, the line, the key and the wrong
-        value, and says what would be right.
-
-        Args:
-            path: path of the file.
-            needed: words that describe the right content in an error message, such as ``with a grid or a list of
-                jobs``.
-
+        Raises ``InvalidInput``, which names the file, the line, the key and the wrong value, and says what would be
+        right. ``needed`` are words for the right content, such as ``with a grid or a list of jobs``.
         """
         document = read_yaml(path)
         wording = Wording(cls, "this key is required; docs/extensions/studies.md shows an example")
@@ -50,8 +44,8 @@ class StudyFile(FileModel):
 def load_parts(scenario: str, recipe: str, settings: Sequence[str]) -> tuple[Scenario, TrainingRecipe]:
     """Load a scenario and a recipe by name or path, and apply the settings ``KEY=VALUE`` to them.
 
-    A setting changes the scenario if the scenario has the key, and the recipe if the recipe has the key. Raises
-    ``InvalidInput`` if a name or key is unknown, or if a value is not allowed.
+    A setting changes the scenario or the recipe, whichever has the key. Raises ``InvalidInput`` if a name or key is
+    unknown, or if a value is not allowed.
     """
     loaded = load_recipe(recipe)
     changes = read_settings(settings, [loaded])
@@ -59,9 +53,9 @@ def load_parts(scenario: str, recipe: str, settings: Sequence[str]) -> tuple[Sce
 
 
 def refused_part(scenario: str, recipe: str, settings: Sequence[str]) -> str:
-    """Find the argument that makes ``load_parts`` fail, and return ``recipe``, ``scenario`` or the key of a setting.
+    """Return the argument that makes ``load_parts`` fail: ``recipe``, ``scenario`` or the key of a setting.
 
-    Returns an empty text if every argument is valid by itself, but the arguments do not fit together.
+    The text is empty if every argument is valid by itself, but the arguments do not fit together.
     """
     tried: dict[str, Callable[[], object]] = {
         "recipe": partial(load_recipe, recipe),
@@ -77,5 +71,5 @@ def refused_part(scenario: str, recipe: str, settings: Sequence[str]) -> str:
 
 
 def texts_of(values: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return one text ``KEY=VALUE``, as for the option ``--set``, for each entry of ``values``."""
+    """Return each entry of ``values`` as a text ``KEY=VALUE``, as for the option ``--set``."""
     return tuple(f"{key}={flow_text(value)}" for key, value in values.items())

@@ -1,7 +1,8 @@
-"""A sweep: read a list of training runs from a YAML file, do these runs on Ray Tune, and write one table of results.
+"""A sweep: read a list of training runs (jobs) from a YAML file, do them on Ray Tune, and write one table of results.
 
-The table of results is computed only from the folders of the training runs. The table is the same, byte for byte, in
-whatever order and on whatever computers the training runs are done, and however often they are interrupted.
+The table is computed only from the folders of the training runs. It is the same, byte for byte, in whatever order and
+on whatever computers the training runs are done, and however often they are interrupted. In methods with an argument
+``path``, this is the sweep's folder.
 """
 
 from __future__ import annotations
@@ -40,8 +41,7 @@ _GRID: YamlPath = ("grid",)
 class _OneOrMore:
     """Annotation of a field that accepts a list or, instead of a list with one entry, this entry itself.
 
-    The annotation ``_OneOrMore`` changes only the JSON Schema. The validator ``Grid._one_is_a_list_of_one`` turns a
-    single entry into a list.
+    The annotation changes only the JSON Schema; ``Grid._one_is_a_list_of_one`` turns a single entry into a list.
     """
 
     @classmethod
@@ -68,7 +68,7 @@ _Settings = Annotated[dict[str, Any], AfterValidator(_check_keys)]
 
 
 class Request(NamedTuple):
-    """One training run of a sweep, as requested in the file of the sweep."""
+    """One job, as requested in the file of the sweep."""
 
     path: YamlPath  # place of the training in the file: ``("grid",)``, or ``("jobs", k)`` for a listed job
     scenario: str  # name or path of the scenario
@@ -77,7 +77,7 @@ class Request(NamedTuple):
     seed: int  # seed of the training
 
     def __str__(self) -> str:
-        """Return the job as text, for messages: its place in the file, scenario, recipe, seed and settings."""
+        """Return the place in the file, scenario, recipe, seed and settings, for messages."""
         settings = f", {', '.join(self.settings)}" if self.settings else ""
         return f"{_place(self.path)} ({self.scenario}, {self.recipe}, seed {self.seed}{settings})"
 
@@ -119,7 +119,7 @@ class Grid(FileModel):
 
     @property
     def seeds(self) -> Sequence[int]:
-        """All seeds of the training runs: the listed seeds, or every seed in the range."""
+        """All seeds of the training runs."""
         if isinstance(self.seed, SeedRange):
             return range(self.seed.first, self.seed.first + self.seed.count)
         return self.seed
@@ -146,17 +146,12 @@ class SweepFile(StudyFile):
     )
 
     def size(self) -> int:
-        """Return the number of jobs that the file requests."""
         grid = self.grid
         lists = [] if grid is None else [grid.scenario, grid.recipe, grid.seeds, *grid.settings.values()]
         return (math.prod(map(len, lists)) if lists else 0) + len(self.jobs)
 
     def requests(self) -> Iterator[Request]:
-        """Yield all jobs: first the jobs of the grid, then the jobs of the list ``jobs``.
-
-        The jobs of the grid are ordered by seed: all jobs with the first seed come before all jobs with the second
-        seed.
-        """
+        """Yield all jobs: first the jobs of the grid, ordered by seed, then the jobs of the list ``jobs``."""
         if (grid := self.grid) is not None:
             changes = [
                 self._texts(dict(zip(grid.settings, values, strict=True)), _GRID)
@@ -171,8 +166,7 @@ class SweepFile(StudyFile):
     def where(self, asked: Request, part: str = "") -> str:
         """Return the line that requests a job, as text for messages: ``sweep.yaml, line 7``.
 
-        If ``part`` is ``recipe``, ``scenario`` or the key of a setting, the text names the line with this entry of the
-        job.
+        If ``part`` is ``recipe``, ``scenario`` or the key of a setting, the text names the line of this entry.
         """
         path = (*asked.path, "set", part) if part else asked.path
         if part in self.settings:
@@ -199,7 +193,7 @@ TABLE, FAILURES, RUNS = "results.csv", "failures.csv", "runs"  # names inside th
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One job (one training run) of a sweep, checked and loaded. The results of the job become one row of the table."""
+    """One job, checked and loaded. Its results become one row of the table."""
 
     asked: Request  # job as requested in the file
     identity: str  # SHA-256 of everything that affects the training (``Training.identity``)
@@ -208,12 +202,12 @@ class Row:
 
     @property
     def settings(self) -> dict[str, str]:
-        """Settings of the job, as a dictionary from key to value, both as text."""
+        """Settings of the job: key -> value, both as text."""
         return dict(text.split("=", 1) for text in self.asked.settings)
 
     @property
     def about(self) -> dict[str, Any]:
-        """Values in the job's row of the table that describe the job, by column, such as ``scenario`` and ``seed``."""
+        """Columns of the table that describe the job, such as ``scenario`` and ``seed``."""
         return {
             "hash": self.identity,
             "scenario": self.asked.scenario,
@@ -227,13 +221,13 @@ class Row:
 
 @dataclass(frozen=True)
 class SweepPlan:
-    """All jobs of a sweep, checked and loaded, in the order of the sweep's table."""
+    """All jobs of a sweep, checked and loaded, in the order of the table."""
 
     rows: Sequence[Row]  # the jobs
 
     @staticmethod
     def json_schema() -> dict[str, Any]:
-        """Return the JSON Schema of a sweep file, for editors that complete and check YAML."""
+        """Return the JSON Schema of a sweep file, for editors."""
         schema = SweepFile.model_json_schema(schema_generator=FileSchema)
         return FileSchema.publish(
             {**schema, "title": "Sweep", "anyOf": [{"required": ["grid"]}, {"required": ["jobs"]}]}
@@ -244,8 +238,7 @@ class SweepPlan:
         """Read the file of a sweep, and load the scenario and the recipe of every job.
 
         Raises ``InvalidInput``, which names the file, the line and the job, if a scenario, a recipe or a setting is
-        unknown, if the scenario, recipe and settings of a job do not fit together, or if two jobs request the same
-        training run.
+        unknown, if those of a job do not fit together, or if two jobs request the same training run.
         """
         file = SweepFile.read_as(path, "with a grid or a list of jobs")
         if not 1 <= file.size() <= MOST_JOBS:
@@ -279,27 +272,24 @@ class SweepPlan:
 
     @staticmethod
     def folder(path: Path) -> StudyFolder:
-        """Return a ``StudyFolder`` that checks and locks the folder ``path`` of a sweep.
-
-        The ``StudyFolder`` compares no settings, because the folder of each job stores the settings of this job.
-        """
+        """Return a ``StudyFolder``, which compares no settings: the folder of each job stores its own settings."""
         return StudyFolder(path, "a sweep", writes=(TABLE, FAILURES))
 
     @staticmethod
     def job(row: Row, path: Path) -> TrainingJob:
-        """Return the training run of the job ``row``, with its own folder inside the sweep's folder ``path``."""
+        """Return the training run of the job ``row``, with its folder."""
         training = Training.of(row.first.recipe, row.first.scenario, seed=row.asked.seed)
         return TrainingJob(training, path / RUNS / row.name, row.asked.settings)
 
     def train(self, row: Row, path: Path) -> None:
-        """Train the job ``row`` in the sweep's folder ``path`` to its end, or continue it if it has begun."""
+        """Train a job to its end, or continue it if it has begun."""
         finish(self.job(row, path))
 
     def results(self, path: Path) -> dict[str, dict[str, Any]]:
-        """Return the results of the finished jobs in the sweep's folder ``path``, as a dictionary by name of the job.
+        """Return the results of the finished jobs, by name of the job.
 
-        The results of a job are the values in its row of the table, by column: ``harm`` and all of ``figures.FIGURES``.
-        Example: ``{"ppo-seed0": {"harm": 7.1, "steps": 400000, ...}}``.
+        The results are ``harm`` and all of ``figures.FIGURES``, by column of the table. Example: ``{"ppo-seed0":
+        {"harm": 7.1, "steps": 400000, ...}}``.
         """
         jobs = ((row.name, self.job(row, path)) for row in self.rows)
         return {name: final_figures(job) for name, job in jobs if is_done(job)}
@@ -307,7 +297,7 @@ class SweepPlan:
     def states(self, path: Path) -> list[dict[str, Any]]:
         """Return a dictionary for each job, with ``hash``, ``job`` (its name), ``set`` (its settings) and ``state``.
 
-        The state is ``new``, ``begun`` or ``finished``. ``path`` is the sweep's folder.
+        The state is ``new``, ``begun`` or ``finished``.
         """
         done = self.results(path)
         return [
@@ -323,9 +313,7 @@ class SweepPlan:
     def run(
         self, path: Path, *, jobs: int | None = None, ray: str = LOCAL, retries: int = 2, tell: OnProgress | None = None
     ) -> SweepResult:
-        """Run the unfinished jobs of the sweep, and write the tables of results and of failures.
-
-        Both tables are also written if Ctrl-C stops the run.
+        """Run the unfinished jobs, and write the tables of results and of failures, also if Ctrl-C stops the run.
 
         Raises ``InvalidInput`` if another process works in the folder, or if no cluster runs at the address ``ray``.
 
@@ -333,9 +321,8 @@ class SweepPlan:
             path: folder of all results; created if necessary.
             jobs: number of jobs that run at once; None: one for each core.
             ray: address of a Ray cluster; ``local``: Ray is started on this machine.
-            retries: number of times that a job is started again after its process has ended unexpectedly.
-            tell: function that is called with the number of jobs that have ended, and with the reason of each failure;
-                None: no reports.
+            retries: number of times that a job is started again after its process ended unexpectedly.
+            tell: called with the number of jobs that have ended, and with the reason of each failure.
 
         """
         with self.folder(path).work():
@@ -374,11 +361,7 @@ class SweepPlan:
     def _train(
         self, left: list[int], path: Path, jobs: int | None, ray: str, retries: int, tell: OnProgress | None
     ) -> dict[str, str]:
-        """Train jobs on Ray. Return a dictionary from the name of each failed job to the reason of its failure.
-
-        ``left`` are the indices in ``rows`` of the jobs to train. The docstring of ``run`` explains the other
-        arguments.
-        """
+        """Train the jobs with the indices ``left`` on Ray; return the reason of each failure, by name of the job."""
         with connected(ray, jobs):
             from ray import tune
 
@@ -400,7 +383,7 @@ class SweepPlan:
 
 @dataclass(frozen=True, slots=True)
 class SweepResult:
-    """Result of ``SweepPlan.run``: the file with the table of results, and the numbers of finished and failed jobs."""
+    """Result of ``SweepPlan.run``."""
 
     table: Path  # CSV file with a row for each finished job
     jobs: int  # number of all jobs
@@ -414,12 +397,5 @@ class SweepResult:
 
 
 def do_job(config: dict[str, Any], plan: SweepPlan, path: Path) -> None:
-    """Train one job in a worker process of Ray.
-
-    Args:
-        config: configuration of the job, ``{"job": index}``, with its index in ``plan.rows``.
-        plan: checked content of the sweep's file.
-        path: folder with all results of the sweep.
-
-    """
+    """Train one job in a worker process of Ray; ``config`` is ``{"job": index in plan.rows}``."""
     plan.train(plan.rows[config["job"]], path)

@@ -26,16 +26,11 @@ if TYPE_CHECKING:
 
 
 def train_all(trainings: Sequence[TrainingJob], jobs: int = 1, tell: OnProgress | None = None) -> bool:
-    """Start or continue every training run until it ends. Return False if a training run was stopped before its end.
+    """Start or continue every training run until it ends. Return False if one was stopped before its end.
 
-    The trained policies depend neither on ``jobs`` nor on interruptions. Before any run begins, raises the exceptions
-    of ``steps_left``. If a training run fails later, raises the exception of the first run that fails.
-
-    Args:
-        trainings: training runs, each with its folder.
-        jobs: number of training runs at the same time, each in a process of its own.
-        tell: function that is called with the progress; None: no reports.
-
+    ``jobs`` is the number of training runs at the same time, each in a process of its own. The trained policies depend
+    neither on ``jobs`` nor on interruptions. Before any run begins, raises the exceptions of ``steps_left``. If a
+    training run fails later, raises the exception of the first run that fails.
     """
     left = [training for training in trainings if training.steps_left()]
     if jobs == 1 or len(left) < 2:
@@ -85,16 +80,10 @@ class TrainingJob:
         return max(total - (steps if isinstance(steps, int) else 0), 1)
 
     def finish(self, tell: OnProgress | None = None, *, stop_at: StopAt | None = None) -> bool | None:
-        """Start or continue the training run until it ends.
+        """Start or continue the training run until it ends. Return True, or None if it was stopped early.
 
-        Return True if the run has finished, or None if the run was stopped early.
-
-        Raises the exceptions of ``train`` and ``resume``.
-
-        Args:
-            tell: function that is called with the progress; None: no reports.
-            stop_at: function that is called with each evaluation; it returns a reason to stop, or None to continue.
-
+        ``stop_at`` is called with each evaluation; it returns a reason to stop, or None to continue. Raises the
+        exceptions of ``train`` and ``resume``.
         """
         from ethbrake_marl.training.session import resume, train  # torch takes seconds to load
 
@@ -117,8 +106,7 @@ class TrainingJob:
     def time(self, sample: Sample | None = None) -> Timed:
         """Measure the time of a few updates of this training run, and the time in which its policies drive some worlds.
 
-        The policies drive at most 50 worlds of ``sample``. If ``sample`` is None, the policies drive the first 50
-        worlds of the list on which the recipe evaluates.
+        The policies drive at most 50 worlds of ``sample`` (None: of the list on which the recipe evaluates).
         """
         from ethbrake_marl.training.session import train
 
@@ -142,7 +130,7 @@ class TrainingJob:
             return Timed(self, decision_s, replace(self, folder=path).world_seconds(worlds))
 
     def world_seconds(self, sample: Sample) -> float:
-        """Return the time in s that the trained policies in ``folder`` need for one world of ``sample``."""
+        """Return the time in s that the trained policies need for one world of ``sample``."""
         team = {"team": load_team(self.folder, self.training.scenario)}
         drive = partial(evaluate, agents=team, scenario=self.training.scenario, aftermath=False)
         return Timed.each_s(sample.worlds, drive)
@@ -158,8 +146,7 @@ class Timed(NamedTuple):
     def seconds(self, steps: int) -> float:
         """Estimate how long (s) this training run takes for ``steps`` decisions, including its evaluations.
 
-        A training run evaluates its policies at the start, every few updates and at the end, on the recipe's list of
-        worlds.
+        Policies are evaluated at the start, every few updates and at the end, on the recipe's list of worlds.
         """
         recipe = self.job.training.recipe
         times = recipe.total_steps // self.job.per_update // recipe.evaluation.every_updates + 2

@@ -36,18 +36,18 @@ def run_trials(
 ) -> list[dict[str, Any]]:
     """Run trials on Ray Tune. Return the last report of each trial that began, in the order in which the trials began.
 
-    A report is the dictionary that ``work`` passes to ``tune.report``, and to which Ray adds entries. If the trial
-    failed, the entry ``reason`` of the report says why. The entry ``done`` of the report is True if the trial has
-    ended. Ctrl-C stops all trials. The caller must connect to Ray first (see ``cluster.connected``).
+    A report is the dictionary that ``work`` passes to ``tune.report``, with further entries of Ray. If the trial
+    failed, the entry ``reason`` says why. The entry ``done`` is True if the trial has ended. Ctrl-C stops all trials.
+    The caller must connect to Ray first (see ``cluster.connected``).
 
     Args:
         work: function that runs a trial in a worker process, called as ``work(config, **given)``.
         given: further keyword arguments of ``work``, the same for all trials.
         folder: folder of all results; every computer of a cluster must see it.
         config: settings of Ray Tune: search algorithm, scheduler and number of trials.
-        space: values that Ray Tune tries, by key; ``work`` gets one value of each key, in the dictionary ``config``.
+        space: values that Ray Tune tries, by key; ``config`` has one value of each key.
         jobs: number of trials that run at once; None: one for each core.
-        retries: number of times that a trial is started again after its process has ended unexpectedly, or after an
+        retries: number of times that a trial is started again after its process ended unexpectedly, or after an
             exception that is not an ``EthBrakeError``.
         callback: callback that reports the trials that have ended.
 
@@ -80,9 +80,7 @@ def run_trials(
 
 
 def _attempt(config: dict[str, Any], work: Callable[..., None], given: Mapping[str, Any], folder: Path) -> None:
-    """Run one attempt at a trial with the configuration ``config``.
-
-    The docstring of ``run_trials`` explains the other arguments.
+    """Run one attempt at a trial; for the arguments see ``run_trials``.
 
     An ``EthBrakeError`` is caught and reported as the result of the trial, because Ray would repeat the trial after an
     exception.
@@ -104,8 +102,8 @@ class TrialCallback(tune.Callback):  # type: ignore[misc]  # Ray ships no types
     Args:
         name: name of the study, for the progress display.
         done: number of trials that ended in earlier runs of the command.
-        total: number of all trials of the study.
-        tell: function that is called with a ``Progress`` object at each report; None: nothing is reported.
+        total: number of all trials.
+        tell: called with a ``Progress`` object at each report.
 
     """
 
@@ -121,15 +119,15 @@ class TrialCallback(tune.Callback):  # type: ignore[misc]  # Ray ships no types
         self._tell(Progress(self._name, self._done, self._total, note=note))
 
     def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        """Count a trial that has ended, and report the reason if it failed. Ray calls this method."""
+        """Count a trial that has ended, and report the reason if it failed."""
         self._done += 1
         self.say(str(trial.last_result.get(REASON, "")))
 
     def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        """Count a trial that has failed at its last attempt. Ray calls this method."""
+        """Count a trial that has failed at its last attempt."""
         self._done += 1
         self.say("a trial failed after all attempts; the table contains the reason")
 
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        """Report that a trial starts again after its process has ended unexpectedly. Ray calls this method."""
+        """Report that a trial starts again after its process has ended unexpectedly."""
         self.say("the process of a trial was lost or failed; the trial is tried again")

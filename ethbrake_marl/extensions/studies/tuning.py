@@ -2,6 +2,8 @@
 
 The table contains no times and no paths. If only one trial runs at a time, the table is the same, byte for byte,
 however often the search was interrupted.
+
+Arguments that several methods share: ``values`` has a value for each searched key. ``path`` is the tuning's folder.
 """
 
 from __future__ import annotations
@@ -58,10 +60,7 @@ _Count = Annotated[int, Field(ge=0, le=1_000_000)]
 
 
 def _check_number(value: Any) -> int | float:
-    """Return ``value`` if it is a finite number, else raise ``ValueError``.
-
-    An ``int`` is returned as an ``int``, not as a ``float``.
-    """
+    """Return ``value`` if it is a finite number, else raise ``ValueError``; an ``int`` stays an ``int``."""
     if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
         raise ValueError("each end of a range must be a finite number")
     return value
@@ -83,13 +82,13 @@ class Range(FileModel):
     log: bool = Field(default=False, description="true: values are spread evenly on a logarithmic scale")
 
     def __str__(self) -> str:
-        """Return the range as text: ``from 0.001 to 0.1, logarithmic``."""
+        """Return text such as ``from 0.001 to 0.1, logarithmic``."""
         kind = ", whole numbers" * self.whole + ", logarithmic" * self.log
         return f"from {flow_text(self.low)} to {flow_text(self.high)}{kind}"
 
     @property
     def whole(self) -> bool:
-        """Whether ``low`` and ``high`` are written without a decimal point, so that only whole numbers are tried."""
+        """Whether only whole numbers are tried."""
         return isinstance(self.low, int) and isinstance(self.high, int)
 
     @model_validator(mode="after")
@@ -102,11 +101,7 @@ class Range(FileModel):
 
     @property
     def ends(self) -> tuple[Any, ...]:
-        """The smallest and the largest value of the range.
-
-        Before the search starts, the recipe is checked once with the smallest value and once with the largest value of
-        each range.
-        """
+        """The smallest and the largest value; before the search starts, the recipe is checked with each of them."""
         return self.low, self.high
 
     def own(self, value: Any) -> int | float | None:
@@ -118,7 +113,6 @@ class Range(FileModel):
         return int(value) if value == int(value) else None
 
     def distribution(self) -> BaseDistribution:
-        """Return Optuna's distribution of the values in this range."""
         from optuna.distributions import FloatDistribution, IntDistribution
 
         if self.whole:
@@ -140,7 +134,7 @@ class Choices(FileModel):
     )
 
     def __str__(self) -> str:
-        """Return the choices as text: ``one of relu, tanh``."""
+        """Return text such as ``one of relu, tanh``."""
         return f"one of {', '.join(map(flow_text, self.choices))}"
 
     @model_validator(mode="after")
@@ -153,7 +147,7 @@ class Choices(FileModel):
 
     @property
     def ends(self) -> tuple[Any, ...]:
-        """All choices of this setting. Before the search starts, the recipe is checked with each choice."""
+        """All choices; before the search starts, the recipe is checked with each of them."""
         return self.choices
 
     def own(self, value: Any) -> Any:
@@ -220,7 +214,6 @@ class Pruning(FileModel):
     )
 
     def rule(self) -> TrialScheduler:
-        """Return Ray Tune's scheduler that applies the median stopping rule."""
         from ray.tune.schedulers import MedianStoppingRule
 
         return MedianStoppingRule(
@@ -243,7 +236,7 @@ class Sampling(FileModel):
     random_trials: _Count = Field(default=10, description="number of trials with random values before TPE begins")
 
     def of_trial(self, number: int) -> BaseSampler:
-        """Return the Optuna sampler that proposes the values of trial ``number``; its seed depends on the number."""
+        """Return the Optuna sampler for trial ``number``; its seed depends on the number."""
         from optuna.samplers import RandomSampler, TPESampler
 
         seed = int(np.random.SeedSequence([self.seed, number]).generate_state(1)[0])
@@ -274,21 +267,15 @@ class TuningFile(StudyFile):
     sampler: Sampling = Field(default=Sampling(), description="method that chooses the values of the next trial")
 
     def values(self, proposal: Mapping[str, Any]) -> dict[str, Any]:
-        """Convert a proposal of Optuna into values as in the YAML file of a recipe, and return them by key.
-
-        ``proposal`` maps each searched key to its value as Optuna stores it.
-        """
+        """Convert a proposal (values as Optuna stores them) into values as in the YAML file of a recipe."""
         return {key: self.search[key].value(value) for key, value in proposal.items()}
 
     def space(self) -> dict[str, BaseDistribution]:
-        """Return a dictionary from each searched key to Optuna's distribution of its values."""
+        """Return Optuna's distribution of each searched key."""
         return {key: dimension.distribution() for key, dimension in self.search.items()}
 
     def points(self, number: int) -> Iterator[dict[str, Any]]:
-        """Yield ``number`` random combinations of values, each as a dictionary from searched key to value.
-
-        Every call yields the same combinations.
-        """
+        """Yield ``number`` random combinations of values, the same in every call."""
         with naming_extras():
             import optuna
         optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -317,7 +304,7 @@ TABLE, TRIALS, PROPOSALS = "trials.csv", "trials", "proposals.json"  # names ins
 
 @dataclass(frozen=True)
 class TuningPlan:
-    """Content of a tuning's file after it was checked, with the scenario and the recipe that all trials share."""
+    """Checked content of a tuning's file, with the scenario and the recipe that all trials share."""
 
     file: TuningFile  # content of the tuning's file
     recipe: TrainingRecipe  # recipe with the file's settings and seed, before any searched value
@@ -326,7 +313,7 @@ class TuningPlan:
 
     @staticmethod
     def json_schema() -> dict[str, Any]:
-        """Return the JSON Schema of a tuning file, for editors that complete and check YAML."""
+        """Return the JSON Schema of a tuning file, for editors."""
         return FileSchema.publish({**TuningFile.model_json_schema(), "title": "Tuning"})
 
     @classmethod
@@ -380,7 +367,7 @@ class TuningPlan:
         return plan
 
     def training(self, values: Values) -> Training:
-        """Return the training run of the trial in which the searched keys have these ``values``.
+        """Return the training run of the trial with these ``values``.
 
         Every training run has about ``measure.times`` evaluations, so that trials can be compared before they finish.
         Raises ``InvalidInput`` if the recipe does not allow this combination of values.
@@ -404,8 +391,7 @@ class TuningPlan:
     def example(self) -> str:
         """Return a command line ``ethbrake train ...`` that does the same training run as one trial.
 
-        The command line gives every searched key the recipe's own value. If the recipe's own value of at least one
-        searched key is not among the values to search, every searched key gets a random value to search instead.
+        Every searched key gets the recipe's own value or, if one of these values is not to be searched, a random value.
         """
         values = self.own_values() or next(self.file.points(1))
         measured = {"evaluation": self.training(values).recipe.evaluation.model_dump(mode="json")}
@@ -434,17 +420,13 @@ class TuningPlan:
             raise InvalidInput(f"search: a trial with {', '.join(texts_of(values))} is not possible: {error}") from None
 
     def folder(self, path: Path) -> StudyFolder:
-        """Return a ``StudyFolder`` that checks and locks the folder ``path``.
-
-        The ``StudyFolder`` raises ``InvalidInput`` if the folder belongs to a tuning with other settings.
-        """
+        """Return a ``StudyFolder``, which raises ``InvalidInput`` for the folder of a tuning with other settings."""
         return StudyFolder(path, "a tuning", self.question, record="tuning.json", writes=(TABLE,))
 
     def proposals(self, path: Path) -> list[Values]:
-        """Return the proposals in the tuning's folder ``path``: the values of each trial so far, as Optuna stores them.
+        """Return the stored proposals: the values of each trial so far, as Optuna stores them.
 
-        Raises ``InvalidInput`` if a proposal has other keys or values than the entry ``search`` of the tuning's file
-        allows.
+        Raises ``InvalidInput`` if the entry ``search`` of the tuning's file does not allow a proposal.
         """
         file, space = path / PROPOSALS, self.file.search
         if not file.exists():
@@ -463,12 +445,7 @@ class TuningPlan:
         return [*known]
 
     def job(self, values: Values, path: Path) -> TrainingJob:
-        """Return the training run with these ``values`` of the searched keys, and its folder inside ``path``.
-
-        ``path`` is the folder of the tuning.
-
-        Two trials with equal values share one training run and one folder.
-        """
+        """Return the training run with these ``values``, and its folder; trials with equal values share both."""
         training = self.training(values)
         return TrainingJob(training, path / TRIALS / training.identity[:16], texts_of({**self.file.settings, **values}))
 
@@ -484,19 +461,18 @@ class TuningPlan:
     ) -> TuningResult:
         """Run trials until the folder contains ``trials`` trials, and write a table with a row for each trial.
 
-        Every run repeats the search from the first trial, with the proposals that earlier runs have stored. Finished
-        trials are not trained again: their results are read from their folders. Unfinished trials continue. The table
-        is also written if Ctrl-C stops the run. Raises ``InvalidInput`` if another process works in the folder, if a
-        file is damaged, or if no cluster runs at the address ``ray``.
+        Every run repeats the search from the first trial, with the stored proposals of earlier runs. The results of
+        finished trials are read from their folders. Unfinished trials continue. The table is also written if Ctrl-C
+        stops the run. Raises ``InvalidInput`` if another process works in the folder, if a file is damaged, or if no
+        cluster runs at the address ``ray``.
 
         Args:
             path: folder of all results; created if necessary.
-            trials: number of trials that the folder contains at the end, including the trials of earlier runs.
+            trials: number of trials in the folder at the end, including earlier runs.
             jobs: number of trials that run at once; this number affects the proposals.
             ray: address of a Ray cluster; ``local``: Ray is started on this machine.
-            retries: number of times that a trial is started again after its process has ended unexpectedly.
-            tell: function that is called with the number of trials that have ended, and with the reason of each
-                failure; None: no reports.
+            retries: number of times that a trial is started again after its process ended unexpectedly.
+            tell: called with the number of trials that have ended, and with the reason of each failure.
 
         """
         with self.folder(path).work():
@@ -528,10 +504,9 @@ class TuningPlan:
     def _search(
         self, path: Path, known: list[Values], trials: int, jobs: int, retries: int, tell: OnProgress | None
     ) -> tuple[list[Values], list[dict[str, Any]]]:
-        """Run the trials on Ray. Return all proposals, and the last result that each trial reported to Ray.
+        """Run the trials on Ray; return all proposals, and the last result that each trial reported.
 
-        ``known`` are the proposals (values to try in each trial) of earlier runs of the command. The docstring of
-        ``run`` explains the other arguments.
+        ``known`` are the proposals of earlier runs.
         """
         from ray import tune
 
@@ -562,14 +537,8 @@ class TuningPlan:
     def best_recipe(self, values: Values, file: Path, source: str) -> str:
         """Return the YAML text of a recipe that repeats the training run of the trial with these ``values``.
 
-        Raises ``InvalidInput`` if the name of ``file`` is not a valid name of a recipe.
-
-        Args:
-            values: value of each searched key.
-            file: path of the file to which the caller writes the text; the name of this file becomes the name of the
-                recipe.
-            source: value of the recipe's key ``source``, a text.
-
+        The name of ``file`` becomes the name of the recipe; ``source`` is the recipe's key ``source``. Raises
+        ``InvalidInput`` if the name of ``file`` is not a valid name of a recipe.
         """
         check_file_name("recipe", file.stem)
         described = f"Settings of {self.file.recipe} that `ethbrake study tune` found."
@@ -587,7 +556,7 @@ class TuningPlan:
         return recipe.text(f"# The best trial of a tuning, trained again: {command}\n")
 
     def has_exported(self, path: Path, file: Path) -> bool:
-        """Return whether ``file`` is a recipe that was exported from a trial in the tuning's folder ``path``."""
+        """Return whether ``file`` is a recipe that was exported from a trial in the folder ``path``."""
         try:
             source, text = load_recipe(file).source, file.read_text("utf-8")
         except InvalidInput:
@@ -601,7 +570,7 @@ State = Literal["running", "finished", "pruned", "failed"]
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One trial of a tuning: the values of the searched keys in one training run, and the result of this run."""
+    """One trial of a tuning: one training run, and its result."""
 
     number: int  # number of the trial, from 0
     state: State  # state of the trial; ``pruned``: stopped early because of too much harm
@@ -612,10 +581,7 @@ class Trial:
 
     @classmethod
     def of(cls, number: int, values: Values, end: Mapping[str, Any]) -> Trial:
-        """Return the trial ``number`` with these ``values`` of the searched keys, and with the result in ``end``.
-
-        ``end`` is the last result that the trial reported to Ray (see ``run_trials``).
-        """
+        """Return a trial; ``end`` is the last result that it reported to Ray (see ``run_trials``)."""
         reason = str(end.get(REASON, ""))
         state: State = "running"
         if reason:
@@ -628,7 +594,7 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class TuningResult:
-    """Result of ``TuningPlan.run``: the trials, and the file with their table."""
+    """Result of ``TuningPlan.run``."""
 
     table: Path  # CSV file with a row for each trial that ended
     asked: int  # requested number of trials in the folder
@@ -646,25 +612,15 @@ class TuningResult:
 
     @property
     def best(self) -> Trial | None:
-        """Finished trial with the least harm; if several trials have this harm, the first of them.
-
-        The value is None if no trial has finished.
-        """
+        """Finished trial with the least harm (the first of several); None if no trial has finished."""
         finished = [each for each in self.trials if each.harm is not None]
         return min(finished, key=lambda each: (each.harm, each.number), default=None)
 
 
 def do_trial(config: dict[str, Any], plan: TuningPlan, path: Path) -> None:
-    """Train the policy of one trial to the end in a worker process of Ray, and report every evaluation to Ray.
+    """Train the policy of one trial in a worker process of Ray, and report every evaluation to Ray, which may prune it.
 
-    When the trial reports an evaluation, Ray may stop (prune) the trial.
-
-    Args:
-        config: configuration of the trial, ``{"trial": number, "values": proposal}``, with values as Optuna stores
-            them.
-        plan: checked content of the tuning's file.
-        path: folder with all results of the tuning.
-
+    ``config`` is ``{"trial": number, "values": proposal}``.
     """
     from ray.tune import report
 

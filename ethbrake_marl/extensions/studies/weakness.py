@@ -1,7 +1,4 @@
-"""Measures of how badly an agent does in a world.
-
-A search for an agent's worst worlds uses one of these measures as the score of a world.
-"""
+"""Measures of how badly an agent does in a world: the scores in a search for its worst worlds."""
 
 from __future__ import annotations
 
@@ -45,8 +42,6 @@ class Measured:
 class Measure:
     """Measure of how badly an agent does in a world.
 
-    Call this object with a ``Sample`` of worlds to compute the score of every world.
-
     The measure ``harm`` is the agent's harm. The measure ``regret`` is the agent's harm minus the harm of a reference
     agent, by default ``best_harm``. The measure ``difference`` is the absolute difference between the harms of the
     agent and the reference agent. The measure ``bound`` is the agent's harm minus the bound of its shield at the alert;
@@ -59,10 +54,9 @@ class Measure:
     harm_count: HarmCount  # harm count: the first impact of each pair (``first``) or all impacts (``total``)
 
     def __call__(self, sample: Sample) -> Measured:
-        """Return for each world the agent's score, the agent's harm, and the harm or bound to compare this harm with.
+        """Return for each world the agent's score, its harm, and the harm or bound to compare with.
 
-        If the physics cannot simulate a world, the score of this world is minus infinity, and its harm is NaN. Raises
-        ``InvalidInput`` for the measure ``bound`` if the agent has no shield.
+        Raises ``InvalidInput`` for the measure ``bound`` if the agent has no shield.
         """
         n = sample.worlds.n
         score, harm, reference = np.full(n, -np.inf), np.full(n, np.nan), np.full(n, np.nan)
@@ -90,18 +84,17 @@ class Measure:
     def falsify(
         self, budget: int, seed: int, *, most: int = 20, adaptive: bool = True, on_round: Watcher | None = None
     ) -> Falsified:
-        """Search for those worlds in which the agent does worst, among all worlds that the scenario can draw.
+        """Search all worlds that the scenario can draw for those in which the agent does worst.
 
-        For every measure but ``bound``, only worlds with a score above 0 are returned, so the result may contain no
-        world. Raises the exceptions of ``scenario.ranges``. Raises ``InvalidInput`` if no tried world has a finite
-        score.
+        For every measure but ``bound``, only worlds with a score above 0 are returned, so the result may be empty.
+        Raises the exceptions of ``scenario.ranges``. Raises ``InvalidInput`` if no tried world has a finite score.
 
         Args:
             budget: number of worlds to try.
             seed: seed of the search.
-            most: largest number of worlds in the result; any two of these worlds differ clearly.
+            most: largest number of worlds in the result; any two of them differ clearly.
             adaptive: True: search around the worst worlds so far; False: all worlds are uniform random worlds.
-            on_round: function that is called with the number of worlds tried so far and ``budget``.
+            on_round: called with the number of worlds tried so far and ``budget``.
 
         """
         drawn = ranges(self.scenario)
@@ -143,17 +136,9 @@ class Measure:
     def of(cls, name: str, agent: str, against: str | None, scenario: Scenario, harm_count: HarmCount) -> Measure:
         """Return the measure called ``name`` for an agent.
 
-        Raises ``InvalidInput`` if ``name`` is unknown, or if ``against`` is missing or not allowed for the measure.
-
-        Args:
-            name: name of the measure: ``harm``, ``regret``, ``difference`` or ``bound``.
-            agent: spec of the agent, such as ``ppo`` or ``ppo+step``.
-            against: spec of the reference agent, whose harm the measures ``regret`` and ``difference`` compare with the
-                agent's harm. For the measure ``regret``, None means that the reference agent is ``best_harm``. For the
-                measures ``harm`` and ``bound``, ``against`` must be None.
-            scenario: scenario whose learners the agents drive.
-            harm_count: impacts that count as harm: the first of each pair (``first``) or all (``total``).
-
+        ``agent`` and ``against`` are specs such as ``ppo+step``. ``against`` is the reference agent of ``regret``
+        (None: ``best_harm``) and ``difference``; for the other measures it must be None. Raises ``InvalidInput`` if
+        ``name`` is unknown, or if ``against`` is missing or not allowed for the measure.
         """
         chosen = next((each for each in MEASURES if each == name), None)
         if chosen is None:
