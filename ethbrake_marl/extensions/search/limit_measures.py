@@ -146,9 +146,9 @@ class LimitMeasures(MeasureSet):
         known = row.more[NAME]["known_best_share"]
         if known is not None and known < 1.0:
             lines.append(
-                f"An earlier search covers {100.0 * known:.1f} % of the worlds. Elsewhere the best known harm is only the"
-                " least harm of the agents above, so regrets are lower bounds, and the share of the possible reduction is"
-                " omitted."
+                f"An earlier search covers {100.0 * known:.1f} % of the worlds. Elsewhere the best known harm is only"
+                " the least harm of the agents above, so regrets are lower bounds, and the share of the possible"
+                " reduction is omitted."
             )
         counts = {each.agent: each.more[NAME]["below_best_known"] for each in rows}
         below = [f"{agent} in {count_of(count, 'world')}" for agent, count in counts.items() if count]
