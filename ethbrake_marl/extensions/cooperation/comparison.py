@@ -24,7 +24,7 @@ from ethbrake_marl.shields.episodes import Shielded
 
 
 def compare(measured: Sequence[Measured], searched: int) -> Json:
-    """Return the comparison of all levels as a mapping for JSON. docs/extensions/cooperation.md describes the keys.
+    """Return the comparison of all levels as a mapping for JSON.
 
     Four keys contain a list:
 
