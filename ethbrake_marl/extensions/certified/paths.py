@@ -188,8 +188,8 @@ def strike(
 ) -> bool:
     """Put the worlds in which pair ``p`` has an impact in the present piece on the stack as a new path.
 
-    Returns False, and puts nothing on the stack, if the stack is full or the rear vehicle may move backwards
-    (``thrown_back``). ``harm`` is the harm up to and including this impact, m2/s2.
+    Returns False if some of these worlds could not be put on the stack, because the stack is full or the rear vehicle
+    may move backwards (``thrown_back``). ``harm`` is the harm up to and including this impact, m2/s2.
     """
     N, P, width = cell.speed.shape[0], cell.gap.shape[0], cell.speed.shape[1]
     size = stack.size[0]
