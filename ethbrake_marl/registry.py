@@ -55,7 +55,8 @@ class Part:
 def points(group: str) -> dict[str, list[EntryPoint]]:
     """Return the entry points of a group by name; several packages may define an entry point with the same name.
 
-    Names defined by this package come first. ``group`` lacks the prefix ``ethbrake_marl.``: for example ``agents``.
+    Names defined by this package come first. ``group`` is written without the prefix ``ethbrake_marl.``, for example
+    ``agents``.
     """
     by_name: dict[str, list[EntryPoint]] = {}
     in_order = sorted(entry_points(group=f"ethbrake_marl.{group}"), key=lambda each: (giver(each) != OURS, each.name))

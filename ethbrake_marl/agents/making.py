@@ -176,7 +176,8 @@ def make_from_file(argument: str | None, settings: AgentSettings) -> Driver:
             arguments = ()
     if not arguments and (argument, settings.policy) != (None, None):
         raise InvalidInput(
-            f"agent {settings.spec!r}: the function {named[1]} has no parameters; leave out argument and policy"
+            f"agent {settings.spec!r}: the function {named[1]} has no parameters; write the name without an"
+            " argument and without a policy"
         )
     driver: Driver = function(*arguments)
     return driver

@@ -17,7 +17,8 @@ def summarise_by(evaluation: Evaluation, by: str, *, baseline: str = BASELINE) -
 
     Args:
         evaluation: outcomes of the agents in worlds of a mixture of scenarios, or of a scenario with vehicle types.
-        by: ``scenario`` (one of the mixture's scenarios), or the type of a vehicle, such as ``vehicle_2_type``.
+        by: ``"scenario"`` (one group for each scenario of the mixture), or the type of a vehicle, such as
+            ``"vehicle_2_type"``.
         baseline: name of the agent with which the other agents are compared.
 
     Raises ``InvalidInput`` if the worlds have no groups, and ``UnknownName`` if ``by`` is unknown.

@@ -13,7 +13,7 @@ from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 
 @dataclass(frozen=True, slots=True)
 class Rescored:
-    """For each vehicle, the mean value of one objective over the worlds of one agent. A smaller mean is better."""
+    """Mean value of one objective for each vehicle, over all worlds that one agent drives. Smaller is better."""
 
     agent: str
     objective: str  # as in scenarios: ``total``, ``own``, ``social:45``

@@ -19,8 +19,8 @@ ring    the newest samples in a ring buffer, RING_HEAD + 3 N columns each: time,
 
 A scenario can say what a message contains (``v2x: tells``). Worlds of such a scenario are marked by a flag in the
 columns of the link from Vehicle 1 to itself. In these worlds, each sample also contains the *intents*: the commands
-of the N vehicles chosen at the last decision. These worlds have three more groups of columns between *links* and
-*ring*, even if they have no periodic messages:
+of the N vehicles chosen at the last decision. If the flag is set, the array has three more groups of columns between
+*links* and *ring*, even without periodic messages:
 
 contents    N * CONTENTS: 1 if messages of this vehicle contain this quantity (see ``PIECES``), else 0
 intents     N, present intent of each vehicle (m/s2)
@@ -295,7 +295,7 @@ class Messages(NamedTuple):
         return np.full(len(self.columns), np.inf) if seen is None else seen
 
     def known_pieces(self, vehicle: int, time_s: Floats) -> Bools:
-        """Return a mask [n, N, CONTENTS], True at (world, j, c) if ``vehicle`` knows ``PIECES[c]`` of vehicle j.
+        """Return a mask [n, N, CONTENTS], True at (world, j, c) if ``vehicle`` knows quantity c of vehicle j.
 
         The mask describes the time ``time_s`` [n]. It is valid for a vehicle j whose first message has arrived by then,
         and for a vehicle j in sight.

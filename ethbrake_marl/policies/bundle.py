@@ -121,6 +121,6 @@ def _check_observed(path: Path, manifest: Manifest) -> None:
             return
     raise CorruptBundle(
         f"{path}: observation: this version of the package computes or scales features differently than the version"
-        f" in which the policy was trained, {manifest.versions.get('ethbrake-marl', 'unknown')}; use that version, or"
-        " train again"
+        f" in which the policy was trained ({manifest.versions.get('ethbrake-marl', 'not recorded')}); use that"
+        " version, or train again"
     )

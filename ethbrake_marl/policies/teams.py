@@ -41,7 +41,8 @@ Trained = Policy | PolicyTeam  # result of a training: one policy for all learne
 def read_trained(folder: Path) -> Trained:
     """Read the policy or team that ``save`` wrote into ``folder``.
 
-    Raises ``CorruptBundle`` if ``folder`` contains neither, and the errors of ``load_policy``.
+    Raises ``CorruptBundle`` if ``folder`` contains neither a policy nor a team, and the errors of
+    ``load_policy``.
     """
     if (folder / MANIFEST).exists():
         return load_policy(folder)

@@ -67,7 +67,7 @@ def register_scenarios(folder: str | os.PathLike[str]) -> None:
     """
     path = Path(folder).resolve()
     if not path.is_dir():
-        raise InvalidInput(f"folder of scenarios {os.fspath(folder)!r}: does not exist")
+        raise InvalidInput(f"folder of scenarios {os.fspath(folder)!r}: is not an existing folder")
     if not _files_of(path):
         raise InvalidInput(f"folder of scenarios {os.fspath(folder)!r}: has no file that ends in .yaml")
     known = str(path) in FOLDERS

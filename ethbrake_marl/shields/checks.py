@@ -21,7 +21,7 @@ def check_amount(name: str, value: object, where: str, unit: str = "") -> None:
     The error message begins with ``where`` and ends with ``unit``, such as " m2/s2".
     """
     if not is_amount(value):
-        raise InvalidInput(f"{where}: {name} = {value!r}: must be a number of at least 0{unit}")
+        raise InvalidInput(f"{where}: {name} = {value!r}: must be a finite number of at least 0{unit}")
 
 
 def check_scenario(scenario: object, where: str) -> None:

@@ -152,7 +152,8 @@ class TrainingRecipe(FileModel):
     def _some_reward(cls, value: RewardParams) -> RewardParams:
         if not any(weight for name, weight in value.weights.items() if name != "shaping"):
             raise ValueError(
-                "all weights of the reward are 0, so there is nothing to learn; give at least one term another weight"
+                "all weights of the reward except shaping are 0, so there is nothing to learn; give at least one of"
+                " these terms another weight"
             )
         return value
 

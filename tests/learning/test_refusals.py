@@ -78,8 +78,8 @@ RECIPES: dict[str, Callable[[], object]] = {
     ),
     "n_envs x n_steps = 3200000000 decisions per update": lambda: recipe("n_envs: 16", "n_envs: 100000000"),
     "mine.yaml, line 15: network.policy = []: must not be empty": lambda: recipe("policy: [8]", "policy: []"),
-    "mine.yaml, line 16: reward = {harm: 0}: all weights of the reward are 0, so there is nothing to learn": lambda: (
-        recipe("harm: 1", "harm: 0")
+    "mine.yaml, line 16: reward = {harm: 0}: all weights of the reward except shaping are 0": lambda: recipe(
+        "harm: 1", "harm: 0"
     ),
     "mine.yaml, line 17: evaluation.every_updates = 0: must be greater than or equal to 1": lambda: recipe(
         "every_updates: 2", "every_updates: 0"

@@ -52,7 +52,9 @@ def team() -> StepShield:
 
 STEP_SHIELD: dict[str, Callable[[], object]] = {
     "shield: vehicle = 9: must be an index from 0 to 2": lambda: StepShield(PAPER, 9),
-    "shield: allowance = -1.0: must be a number of at least 0 m2/s2": lambda: StepShield(PAPER, 1, allowance=-1.0),
+    "shield: allowance = -1.0: must be a finite number of at least 0 m2/s2": lambda: StepShield(
+        PAPER, 1, allowance=-1.0
+    ),
     "shield: decide() was called before any episode began; call begin first": lambda: StepShield(PAPER, 1).decide(
         np.zeros(3)
     ),
@@ -140,10 +142,10 @@ OPTIONS: dict[str, Callable[[], object]] = {
         mode="step", bound="pairwise"
     ),
     "shield: cap = 'mine': must be baseline or None": lambda: ShieldOptions(cap="mine"),
-    "shield: intervention_penalty = -1.0: must be a number of at least 0": lambda: ShieldOptions(
+    "shield: intervention_penalty = -1.0: must be a finite number of at least 0": lambda: ShieldOptions(
         intervention_penalty=-1.0
     ),
-    "shield: intervention_penalty = nan: must be a number of at least 0": lambda: ShieldOptions(
+    "shield: intervention_penalty = nan: must be a finite number of at least 0": lambda: ShieldOptions(
         intervention_penalty=float("nan")
     ),
 }

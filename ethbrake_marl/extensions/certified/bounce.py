@@ -58,8 +58,8 @@ def spring_apart(
 
 @compiled(apart=True)
 def stand_still(cell: Cell, pull: Floats, vague: float, left: float, speed: Floats, way: Floats) -> None:
-    """Correct ``speed`` and ``way`` of a braking vehicle in place: the vehicle stands from the time at which its speed
-    would become negative.
+    """Correct the arrays ``speed`` and ``way`` (travelled distance) of a braking vehicle: it stands from the time at
+    which its speed would become negative.
 
     Args:
         cell: only ``moving`` is read.

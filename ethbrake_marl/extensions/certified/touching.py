@@ -1,5 +1,4 @@
-"""Pairs that stay in contact, in a box of worlds: the vehicles bounce a little, then move as one body, and later
-separate.
+"""Motion of a pair from an impact until it separates, in a box of worlds: after small bounces it moves as one body.
 
 The state of a pair in contact is the motion of its centre of mass, as affine forms, and limits on how far the two
 vehicles deviate from this motion. While both vehicles move forward, only their commands act on the pair. The centre of

@@ -54,7 +54,7 @@ VEHICLE = (
     "release_rate_mps3",
 )  # fmt: skip
 
-_MAY_DIFFER = "roles, objective, obstacle_gap_m, v2x and, where v2x differs, latency_s"
+_MAY_DIFFER = "only in roles, objective, obstacle_gap_m, v2x and, where v2x differs, latency_s"
 
 _BUT_CHANNEL = {"name", "title", "description", "source", "v2x"}
 
@@ -164,7 +164,7 @@ def common_worlds(levels: Sequence[Level], episodes: int, seed: int) -> list[Sam
         if level.scenario.observation != levels[0].scenario.observation:
             raise InvalidInput(
                 f"level {level.name!r}: its observation differs from the observation of level {levels[0].name!r};"
-                f" levels may differ in {_MAY_DIFFER} only"
+                f" levels may differ {_MAY_DIFFER}"
             )
         _check_same(levels[0], samples[0], level, samples[k], (*_LINE, *WORLD, *VEHICLE))
         clear = next(j for j in range(k + 1) if levels[j].scenario.v2x == level.scenario.v2x)
@@ -179,8 +179,8 @@ def _check_same(one: Level, first: Sample, other: Level, sample: Sample, names: 
         if rows.size:
             here, there = (", ".join(f"{each:g}" for each in np.ravel(v[rows[0]])) for v in (others, values))
             raise InvalidInput(
-                f"level {other.name!r}: {name} is {here}, but {there} at level {one.name!r}; levels may differ in"
-                f" {_MAY_DIFFER} only: change or leave out one of the two levels"
+                f"level {other.name!r}: {name} is {here}, but {there} at level {one.name!r}; levels may differ"
+                f" {_MAY_DIFFER}; change or leave out one of the two levels"
             )
 
 

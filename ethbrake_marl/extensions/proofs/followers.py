@@ -55,8 +55,8 @@ def least_closing(
     centre of mass of the controlled vehicle and the neighbour of its first contact, and d is the largest difference
     between the speeds of the controlled vehicle and this centre of mass. The arguments ``start`` to ``other_bend``
     describe v as a function of time (``least_of_line``); each bend may be negative. ``share`` to ``end`` are the
-    arguments of ``largest_lead``, which bounds d. ``until`` is the latest time of the contact. All times are in s after
-    the first contact.
+    arguments of ``largest_lead``, which bounds d. ``until`` is the latest time of the contact with the second
+    neighbour. All times are in s after the first contact.
     """
     best = least_of_line(start, slope, turn, bend, other_turn, other_bend, 0.0, until)
     best -= largest_lead(share, press, reach, bounce, opening, lost, late, end, 0.0, until)

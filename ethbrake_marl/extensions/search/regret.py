@@ -75,7 +75,7 @@ class Between:
 
     @property
     def text(self) -> str:
-        """Sentence about these worlds; empty if there are none."""
+        """Sentence about the worlds with unavoidable contact but no proven impact; empty if no such world exists."""
         if self.rate == 0.0:
             return ""
         text = f" In {100 * self.rate:.1f} % of the worlds, contact is proven unavoidable but an impact is not."
