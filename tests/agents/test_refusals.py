@@ -270,10 +270,7 @@ def raising(): raise KeyError("weights")"""
             "agent 'My+File.py:': an agent from a file must be FILE.py:FUNCTION, FILE.py:FUNCTION:ARGUMENT",
         ),
         ("My+File.py:make_agent+stpe", "unknown shield or search 'stpe'; did you mean 'step'?"),
-        (
-            "My+File.py:make_agent:3",
-            "make_agent has no parameters; write the name without an argument and without a policy",
-        ),
+        ("My+File.py:make_agent:3", "make_agent has no parameters; write the name without an argument"),
         ("My+File.py:wrong", "agent 'My+File.py:wrong': 'int' is not an agent, because it has no name and no act"),
         ("My+File.py:raising", "agent 'My+File.py:raising': KeyError: 'weights' (My+File.py, line 4)"),
         ("My+File.py:nobody", "file 'My+File.py': does not define 'nobody'; write FILE.py:NAME with a name"),

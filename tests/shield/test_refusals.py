@@ -52,9 +52,7 @@ def team() -> StepShield:
 
 STEP_SHIELD: dict[str, Callable[[], object]] = {
     "shield: vehicle = 9: must be an index from 0 to 2": lambda: StepShield(PAPER, 9),
-    "shield: allowance = -1.0: must be a finite number of at least 0 m2/s2": lambda: StepShield(
-        PAPER, 1, allowance=-1.0
-    ),
+    "shield: allowance = -1.0: must be a finite number of at least 0 m2/": lambda: StepShield(PAPER, 1, allowance=-1.0),
     "shield: decide() was called before any episode began; call begin first": lambda: StepShield(PAPER, 1).decide(
         np.zeros(3)
     ),
