@@ -604,7 +604,8 @@ class Engine:
     def _rules_for(self, state: State) -> Rules:
         """Return the settings of the compiled step for the worlds of ``state``.
 
-        Brakes may build up in a world of ``state``, even if they act at once in all worlds of this engine.
+        The settings depend on ``state``: brakes may build up in one of its worlds, even if they act at once in all
+        worlds of this engine.
         """
         builds_up = self.scenario.builds_up or state.packed.builds_up or self.in_pieces
         return self._now.rules._replace(builds_up=builds_up)

@@ -171,7 +171,7 @@ class Vehicles:
 
     @property
     def _is_view(self) -> bool:
-        """Whether ``own_latency_s`` and ``known_from_s`` share the memory of ``latency_s`` (see ``at_once``)."""
+        """Whether ``own_latency_s`` and ``known_from_s`` share the memory of ``latency_s``: there is no V2X channel."""
         latency, news = self.latency_s, self.known_from_s
         return self.own_latency_s is latency and news.base is latency and news.strides[1:] == (latency.itemsize, 0)
 

@@ -192,6 +192,7 @@ def _copy_state(of: Floats, table: Floats) -> None:
 
 @compiled(within=True)
 def copy_table(one: Floats, other: Floats) -> None:
+    """Copy every entry of the table ``one`` into the table ``other``."""
     for row in range(one.shape[0]):
         for i in range(one.shape[1]):
             other[row, i] = one[row, i]

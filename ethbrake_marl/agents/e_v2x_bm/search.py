@@ -3,7 +3,7 @@
 The search simulates evenly spaced decelerations (the *grid*), then more decelerations where the harm may be least. Then
 the search simulates decelerations around local minima and around *borders*, at which the number of impacts changes. If
 the result lies close to a jump of the harm, the search finally moves the result away from the jump. docs/evaluate.md
-gives the reasons for these steps.
+says how good the results are.
 
 Each function that simulates returns a status code: ``FLAG.DONE`` or, if a simulation failed, the code of the failed
 check of the physics. ``capacity`` is the braking capacity of the controlled vehicle (m/s2).
