@@ -6,7 +6,7 @@ Arguments that several functions share:
 - ``agent``: an agent that drives ``vehicle``, or a team, whose attribute ``drivers`` states which vehicles it drives.
 - ``vehicle``: index of the vehicle that the agent drives (0 = front); None for a team.
 - ``scenario``: scenario whose scripts drive the other vehicles.
-- ``watched_by``: observers, whose method ``see`` is called after every step.
+- ``watched_by``: observers (``Watch``).
 - ``summed``: names of reward terms to sum over each episode.
 
 Functions that run episodes raise ``PhysicsError``, which names the worlds, if the physics failed in some worlds.

@@ -45,10 +45,11 @@ _KINDS = (
 def adapt_policy(policy: Any, name: str, features: int, initial_state: Begin | None) -> tuple[Infer, Begin | None]:
     """Return two functions that call a policy of a kind that ``policy_agent`` accepts.
 
-    The first function is ``(observations, state) -> (actions, new state)``. The second function is ``n -> initial
-    state``, for n episodes; for a policy without a memory, None is returned in its place. ``features`` is the number of
-    features in one observation. For a function or torch module with a memory, ``initial_state`` is a function ``n ->
-    initial state``; for all other policies it is None. Raises ``InvalidInput`` for a policy of any other kind.
+    The first function is ``(observations, state) -> (actions, new state)``. The second function is ``n -> state`` and
+    returns the initial state for n episodes; for a policy without a memory, None is returned in its place. ``features``
+    is the number of features in one observation. For a function or torch module with a memory, ``initial_state`` is
+    such a function ``n -> state``; for all other policies it is None. Raises ``InvalidInput`` for a policy of any other
+    kind.
     """
     if isinstance(policy, str | os.PathLike):
         policy = _open_onnx(Path(policy), name)

@@ -155,7 +155,7 @@ def variants_of(name: str) -> tuple[str, ...]:
 
 
 def is_variant(form: str) -> bool:
-    """Return whether the last word of ``form``, such as ``step:estimated``, is a registered variant."""
+    """Return whether ``form`` ends with a registered variant, as ``step:estimated`` does."""
     return form.rpartition(":")[2] in variants_of(form.partition(":")[0])
 
 
@@ -210,8 +210,7 @@ def register_agent(
         knows: sources of knowledge (``Source``) that the agent uses while it drives; ``ethbrake agent list`` shows
             them.
         form: syntax of the agent's specification, which ``ethbrake agent list`` shows; None: ``name[:ARGUMENT]``. If
-            ``form`` contains no ``:``, the agent accepts no argument. If ``form`` contains no ``@``, it accepts no
-            policy.
+            ``form`` contains no ``:``, the agent accepts no argument; if it contains no ``@``, no policy.
         takes_policy: whether the specification ``name@policy`` is allowed; the factory finds the policy in
             ``AgentSettings.policy``.
 

@@ -134,7 +134,7 @@ class Now(NamedTuple):
         return self._replace(state=self.state.copy(), roster=self.roster.apart(), stream=copy.copy(self.stream))
 
     def kept(self, packed: Packed) -> Packed:
-        """Return ``packed`` with columns for an obstacle and for messages if this engine's worlds have such columns."""
+        """Return ``packed`` with the columns of an obstacle and *news by link* if this engine's worlds have them."""
         return packed.widened(self.obstacle, self.by_link)
 
 
@@ -248,7 +248,7 @@ class Engine:
         self._now = self._started(stream, self._now.state.guarded, worlds, self._now.watched)
 
     def _started(self, stream: Stream, guarded: Any, worlds: Worlds | None, watched: dict[Watcher, Any]) -> Now:
-        """Return new episodes that start in ``worlds`` or, if it is None, in the next worlds of ``stream``.
+        """Return new episodes that start in ``worlds`` or, if ``worlds`` is None, in the next worlds of ``stream``.
 
         ``guarded`` and ``watched`` contain the previous memories of the guard and of the watchers.
         """
@@ -604,7 +604,8 @@ class Engine:
     def _rules_for(self, state: State) -> Rules:
         """Return the settings of the compiled step for the worlds of ``state``.
 
-        Brakes may build up in a world of ``state``, even if they act at once in all worlds of this engine.
+        The settings depend on ``state``: brakes may build up in one of its worlds, even if they act at once in all
+        worlds of this engine.
         """
         builds_up = self.scenario.builds_up or state.packed.builds_up or self.in_pieces
         return self._now.rules._replace(builds_up=builds_up)

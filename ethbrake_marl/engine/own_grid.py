@@ -53,8 +53,8 @@ class Way(NamedTuple):
     def add_to(self, motion: Floats, column: Columns, reward: Floats, outcome: Floats) -> None:
         """Add these results to the results of the rest of the step, in place.
 
-        ``motion`` [n, S] is the state of the worlds after the whole step, with the columns ``column``. ``reward`` [n,
-        N] and ``outcome`` [OUTCOME_ROWS, n] are the results of the rest of the step.
+        ``motion`` [n, S], with the columns ``column``, is the state of the worlds after the whole step. The results of
+        the rest of the step are ``reward`` [n, N] and ``outcome`` [OUTCOME_ROWS, n].
         """
         reward += self.reward
         outcome[: len(self.harm)] += self.harm

@@ -1,7 +1,7 @@
 """The problem that searches and shields solve: which commands over a whole episode cause the least harm?
 
 A *profile* contains the commands of the controlled vehicles from the first decision to the horizon. A profile consists
-of at most K phases. Each phase ends at a decision. C is the number of controlled vehicles.
+of at most K phases, with constant commands in each. A phase ends at a decision. C is the number of controlled vehicles.
 """
 
 from __future__ import annotations

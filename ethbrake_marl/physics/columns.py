@@ -131,10 +131,10 @@ class Packed(NamedTuple):
         return bool(np.isfinite(self.params[:, column.brake_rate : column.harm_weight]).any())
 
     def widened(self, obstacle: bool, news: bool) -> Packed:
-        """Return these worlds, with the columns of an ``obstacle`` and *news by link* added if requested and missing.
+        """Return these worlds, with missing columns of an obstacle and of *news by link* added.
 
-        Added columns contain the values of a world without an obstacle, in which each vehicle knows everything once its
-        own latency has elapsed.
+        ``obstacle`` and ``news`` say which columns to add. Added columns contain the values of a world without an
+        obstacle, in which each vehicle knows everything once its own latency has elapsed.
         """
         (state, params), column = self, self.column
         if obstacle and not self.has_obstacle:

@@ -49,8 +49,8 @@ def next_event(table: Floats, now: float, end: float) -> float:
 
     There is an event when a pair comes into contact, a vehicle comes to rest or reaches its speed limit, or a command
     takes effect. The function also writes into the table when each vehicle next comes to rest or reaches its speed
-    limit, and when each pair next comes into contact. ``accelerate`` must have been applied to ``table``. The times
-    ``now`` and ``end`` (of the segment) are counted from the start of the segment.
+    limit, and when each pair next comes into contact. ``accelerate`` must have been applied to ``table``. ``now`` and
+    the segment's ``end`` are in seconds from the start of the segment.
     """
     vehicles = table.shape[1]
     soonest = end - now

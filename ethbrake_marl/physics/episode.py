@@ -22,7 +22,7 @@ Arguments that several functions share:
 - ``restitution``: coefficient of restitution of every impact
 - ``clock``: decision times and settings of the episode, [CLOCK.WIDTH]
 - ``no_rows``: ``table[:0]`` or another empty array, so that no single impact is recorded
-- ``step``, ``end``: numbers of decisions, from 0
+- ``step``, ``end``: numbers of decisions, from 0 (in ``step_end_s``: of a step, from 1)
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class Decisions(NamedTuple):
     time_step_s: Floats | float  # time between two decisions (s)
 
     def before(self, time_s: Floats | float) -> Floats:
-        """Return the number of decisions before ``time_s``."""
+        """Return how many decisions are before ``time_s`` (s)."""
         return np.ceil((time_s - self.first_s) / self.time_step_s - _ROUNDING)
 
     def latest(self, time_s: Floats) -> Ints:

@@ -27,10 +27,11 @@ def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> 
 
     If the observer has received the state of a vehicle, the function extrapolates the newest received place and speed
     to the present, under the received command and without contact. If the received states of both vehicles of a pair
-    are from the present time, the estimated gap is the true gap. The observer knows only of its own pairs whether they
-    have had an impact. If the observer has received nothing about a vehicle, the function puts this vehicle at rest at
-    the place of the next vehicle towards the observer. If messages do not contain a quantity, the function replaces the
-    quantity in the same way: a place by the place of the next vehicle towards the observer, a speed or a command by 0.
+    are from the present time, the estimated gap is the true gap. The observer knows about past impacts of its own
+    pairs, but not of other pairs. If the observer has received nothing about a vehicle, the function puts this vehicle
+    at rest at the place of the next vehicle towards the observer. If messages do not contain a quantity, the function
+    replaces the quantity in the same way: a place by the place of the next vehicle towards the observer, a speed or a
+    command by 0.
 
     Args:
         state: true states of the worlds, [n, S], one row per world in the layout of ``physics.columns``.
@@ -102,7 +103,7 @@ def moved_on(speed: float, command: float, limit: float, duration: float) -> tup
 
 @compiled
 def move_on(speed: Floats, command: Floats, onset: Floats, limit: Floats, duration: Floats) -> tuple[Floats, Floats]:
-    """Return final speeds (m/s) and distances travelled (m): ``solo_motion`` of each vehicle, all arrays [n, N]."""
+    """Return final speeds (m/s) and distances (m) of all vehicles by ``motion.solo_motion``; all arrays are [n, N]."""
     after, way = np.empty(speed.shape), np.empty(speed.shape)
     for k in range(speed.shape[0]):
         for i in range(speed.shape[1]):

@@ -13,8 +13,8 @@ rear. With the speeds v- before and v+ after the impact, and the restitution e:
 After the impact, no vehicle of a cluster is faster than the vehicle in front of it.
 
 The argument ``table`` is one world in the layout of ``physics.rows``; ``first`` and ``last`` are the columns of the
-front and the rear vehicle of a cluster; ``restitution``, in [0, 1], holds for every impact. Passing one array from
-function to function takes little time; passing twenty small arrays would take more time than the physics.
+front and the rear vehicle of a cluster; ``restitution``, in [0, 1], holds for every impact. All quantities are in one
+array, because passing twenty small arrays from function to function would take more time than the physics.
 """
 
 from __future__ import annotations

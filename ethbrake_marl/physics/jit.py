@@ -400,7 +400,7 @@ Result = TypeVar("Result")
 def by_parts(work: Callable[[slice], Result], n: int, threads: int) -> list[Result]:
     """Call ``work`` for contiguous slices of the rows 0 to n - 1; return the results in the order of the slices.
 
-    There is one slice per thread, at most ``threads``. The calling thread works on the first slice, so ``threads=1``
+    There are at most ``threads`` slices, one per thread. The calling thread works on the first slice, so ``threads=1``
     starts no thread. If ``work`` raises errors, the function finishes the other slices and then raises the error of the
     first slice that has one. Raises ``InvalidInput`` unless ``threads`` is a whole number of at least 1.
     """

@@ -19,7 +19,7 @@ ring    the newest samples in a ring buffer, RING_HEAD + 3 N columns each: time,
 
 A scenario can say what a message contains (``v2x: tells``). Worlds of such a scenario are marked by a flag in the
 columns of the link from Vehicle 1 to itself. In these worlds, each sample also contains the *intents*: the commands
-of the N vehicles chosen at the last decision. If the flag is set, the array has three more groups of columns between
+that the N vehicles chose at the last decision. If the flag is set, there are three more groups of columns between
 *links* and *ring*, even without periodic messages:
 
 contents    N * CONTENTS: 1 if messages of this vehicle contain this quantity (see ``PIECES``), else 0
@@ -30,10 +30,10 @@ Arguments that several functions share:
 
 - ``messages``: the message columns of one world; returned column numbers are counted from the first of them
 - ``state`` [S], ``params``: one world in the layout of ``physics.columns``; ``column``: first column of each group
-- ``wanted``: commands of the vehicles chosen at the last decision, [N] m/s2
+- ``wanted``: commands that the vehicles chose at the last decision, [N] m/s2
 - ``pieces``: starts (s) and commands (m/s2) of braking profiles, [N, 2 K], as in ``Vehicles.pieces``, for all worlds
-- ``vehicles``: N; ``vehicle``, ``receiver``, ``sender``: indices from 0
-- ``time``, ``end`` and arguments that end in ``_s``: s
+- ``vehicles``, ``N``: number of vehicles; ``vehicle``, ``receiver``, ``sender``: indices from 0
+- ``time``, ``end`` and arguments whose names end in ``_s`` are in s
 """
 
 from __future__ import annotations
@@ -206,7 +206,7 @@ class Messages(NamedTuple):
 
     @classmethod
     def of(cls, worlds: Worlds) -> Messages:
-        """Return the messages of ``worlds``, in shared memory."""
+        """Return the messages of ``worlds``, with the array ``worlds.messages`` itself and not a copy."""
         return cls(worlds.messages, worlds.N)
 
     @staticmethod
@@ -295,7 +295,7 @@ class Messages(NamedTuple):
         return np.full(len(self.columns), np.inf) if seen is None else seen
 
     def known_pieces(self, vehicle: int, time_s: Floats) -> Bools:
-        """Return a mask [n, N, CONTENTS], True at (world, j, c) if ``vehicle`` knows quantity c of vehicle j.
+        """Return a mask [n, N, CONTENTS], True at (world, j, c) if ``vehicle`` knows ``PIECES[c]`` of vehicle j.
 
         The mask describes the time ``time_s`` [n]. It is valid for a vehicle j whose first message has arrived by then,
         and for a vehicle j in sight.

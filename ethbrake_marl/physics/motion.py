@@ -6,7 +6,7 @@ no event is missed. The formulas use only + - * / and sqrt, so a world's results
 Arguments that several functions share:
 
 - ``speed`` v: present speed, m/s; ``limit``: speed up to which the vehicle drives, m/s
-- ``command``: acceleration commanded, m/s2; negative brakes
+- ``command``: command in force (in ``solo_motion``: from ``onset`` on), m/s2; negative brakes
 - ``duration``: length of the motion, s
 - ``gap`` g: present gap of a pair, m, at least 0
 - ``closing`` w, ``pressing`` b: present closing speed (m/s) and constant closing acceleration (m/s2), rear minus front

@@ -32,8 +32,9 @@ front pair. A gap is negative while the vehicles of the pair overlap; nothing pu
 paper, section "Optimization Problem".
 
 The kernels take fields of ``Worlds`` and ``Vehicles`` under short names, for example ``gaps`` for ``gaps_m``; ``k`` is
-the index of a world in all arrays. ``first_harm``, ``total_harm`` (m2/s2) and ``count`` are first-impact harm, harm and
-number of all impacts of each pair, [n, P]; the kernels add to them.
+the index of a world in all arrays. ``command`` [n, N] are the commands, m/s2, not the accelerations in force.
+``first_harm`` and ``total_harm`` (m2/s2) are the two counts of harm, and ``count`` is the number of impacts, of each
+pair, [n, P]; the kernels add to them.
 """
 
 from __future__ import annotations
@@ -166,7 +167,6 @@ def sample_worlds(
     Sample 0 is at the time at which the latency of Vehicle 2 has elapsed. The function updates ``gaps``, ``speeds``,
     ``time`` and ``hit``.
 
-    - ``command``: commands, [n, N] m/s2.
     - ``until``: end times, [n] s; used only for a world whose end time is before sample 0.
     - ``step``: sampling period, s.
     - ``first``: number of the sample at which each world starts, [n]; -1 if it starts before sample 0.

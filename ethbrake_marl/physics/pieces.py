@@ -2,7 +2,8 @@
 
 A world in which a vehicle follows a braking profile is advanced by the functions for brakes that build up
 (``physics.build_up``), even if all brakes act at once. The argument ``table`` is one world in the layout of
-``physics.rows``. The *force* of a vehicle is the acceleration by its brakes or engine.
+``physics.rows``. A *piece* is the time interval of one command. The *force* of a vehicle is the acceleration that its
+brakes or engine alone would cause.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ def force_at(table: Floats, i: int, command: float, latency_s: float, time_s: fl
 def force_now(force: float, wanted: float, brake_rate: float, release_rate: float) -> float:
     """Return a vehicle's force (m/s2) just after the command ``wanted`` (m/s2) takes effect.
 
-    If the rate (m/s3) at which the force moves towards the command is infinite, the result is the command. Otherwise
-    the result is ``force``, the force just before.
+    The force falls to the command at the rate ``brake_rate`` or rises to it at the rate ``release_rate`` (m/s3). If
+    this rate is infinite, the result is the command; otherwise it is ``force``, the force just before.
     """
     return wanted if math.isinf(brake_rate if wanted < force else release_rate) else force

@@ -185,10 +185,10 @@ def place_rates(table: Floats, brake_rate: Floats, release_rate: Floats, pieces:
 def place_forces(
     table: Floats, force: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats
 ) -> None:  # fmt: skip
-    """Write brake and release rates, pieces and present forces of one world's vehicles into its table.
+    """Write brake and release rates, pieces and forces of one world's vehicles into its table.
 
-    ``force`` is [N] m/s2; the other arguments are as in ``place_rates``. If ``place_rates`` sets the entry BUILDS_UP to
-    0, the function writes no forces.
+    ``force`` are the present forces, [N] m/s2. The other arguments are as in ``place_rates``. If ``place_rates`` sets
+    the entry BUILDS_UP to 0, the function writes no forces.
     """
     place_rates(table, brake_rate, release_rate, pieces)
     if table[ROW.BUILDS_UP, 0] == 1.0:

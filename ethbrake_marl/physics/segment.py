@@ -33,12 +33,12 @@ from ethbrake_marl.physics.state import Floats
 def advance_table(
     table: Floats, restitution: float, duration: float, start_s: float, world: int, rows: Floats, recorded: int
 ) -> tuple[int, int]:
-    """Advance one world through a segment; return the number of recorded impacts and a status (DONE if successful).
+    """Advance one world through a segment; return the number of impacts so far and a code of ``FLAG``.
 
-    The function writes the harm of the segment to the rows FIRST_HARM and TOTAL_HARM, and the number of impacts to row
-    COUNT. It writes single impacts into ``rows`` like ``impact.record_impacts``; ``start_s`` is the absolute time at
-    the start of the segment, s, ``world`` the index of the world, and ``recorded`` the number of impacts before this
-    segment.
+    The code is DONE if the segment was completed. The function writes the harm of the segment to the rows FIRST_HARM
+    and TOTAL_HARM, and the number of impacts to row COUNT. It writes single impacts into ``rows``, like
+    ``impact.record_impacts``. ``start_s`` is the absolute time (s) at the start of the segment, and ``world`` the index
+    of the world. ``recorded`` is the number of earlier impacts, which the returned number includes.
     """
     if builds_up(table):
         return advance_on_cubics(table, restitution, duration, start_s, world, rows, recorded)
@@ -84,8 +84,8 @@ def move_apart(table: Floats, duration: float, building: bool) -> bool:
 
     If the result is False, the world has not moved. If both vehicles of a pair have constant accelerations, the time of
     their contact is computed exactly. If the acceleration of one of the vehicles changes, the function uses an upper
-    bound of the decrease of the gap. Without contact, the speed of a vehicle only rises or only falls within a segment
-    of length T. A gap therefore shrinks by at most ``(max rear speed - min front speed) T``.
+    bound of the decrease of the gap. Without contact, the speed of a vehicle only rises or only falls within the
+    segment of length T = ``duration``. A gap therefore shrinks by at most ``(max rear speed - min front speed) T``.
     """
     if building:
         return move_apart_on_cubics(table, duration)

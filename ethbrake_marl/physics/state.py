@@ -80,7 +80,7 @@ class Vehicles:
         return f"Vehicles({count_of(n, 'world')} of {N}, masses {_span(self.mass_t)} t)"
 
     def take(self, rows: ArrayLike) -> Vehicles:
-        """Return a copy of the parameters of the worlds that ``rows`` selects, as in ``Worlds.take``."""
+        """Return a copy of the parameters of the worlds that ``rows`` selects (indices, or a mask [n])."""
         index = np.asarray(rows)
         return _combined(lambda column: np.ascontiguousarray(column[index]), self)
 
@@ -171,7 +171,7 @@ class Vehicles:
 
     @property
     def _is_view(self) -> bool:
-        """Whether ``own_latency_s`` and ``known_from_s`` share the memory of ``latency_s`` (see ``at_once``)."""
+        """Whether ``own_latency_s`` and ``known_from_s`` share the memory of ``latency_s``: there is no V2X channel."""
         latency, news = self.latency_s, self.known_from_s
         return self.own_latency_s is latency and news.base is latency and news.strides[1:] == (latency.itemsize, 0)
 
@@ -323,7 +323,7 @@ class Worlds:
         return value
 
     def play_pieces(self, pieces: Mapping[int, Sequence[tuple[float, float]]]) -> Worlds:
-        """Return these worlds with braking profiles (fixed sequences of commands) for the vehicles in ``pieces``.
+        """Return these worlds with braking profiles for the vehicles in ``pieces``.
 
         ``pieces`` maps a vehicle (index from 0) to a sequence of pairs (start, deceleration), one for each command. The
         start is in s after the vehicle's latency, and the first start is 0. The deceleration is in m/s2. A vehicle
@@ -341,8 +341,8 @@ class Worlds:
     def refuse_build_up(self, who: str) -> None:
         """Raise ``InvalidInput`` if any vehicle has a finite brake or release rate, or a braking profile.
 
-        A function whose result would not be exact in these cases calls this check. ``who`` is its name in the error
-        message.
+        A function whose result would not be exact in these cases calls this check. ``who`` is the name of that function
+        in the error message.
         """
         slow = self.vehicles.build_up
         if self.vehicles.in_pieces.any():
@@ -414,9 +414,9 @@ class Worlds:
 
         The change of the gap to an added obstacle is the distance that Vehicle 1 travels, which worlds do not store. An
         added obstacle changes no motion, because its gap is larger than ``T sqrt(2 E / m_1)``: the distance that
-        Vehicle 1, of mass m_1, would travel in the time T if it had all the energy E that the line can have within T.
-        Impacts and brakes only remove energy. A vehicle of mass m that drives at the speed v with the acceleration a
-        adds at most the energy ``m a v`` per second, and only up to the speed limit.
+        Vehicle 1, of mass m_1, would travel in the time T = ``duration_s`` if it had all the energy E that the line can
+        have within T. Impacts and brakes only remove energy. A vehicle of mass m that drives at the speed v with the
+        acceleration a adds at most the energy ``m a v`` per second, and only up to the speed limit.
         """
         vehicles = self.vehicles
         driving = vehicles.driving_capacity_mps2 * vehicles.speed_limit_mps * duration_s[:, np.newaxis]

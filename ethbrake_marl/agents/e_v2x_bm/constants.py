@@ -7,8 +7,8 @@ methods save computing time:
 - A simulation ends as soon as no pair can have another impact (``will_stay_apart``).
 - A simulation ends as soon as its harm reaches a given number, because the harm can only grow.
 
-Several functions return a status code: ``FLAG.DONE`` or, if a simulation failed, the code of the failed check of the
-physics.
+Functions that simulate return a status code: ``FLAG.DONE`` or, if a simulation failed, the code of the failed check of
+the physics.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def make_line(
 def share_start(line: Line) -> int:
     """Simulate the motion in ``line.shared`` until the controlled vehicle's command takes effect.
 
-    The duration (s) of this motion is written to ``line.clock``. Returns a status code.
+    The duration (s) of this motion is written to ``line.clock``.
     """
     table, clock = line.shared, line.clock
     copy_table(line.start, table)
@@ -133,8 +133,7 @@ def simulate(line: Line, samples: Samples, first: int, end: int, bound: float) -
 
     ``share_start`` must have been called for ``line``; ``line.table`` is overwritten. The decelerations are
     ``samples.at[first:end]``. A simulation stops when its harm reaches ``bound`` (m2/s2). The sample of a stopped
-    simulation has a harm of at least ``bound``, and its ``other`` and ``course`` have no meaning. Returns a status
-    code.
+    simulation has a harm of at least ``bound``, and its ``other`` and ``course`` have no meaning.
     """
     for s in range(first, end):
         if s > first and samples.at[s] == samples.at[s - 1]:
@@ -151,7 +150,7 @@ def simulate(line: Line, samples: Samples, first: int, end: int, bound: float) -
 
 @compiled(within=True)
 def _simulate_one(line: Line, command: float, bound: float) -> int:
-    """Simulate one ``command`` (m/s2) of the controlled vehicle until the harm reaches ``bound`` (m2/s2)."""
+    """Simulate one ``command`` (m/s2) of the controlled vehicle, at most until the harm reaches ``bound`` (m2/s2)."""
     table, duration = line.table, line.clock[DURATION]
     table[ROW.COMMAND, line.controlled] = command
     _copy_state(line.start, table)
@@ -193,6 +192,7 @@ def _copy_state(of: Floats, table: Floats) -> None:
 
 @compiled(within=True)
 def copy_table(one: Floats, other: Floats) -> None:
+    """Copy every entry of the table ``one`` into the table ``other``."""
     for row in range(one.shape[0]):
         for i in range(one.shape[1]):
             other[row, i] = one[row, i]

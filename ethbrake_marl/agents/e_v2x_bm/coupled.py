@@ -102,11 +102,12 @@ def optimise_coupled(
 def _minimise(
     worlds: Worlds, told: Worlds, command: Floats, vehicle: int, rows: Ints, harm_count: HarmCount, horizon_s: float
 ) -> Floats:
-    """Return, for each of the m worlds with the indices ``rows``, the three results of ``search_line``, [3, m].
+    """Return the best deceleration and its harm under both counts in the m worlds with the indices ``rows``, [3, m].
 
-    ``command`` [n, N] m/s2 are the constant commands of all vehicles; the controlled vehicle's column is ignored.
-    ``told`` are the same worlds with other braking capacities, because the closed form assumes full braking: the
-    capacity of each braking vehicle except ``vehicle`` is replaced by the deceleration in ``command``.
+    The results are those of ``search.search_line``. ``command`` [n, N] m/s2 are the constant commands of all vehicles;
+    the controlled vehicle's column is ignored. ``told`` are the same worlds with other braking capacities, because the
+    closed form assumes full braking: the capacity of each braking vehicle except ``vehicle`` is replaced by the
+    deceleration in ``command``.
     """
     v = worlds.vehicles
     lines = (
@@ -148,9 +149,10 @@ def _search_worlds(
 ) -> None:  # fmt: skip
     """Search for the best deceleration of ``vehicle`` in the m worlds with the indices ``rows``.
 
-    ``found`` [3, m] receives the results of ``search_line``, and ``status`` [m] its status codes. ``capacity`` [n, N]
-    are the braking capacities (m/s2), and ``onset`` [n, N] are the times from now until each vehicle may brake (s). The
-    other arguments are as in ``make_line``, with a new first axis for the n worlds.
+    ``found`` [3, m] receives the three results of ``search.search_line``, and ``status`` [m] its status codes.
+    ``capacity`` [n, N] are the braking capacities (m/s2), and ``onset`` [n, N] are the times from now until each
+    vehicle may brake (s). The other arguments are as in ``constants.make_line``, with a new first axis for the n
+    worlds.
     """
     room, at, best = make_room(), np.empty(CANDIDATES), np.empty(3)
     for m in range(rows.shape[0]):
@@ -221,7 +223,7 @@ class EV2XBM:
 
 
 def make_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
-    """Make E-V2X-BM with the horizon and harm count of ``settings``; ``argument`` None means the mode ``coupled``."""
+    """Make E-V2X-BM in the mode ``argument`` (None: ``coupled``), with horizon and harm count of ``settings``."""
     if argument not in (None, "coupled", "pairwise"):
         then = "".join(f", then {variant!r}" for variant in variants_of("e_v2x_bm"))
         raise InvalidInput(f"agent {settings.spec!r}: after the first colon, write 'coupled' or 'pairwise'{then}")

@@ -124,9 +124,8 @@ def minimise_over(
 ) -> tuple[float, float]:
     """Return the deceleration (m/s2) of vehicle ``i`` for which the predicted harm is least, and this harm (m2/s2).
 
-    Only the six decelerations in ``at`` (m/s2) are compared. If several of them have the least harm, consider the
-    middle between the smallest and the largest of these: if the middle has the least harm as well, the middle is
-    returned; if not, the smallest one is returned.
+    Only the six decelerations in ``at`` (m/s2) are compared. If several of them have the least harm, the result is the
+    middle between the smallest and the largest of these if the middle does as little harm, otherwise the smallest.
     """
     best, first, last = math.inf, 0.0, 0.0
     for k in range(at.shape[0]):

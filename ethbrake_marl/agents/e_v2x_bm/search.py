@@ -3,7 +3,7 @@
 The search simulates evenly spaced decelerations (the *grid*), then more decelerations where the harm may be least. Then
 the search simulates decelerations around local minima and around *borders*, at which the number of impacts changes. If
 the result lies close to a jump of the harm, the search finally moves the result away from the jump. docs/evaluate.md
-gives the reasons for these steps.
+says how good the results are.
 
 Each function that simulates returns a status code: ``FLAG.DONE`` or, if a simulation failed, the code of the failed
 check of the physics. ``capacity`` is the braking capacity of the controlled vehicle (m/s2).
@@ -246,8 +246,9 @@ def narrow_minima(line: Line, room: Room) -> int:
 def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, to: int) -> int:
     """Narrow the interval from ``low`` to ``high`` (m/s2) around a local minimum of the harm to at most 1e-9 m/s2.
 
-    Each round divides the interval on each side of the best deceleration so far into three parts. The best deceleration
-    so far is sample ``to`` of ``found``. ``few`` is overwritten with intermediate results.
+    Each round divides the interval on each side of the best deceleration so far into three parts. Sample ``to`` of
+    ``found`` is the best deceleration so far, and is replaced by a better one. ``few`` is overwritten with intermediate
+    results.
     """
     while high - low > NARROWEST_MPS2:
         middle = found.at[to]
