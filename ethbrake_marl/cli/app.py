@@ -73,8 +73,8 @@ def run_command(arguments: Sequence[str]) -> int:
     """Run a command line (the arguments after ``ethbrake``) and return its exit status.
 
     The exit status is 0 for success, 2 for invalid input, wrong usage or a file error (the reason is printed in one
-    line on stderr), and 1 if the reader of the output has closed the pipe. Other errors are defects of the program and
-    are raised.
+    line on stderr), and 1 if the reader of the output has closed the pipe; a command may set another one, such as 130
+    after Ctrl-C. Other errors are defects of the program and are raised.
     """
     asked = _shell_asks(os.environ)
     try:
@@ -267,8 +267,9 @@ def with_installed(group: Any, name: str) -> Any:
 
 
 def whole_command() -> Any:
-    """Return all commands (of the core, extensions, installed packages and ``add_command``) as a Typer (click) group.
+    """Return all commands as a Typer (click) group.
 
+    These are the commands of the core, of extensions and installed packages, and those that ``add_command`` added.
     Raises ``AlreadyExists`` if two commands have the same name.
     """
     added = [name for name in COMMANDS if name not in _OURS and "." not in name]

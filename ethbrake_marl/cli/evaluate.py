@@ -60,7 +60,7 @@ def _task_of(scenario: str, chosen_settings: Settings) -> Task:
 
 
 def make_drivers(agents: str | Sequence[str], task: Task, *, bare: bool = False) -> dict[str, Any]:
-    """Return the agents named on a command line, by name; the arguments are as in ``make_lineup``."""
+    """Return the agents named on a command line, by name (``make_lineup``, where ``agents`` are ``specs``)."""
     return evaluation.make_lineup(agents, task.scenario, harm_count=task.harm_count, bare=bare)
 
 
@@ -253,7 +253,7 @@ def _json_text(content: object) -> str:
 
 
 def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: float) -> None:
-    """Print in how many of all ``worlds`` a vehicle still moves at the horizon, for each agent (``moving``)."""
+    """Print for each agent in how many (``moving``) of all ``worlds`` a vehicle still moves at the horizon."""
     text = ", ".join(f"{name} {count}" for name, count in moving.items() if count)
     if text:
         out.note(

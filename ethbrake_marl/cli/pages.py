@@ -1,4 +1,4 @@
-"""Registry of the functions that draw pages and pictures for commands, in which extensions register their own."""
+"""Registry of the functions that draw pages and pictures for commands; extensions register their functions here."""
 
 from __future__ import annotations
 

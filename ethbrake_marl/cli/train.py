@@ -210,7 +210,7 @@ def train_command(
 def _show(out: Out, result: training.TrainResult, scenario: str | None = None) -> None:
     """Print the harm of the trained agent and of full braking on stdout, and how the training ended on stderr.
 
-    The printed command names ``scenario`` (name or path); None: the scenario of the training run.
+    Also prints the command that evaluates the agent in ``scenario`` (name or path); None: the scenario of the training.
     """
     from ethbrake_marl.training.fixed_list import measure_full_braking
     from ethbrake_marl.training.progress import objective_in_words

@@ -22,9 +22,9 @@ from ethbrake_marl.scenario.task import Task
 class ShovedFront:
     """Measure how far other vehicles shove Vehicle 1 beyond the place that it would reach if nobody touched it.
 
-    ``shoved = distance that Vehicle 1 drives - own_way_m``, where ``own_way_m`` is the distance [n] that it would drive
-    until the horizon if nobody touched it. ``shoved`` is negative if Vehicle 1 ends short of that place, for instance
-    because an obstacle threw it back.
+    ``shoved = distance that Vehicle 1 drives - own_way_m``, where ``own_way_m`` [n] is the distance that Vehicle 1
+    would drive until the horizon if nobody touched it. ``shoved`` is negative if Vehicle 1 ends short of that place,
+    for instance because an obstacle threw it back.
     """
 
     def __init__(self, worlds: Worlds, own_way_m: Floats) -> None:
@@ -90,7 +90,8 @@ class SampledHarm:
 
         The time samples are the times of Vehicle 2's decisions. Sampled harm is therefore defined only if Vehicle 2 is
         the only controlled vehicle and no script reacts to the state of the world. It is not defined with an obstacle
-        or with brake force that builds up gradually, because the paper's equations describe neither.
+        or with brake force that builds up gradually, because the paper's equations describe neither obstacles nor such
+        brakes.
         """
         obstacle = task.scenario.has_obstacle or worlds.obstacle_ahead.any()
         if task.vehicles != (VEHICLE_2,) or obstacle or worlds.vehicles.build_up.any():

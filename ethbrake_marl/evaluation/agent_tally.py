@@ -1,7 +1,8 @@
 """Sums of one agent's measures over many worlds, and the means and intervals computed from these sums.
 
-The sums are exact, so they do not depend on the order in which worlds are added. In all functions, ``worlds`` is the
-number of worlds in the evaluation. A measure that lacks a value in at least one of them has no result (None).
+The sums are exact, so they do not depend on the order in which worlds are added. The argument ``worlds`` is the
+number of worlds in the evaluation. If a measure lacks a value in at least one of these worlds, its share, its sums and
+its estimate are None.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ class AgentTally:
         return so / worlds if of == worlds else None
 
     def sums(self, name: str, worlds: int) -> Moments | None:
-        """Return the sums of the numeric measure ``name``; None if it lacks a value in some world."""
+        """Return the sums of the numeric measure ``name``."""
         moments = self.moments.get(name)
         return moments if moments is not None and moments.count == worlds else None
 
@@ -72,7 +73,8 @@ def tally_agents(
         contexts: context of each set of measures (``contexts_of``), by the set's name.
         baseline: name of the agent with which the others are compared, unless a set of measures names its own baseline.
         objectives: objectives such as ``"social:45"`` (docs/cooperation.md). If this is a list, even an empty list, the
-            result also contains for each vehicle the sum of the harm that it bears and of the value of each objective.
+            result also contains, for each vehicle, the sum of the harm that it bears, and the sum of each objective's
+            value.
         clusters: name of each world's recording, [n]; None: all worlds are independent.
 
     """

@@ -57,8 +57,8 @@ class Lineup:
         agents: names of the agents.
         scenario: scenario whose learners the agents drive.
         harm_count: count of harm that agents minimise.
-        uncertainty: how far quantities may differ from their stated values, such as ``gaps_m=0.5``, for shields that
-            need it; None: no agent has such a shield.
+        uncertainty: for shields that need it: how far quantities may differ from their stated values, written as in
+            ``gaps_m=0.5``; None: no agent has such a shield.
         measures: names of the user's measures that every process loads (``load_measures``), some as ``FILE:NAME``.
         reported: names of all measures of the user whose values the evaluation reports.
         sets: names of the sets of measures that every process must have.
@@ -170,7 +170,7 @@ def _drive(lineup: Lineup, part: Sample, seed: int | None, first: int) -> Evalua
 
 
 def _only(outcome: Outcome, names: Sequence[str]) -> Outcome:
-    """Return the outcome with only the columns of the user's measures ``names`` in ``metrics``."""
+    """Return the outcome with ``metrics`` reduced to the columns of the user's measures ``names``."""
     metrics = {c: each for c, each in outcome.metrics.items() if c in names or c.rpartition("_")[0] in names}
     return replace(outcome, metrics=metrics)
 
@@ -189,8 +189,8 @@ def tally_list(
 
     The worlds are drawn and driven chunk by chunk, so memory does not grow with the length of the list. The result
     omits sets of measures whose computation takes longer than the simulation of the episodes. If ``objectives`` such as
-    ``"social:45"`` (docs/cooperation.md) are passed, the result also contains for each vehicle the sum of the harm that
-    it bears and of the value of each objective.
+    ``"social:45"`` (docs/cooperation.md) are passed, the result also contains, for each vehicle, the sum of the harm
+    that it bears, and the sum of each objective's value.
     """
     check_whole_number("episodes", episodes, 1, MOST_EPISODES)
     check_whole_number("seed", seed, 0)

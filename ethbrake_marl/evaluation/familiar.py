@@ -23,10 +23,10 @@ _TRAINED = 2_000  # number of worlds drawn from the training scenario to find th
 def warn_unfamiliar(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenario, vehicles: Sequence[int]) -> None:
     """Warn (``Unfamiliar``) about each trained policy that is to drive in worlds unlike its training worlds.
 
-    A policy's manifest contains its training scenario; ``worlds`` at the alert are compared with worlds drawn from this
-    scenario. If no worlds of the training scenario can be drawn on this machine, there is no warning. The comparison
-    considers only two features of the V2X channel: the latencies and the contents of messages. ``vehicles`` are the
-    indices (0 = front) of the vehicles that each agent drives.
+    A policy's manifest contains its training scenario; ``worlds`` (at the alert) are compared with worlds drawn from
+    this scenario. If no worlds of the training scenario can be drawn on this machine, there is no warning. The
+    comparison considers only two features of the V2X channel: the latencies and the contents of messages. ``vehicles``
+    are the indices (0 = front) of the vehicles that each agent drives.
     """
     drives: dict[str, tuple[str, Manifest, dict[str, None]]] = {}  # by hash: the first agent, vehicles in order
     for name, agent in agents.items():

@@ -54,8 +54,8 @@ def make_lineup(
             replaced by all agents of the group.
         scenario: scenario whose learners the agents drive.
         harm_count: count of harm that optimising agents minimise.
-        uncertainty: how far quantities may differ from their stated values, for instance ``gaps_m=0.5``, for shields
-            that need it (``make_agent``).
+        uncertainty: for shields that need it: how far quantities may differ from their stated values, written as in
+            ``gaps_m=0.5`` (``make_agent``).
         alone: whether to refuse teams.
         bare: whether to refuse agents that already have a shield and, if the scenario has one learner, also teams.
 

@@ -82,8 +82,8 @@ class MeasureSet:
     """Base class of a set of measures that need the same information about the worlds, the *context*.
 
     A subclass must list its measures in ``measures``. It may override ``prepare``, which computes the context once per
-    evaluation; ``row``, which adds fields to JSON results; and ``warnings`` and ``notes``, which add texts to a results
-    table, whose rows are their argument (``SummaryRow``, one per agent).
+    evaluation; ``row``, which adds fields to JSON results; and ``warnings`` and ``notes``, which get the rows of a
+    results table (``SummaryRow``, one per agent) and add texts to this table.
     """
 
     measures: tuple[Measure, ...] = ()  # measures with a column or a JSON key, in the order of JSON
@@ -243,7 +243,7 @@ def contexts_of(evaluation: Any, *, long_list: bool = False) -> dict[str, Any]:
 
 
 def silent_in_long_lists() -> dict[str, Silent]:
-    """Return the sets of measures that do not apply to more than 100,000 worlds, by name."""
+    """Return ``Silent`` for each set of measures that does not apply to more than 100,000 worlds, by the set's name."""
     return {name: Silent(why) for name, each in MEASURE_SETS.items() if (why := each.not_in_long_lists)}
 
 

@@ -126,7 +126,7 @@ class _Follower(Tape):
 
 
 def join_pieces(pieces: Floats, vehicles: int) -> Floats:
-    """Return the same motion (``EpisodeMotion.pieces``) of N = ``vehicles`` vehicles with fewer pieces.
+    """Return the same motion (``EpisodeMotion.pieces``) with fewer pieces; ``vehicles`` is the number N.
 
     A piece is dropped if the previous piece, continued to the beginning of this piece, leads to the same state up to
     rounding. If several pieces begin within the same 0.1 ms, only the last of them is kept.
@@ -143,8 +143,8 @@ def join_pieces(pieces: Floats, vehicles: int) -> Floats:
 def state_at(piece: Floats, time_s: float, vehicles: int) -> Floats:
     """Return the state [4 N] at ``time_s`` (since the alert) within ``piece``, a row of ``EpisodeMotion.pieces``.
 
-    The state is the position of Vehicle 1 (m), gaps (m), speeds (m/s), accelerations (m/s2) and jerks (m/s3) of N =
-    ``vehicles`` vehicles.
+    The state is the position of Vehicle 1 (m), gaps (m), speeds (m/s), accelerations (m/s2) and jerks (m/s3).
+    ``vehicles`` is the number N.
     """
     t, N = time_s - piece[0], vehicles
     speeds, rates, jerks = (piece[1 + part * N : 1 + (part + 1) * N] for part in (1, 2, 3))

@@ -94,7 +94,7 @@ class Outcome:
         return self.ledger.impacts
 
     def world_harm(self, harm_count: HarmCount) -> Floats:
-        """Return the harm (``first``-impact or ``total``) of the whole line in each world, [n] m2/s2."""
+        """Return the harm of the whole line in each world, [n] m2/s2: ``first``-impact harm or ``total`` harm."""
         return self.ledger.world_harm(harm_count)
 
     @property
@@ -108,7 +108,7 @@ class Outcome:
         return self.ledger.world_harm("total")
 
     def vehicle_harm(self, harm_count: HarmCount) -> Floats:
-        """Return the harm (``first``-impact or ``total``) that each vehicle bears in each world, [n, N] m2/s2."""
+        """Return each vehicle's part of the ``first``-impact or ``total`` harm in each world, [n, N] m2/s2."""
         return self.ledger.vehicle_harm(harm_count)
 
     @property
@@ -179,7 +179,7 @@ class LeftOut(NamedTuple):
     def line(worlds: Sequence[str], whole: int) -> str:
         """Return a note for the user that lists at most ten of the left-out ``worlds``.
 
-        ``worlds`` are descriptions with the reason; ``whole`` is the number of all worlds, including the left-out ones.
+        ``worlds`` describes each left-out world, with the reason; ``whole`` is the number of all worlds, with these.
         """
         named = [*worlds[:_NAMED], *(["and so on"] if len(worlds) > _NAMED else [])]
         return (

@@ -48,8 +48,8 @@ def measure_columns(terms: Mapping[str, Any], episodes: EpisodeImpacts | None) -
     """Return the values of every registered measure: name of a column -> values [n].
 
     A measure with one value per vehicle has the columns ``NAME_1``, ``NAME_2`` and so on. ``terms`` maps each measure
-    that is computed by step to its sum over each episode, [n] or [n, N]. The other measures, if there are any, are
-    computed from the impacts ``episodes``.
+    that is computed at each step to its sum over each episode, [n] or [n, N]. The other measures are computed from the
+    impacts ``episodes`` (None if there are no other measures).
     """
     columns: dict[str, Any] = {}
     for name, measure in REPORTED.items():

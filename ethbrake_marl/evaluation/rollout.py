@@ -123,7 +123,7 @@ def drive_chunk(
 ) -> Evaluation:
     """Let each agent drive all worlds of one chunk at once, from the alert to the end of their episodes.
 
-    ``vehicles`` are the indices (0 = front) of the controlled vehicles, ``first`` is the position of the chunk's first
+    ``vehicles`` are the indices (0 = front) of the controlled vehicles. ``first`` is the position of the chunk's first
     world among all evaluated worlds (from 0), for error messages. ``seed`` and ``aftermath`` are as in ``evaluate``. If
     the simulation of every world fails, the returned ``Evaluation`` contains no world.
     """
@@ -172,8 +172,9 @@ def _check_request(worlds: object, agents: object, chunk: object) -> None:
 def controlled_vehicles(scenario: Scenario, vehicle: int | str | None, agents: Mapping[str, Driver]) -> tuple[int, ...]:
     """Return the indices (0 = front) of the vehicles that the agents are to control.
 
-    They are ``vehicle`` (name or index) or, if ``vehicle`` is None, all learners of the scenario. If there are none
-    either, the result is empty if all agents are teams; otherwise ``InvalidInput`` is raised.
+    They are ``vehicle`` (name or index) or, if ``vehicle`` is None, all learners of the scenario. If ``vehicle`` is
+    None and the scenario has no learner, the result is empty, provided that all agents are teams; otherwise
+    ``InvalidInput`` is raised.
     """
     if vehicle is not None or (not scenario.learners and any(not isinstance(a, Team) for a in agents.values())):
         return (controlled_vehicle(scenario, vehicle),)

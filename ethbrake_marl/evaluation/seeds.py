@@ -8,8 +8,8 @@ resampled within each task (scenario), because seeds are random and tasks are no
 Arguments that several functions share: ``values``, ``baseline``, ``worst``, ``best`` and each of ``sides`` have one
 result per training run (seed) and world, [seeds, worlds], for the same worlds; the numbers of seeds may differ.
 ``clusters`` has the name of each world's cluster (``statistics``), [worlds]; None: all worlds are independent. ``seed``
-is the seed of the bootstrap's random numbers. All these functions raise ``InvalidInput`` if the arrays do not all have
-the same number of worlds, or if a value is not finite.
+is the seed of the bootstrap's random numbers. ``mean_over_seeds`` and ``share_over_seeds`` raise ``InvalidInput`` if
+the arrays do not all have the same number of worlds, or if a value is not finite.
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ class ModeRow:
     # (equal) and costly (lower), in this order; None if the shield replaced no decision.
     verdicts: tuple[float, ...] | None = None
     above_bound: int | None = None  # number of worlds whose harm exceeds the bound at the alert
-    left_out: LeftOutRows = ()  # (row, reason) of each world whose simulation failed
+    left_out: LeftOutRows = ()  # (row, reason) of each world left out because it failed with some agent
     policy_sha256: Mapping[str, str] = field(default_factory=dict)  # vehicle's name -> SHA-256 of its policy
 
     def to_json(self) -> dict[str, Any]:
@@ -142,7 +142,7 @@ def compare_modes(
     shield. If the simulation of a world fails with one agent, the world is left out for all agents.
 
     Args:
-        agents: agents or teams by name, without a shield. The objects that you pass do not change.
+        agents: agents or teams by name, without a shield (unless ``behind``). The objects that you pass do not change.
         worlds: worlds at the alert.
         task: the scenario, the controlled vehicles, and the count of harm that the shield bounds.
         behind: whether ``agents`` already have shields. If so, the policies behind shields in episode or step mode are

@@ -11,6 +11,7 @@ freedom (Cameron and Miller 2015, "A practitioner's guide to cluster-robust infe
 
 Arguments that several functions share: ``values``, ``baseline`` and ``others`` have one number per world, [n], for the
 same worlds in the same order. ``clusters`` has the name of each world's cluster, [n]; None: all worlds are independent.
+In the methods of ``Moments``, ``other``, ``others`` and ``baseline`` are the ``Moments`` of such numbers, and
 ``products`` is the exact sum over all worlds of ``value * other`` or ``value * baseline`` (``exact_sum``). ``mean``,
 ``share_of``, ``paired_difference`` and ``relative_decrease`` raise ``InvalidInput`` if an array is empty or not finite,
 or if the arrays have different lengths.
@@ -207,7 +208,7 @@ class Moments:
 
 
 def of_amounts(estimate: Estimate, *, nothing: bool) -> Estimate:
-    """Return the mean of non-negative values, ``estimate``, with its interval cut off below 0.
+    """Return the mean of non-negative values, ``estimate``, with its interval cut off at 0.
 
     ``nothing`` says that all values are 0. The result then has no interval, because zeros show that larger values are
     rare, but not how large such values can be.
@@ -240,7 +241,7 @@ def rate(successes: int, count: int) -> Estimate:
 def wilson(p: float, count: float) -> tuple[float, float]:
     """Return the ends (low, high) of Wilson's 95 % score interval of the observed share ``p``, 0 to 1.
 
-    ``count`` is the number of independent draws. Neither ``count`` nor ``p * count`` need be whole numbers.
+    ``count`` is the number of independent draws. Neither ``count`` nor ``p * count`` needs to be a whole number.
     """
     z = float(ndtri(_UPPER))
     shrink = 1.0 + z * z / count

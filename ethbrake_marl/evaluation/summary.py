@@ -122,7 +122,7 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", ["Agent", "Knows", *columns], lines)
 
     def terminal(self) -> Sheet:
-        """Return the table for a terminal with at least 80 columns, with the same text below as in ``markdown``."""
+        """Return the table for a terminal of at least 80 characters, with the same text below as in ``markdown``."""
         narrow = self._narrow()
         columns = [
             replace(each, wide=each.name not in narrow, interval="below" if each.name in _BELOW else "hidden")

@@ -35,7 +35,7 @@ def load_runnable(
 
     ``settings`` override values of the file. ``drives`` says how many learners the scenario must have: ``one`` (exactly
     one), ``some`` (at least one) or ``nobody`` (any number, because no agent is to drive). Raises ``InvalidInput`` if a
-    script does not work (the message names file, line, vehicle and script), or if the number of learners is wrong.
+    script does not work (the message names file, line, vehicle and script), or if the number of learners does not fit.
     """
     scenario = load_scenario(name_or_path)
     if settings:

@@ -57,8 +57,8 @@ UNSHOWN = object()  # passed as a value, means: do not show the value in the err
 def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
     """Raise, in a pydantic validator, the error for an invalid ``value``.
 
-    ``at`` is the path of the value inside the checked field, ``right`` says what would be valid, for example ``must be
-    above 0``.
+    ``at`` is the path of the value inside the checked field (``()``: the field itself). ``right`` says what would be
+    valid, for example ``must be above 0``.
     """
     shown = "" if value is UNSHOWN else flow_text(value, 60)
     raise PydanticCustomError("refused", "{right}", {"right": right, "value": shown, "at": at})

@@ -84,7 +84,7 @@ class Policy:
 
     @property
     def drivers(self) -> dict[str, Policy]:
-        """The policy for each vehicle that it learned to control, by vehicle name: ``{"vehicle_2": policy}``."""
+        """The policy itself for each vehicle that it learned to control, by vehicle name: ``{"vehicle_2": policy}``."""
         return dict.fromkeys(self.manifest.learners, self)
 
     @classmethod

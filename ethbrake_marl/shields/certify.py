@@ -3,10 +3,10 @@
 The *backup* is the shield's present plan. Two plans that begin with the proposed action are simulated: one continues
 with the rest of the backup, the other with the constant action that does the least harm. Each plan is simulated in all
 possible worlds (members) of a world, with the compiled functions of the module ``members``. The *harm of a plan* is the
-harm of the whole episode if the plan is executed from now on, in the worst possible world, m2/s2. The module ``step``
-proves that the harm of the episode never exceeds the bound at the alert.
+harm of the whole episode if the plan is executed from now on, the largest over the possible worlds, m2/s2. The module
+``step`` proves that the harm of the episode never exceeds the bound at the alert.
 
-Arguments that several functions share, for one world with M possible worlds, K shielded vehicles and L decisions:
+Arguments of the compiled functions, for one world with M possible worlds, K shielded vehicles and L decisions:
 
 - ``world``: parameters of the possible worlds.
 - ``states`` [M, S], ``ended`` [M]: their present states, in the layout of ``Running.states``, and whether their
@@ -19,8 +19,8 @@ Arguments that several functions share, for one world with M possible worlds, K 
 - ``out`` [K, 4]: receives each shielded vehicle's applied action, reason, bound and margin.
 - ``room`` [2, L, K], ``trial`` [L, K], ``tried`` [2, K]: workspaces for the plans and actions that are tried.
 
-Functions for n worlds take arrays of budgets [n], plans [n, L, K] and results [n, K, 4]; ``after`` and ``over`` then
-have n * M rows.
+Functions for n worlds take arrays of budgets and harms [n], plans [n, L, K] and results [n, K, 4]; ``after`` and
+``over`` then have n * M rows.
 """
 
 from __future__ import annotations

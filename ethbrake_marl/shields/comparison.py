@@ -11,7 +11,7 @@ from ethbrake_marl.physics.state import Bools, Floats, Worlds
 from ethbrake_marl.shields.certify import ends_of_plans
 from ethbrake_marl.shields.running import Running
 
-SLACK = 1e-9  # tolerance (m, m/s) around the range of several predicted worlds; a one alone must match exactly
+SLACK = 1e-9  # tolerance (m, m/s) around the range of several predicted worlds; a single one must match exactly
 
 # quantities of each pair in a state: name and unit
 GROUPS = (("gap", " m"), ("hit flag", ""), ("first-impact harm", " m2/s2"), ("total harm", " m2/s2"))

@@ -7,7 +7,7 @@ Arguments that several functions share:
 
 - ``world``: parameters of the possible worlds; ``m``: index of one of them.
 - ``states`` [M, S], ``ended`` [M]: present state of each possible world, in the layout of ``Running.states``, and
-  whether its episode has ended. ``state`` [S] is the state of one possible world.
+  whether its episode has ended. For one possible world: ``state`` [S] and ``ended``.
 - ``step``: number of the present decision.
 - ``action`` [K], ``plan`` [L, K]: actions of the shielded vehicles at one decision and at every decision.
 - ``after`` [M, S] or [S], ``over`` [M]: receive the states after the step, and whether the episodes have then ended.

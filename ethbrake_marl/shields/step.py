@@ -94,7 +94,7 @@ class StepShield:
     its prediction (a vehicle brakes beyond its capacity, a number is NaN, a message is missing), this world is marked
     in ``memory.distrusted`` [n], and its bound no longer holds. In a distrusted world the shield ignores proposals for
     the rest of the episode, and applies the rest of the plan or the best constant action, whichever does less harm. The
-    shield chooses again whenever a distrusted world differs from the prediction. If the engine continues an episode
+    shield chooses again whenever a distrusted world differs from the new prediction. If the engine continues an episode
     after the end that the shield predicted, the shielded vehicles brake fully.
 
     With several ``possible`` worlds for each world, each harm is the largest harm over the possible worlds, and each
