@@ -225,6 +225,8 @@ class Ranges:
     ) -> Worlds:
         """Return the estimated worlds of the estimating vehicle at the present time, [n].
 
+        Raises ``InvalidInput`` if brakes build up.
+
         Args:
             worlds: the true worlds; only the information that the vehicle received is read.
             way_m: [n] distance that the estimating vehicle has travelled since the alert, m.

@@ -10,10 +10,10 @@ the controlled vehicle may act; the leader already brakes at time 0. docs/intern
 every formula. The formulas use only + - * / and sqrt, so they give the same bits on every machine.
 
 Arrays that several functions share: ``gap`` [P], ``speed`` [N], ``braking`` and ``driving`` [N] (capacities, m/s2) and
-``limit`` [N] (speed limit, m/s) describe one world; ``onset`` [N] has the time from which on each vehicle may act. Each
-``onset``, ``start`` and ``until`` is in s after the moment at which the gaps and speeds are those in the arguments.
-``i`` is the index of the controlled vehicle. ``out`` [RESULT_WIDTH] is the verdict, into which the functions write;
-``decide_world`` explains its columns.
+``limit`` [N] (speed limit, m/s) describe one world; ``onset`` [N] has the time from which on each vehicle may act. The
+times ``onset``, ``start`` and ``until`` are in s after the moment of the given gaps and speeds. ``i`` is the index of
+the controlled vehicle. ``out`` [RESULT_WIDTH] is the verdict, into which the functions write; ``decide_world`` explains
+its columns.
 """
 
 from __future__ import annotations
@@ -304,9 +304,9 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
         scripts: script of each vehicle that is not controlled, by index, as in ``Scenario.roles``; only full_brake is
             allowed. None: all of them brake fully.
 
-    Raises ``InvalidInput`` for any other line, for a script other than full_brake, if the front vehicle may brake only
-    after the controlled vehicle may act, if a vehicle moves backward, or if vehicle_1 could reach an obstacle
-    (``obstacle_gap_m``) before any contact.
+    Raises ``InvalidInput`` for any other line, for a script other than full_brake, if brakes build up, if the front
+    vehicle may brake only after the controlled vehicle may act, if a vehicle moves backward, or if vehicle_1 could
+    reach an obstacle (``obstacle_gap_m``) before any contact.
 
     """
     worlds.refuse_build_up("avoidability")
