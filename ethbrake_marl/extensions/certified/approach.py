@@ -5,7 +5,8 @@ affine forms of a path may also enclose states of worlds with other impacts. The
 for the worlds that really have the impacts of the path.
 
 Arguments that several functions share: ``p`` is the index of the pair (vehicle ``p`` in front, vehicle ``p + 1``
-behind), ``motion`` the result of ``move_alone``, and ``length`` the duration of the piece, s.
+behind), ``motion`` the motion of all vehicles in the piece (``affine.Motion``), and ``length`` the duration of the
+piece, s.
 """
 
 from __future__ import annotations

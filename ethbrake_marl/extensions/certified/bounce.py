@@ -2,9 +2,9 @@
 
 Arrays without a stated shape are affine forms [W] (module ``affine``). Arguments that several functions share: ``p`` is
 the index of the pair (vehicle ``p`` in front, vehicle ``p + 1`` behind), and ``left`` the time from the impact to the
-end of the piece, s. ``motion`` is the result of ``move_alone``, and ``how`` the result of ``approach`` for pair ``p``.
-The functions write the speeds at the end of the piece into ``after``, the path after the impact, and the distances (m)
-that the two vehicles travel in the piece into ``way`` [N, W].
+end of the piece, s. ``motion`` is the motion of all vehicles without the impact, and ``how`` the result of ``approach``
+for pair ``p``. ``after`` is the path after the impact; the functions write the speeds of both vehicles at the end of
+the piece into it. They write the distances (m) that both vehicles travel in the piece into ``way`` [N, W].
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ def spring_apart(
 
 @compiled(apart=True)
 def stand_still(cell: Cell, pull: Floats, vague: float, left: float, speed: Floats, way: Floats) -> None:
-    """Correct the arrays ``speed`` and ``way`` (travelled distance) of a braking vehicle: it stands from the time at
-    which its speed would become negative.
+    """Correct ``speed`` and ``way`` of a braking vehicle in place: the vehicle stands from the time at which its speed
+    would become negative.
 
     Args:
         cell: only ``moving`` is read.

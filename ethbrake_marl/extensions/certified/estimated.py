@@ -199,8 +199,8 @@ class Ranges:
         return cls(vehicle, others, middle, low, high, float(world.obstacle_gap_m[0]))
 
     def at(self, share: Mapping[tuple[str, int], float] | None, key: str) -> Floats:
-        """Return the quantity ``key`` (a key of ``middle``) of every vehicle, [N], at the positions in its range
-        that ``share`` gives.
+        """Return the quantity ``key`` (a key of ``middle``) of every vehicle, [N]: the median, or the value at the
+        position that ``share`` gives.
         """
         value = self.middle[key].copy()
         for (name, j), part in () if share is None else share.items():
@@ -225,10 +225,12 @@ class Ranges:
     ) -> Worlds:
         """Return the estimated worlds of the estimating vehicle at the present time, [n].
 
+        Raises ``InvalidInput`` if brakes build up.
+
         Args:
             worlds: the true worlds; only the information that the vehicle received is read.
             way_m: [n] distance that the estimating vehicle has travelled since the alert, m.
-            share: positions of unknown quantities in their ranges, see the class.
+            share: positions of unknown quantities in their ranges, as the class docstring explains.
             foretold: the predicted present worlds, including impacts, and a mask [n, N]: True for a vehicle whose
                 predicted state replaces the state in its last message. None: the estimate uses no prediction.
 

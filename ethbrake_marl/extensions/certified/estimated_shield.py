@@ -8,9 +8,9 @@ most the bound at the first decision. This bound holds for two reasons: a later 
 contradict the message, and a new plan replaces the present plan only if the new plan is better in the remaining
 corners.
 
-Arguments that several methods share: ``worlds`` are the true worlds, ``rows`` [m] the indices of episodes in the batch,
-``due`` [n] is True for worlds that have a decision now, and ``way_m`` is the distance that the shielded vehicle has
-travelled since the alert, m.
+Arguments that several methods share: ``worlds`` are the true worlds, ``estimated`` the estimated worlds at the same
+time, ``rows`` [m] the indices of episodes in the batch, and ``way_m`` is the distance that the shielded vehicle has
+travelled since the alert, m, one number for each world.
 """
 
 from __future__ import annotations
@@ -209,6 +209,8 @@ class EstimatedShield:
     def _begin_anew(self, worlds: Worlds, estimated: Worlds, way_m: Floats, due: Bools) -> None:
         """Start the inner shield (``self.shield``) in worlds in which it has not started; restart it in worlds in which
         new information requires a restart.
+
+        ``due`` [n] is True for worlds that have a decision now.
         """
         shield, vehicle = self.shield, self.vehicle
         known = Told.to(worlds, vehicle)

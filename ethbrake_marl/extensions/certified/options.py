@@ -31,8 +31,8 @@ class RobustOptions(ShieldOptions):
         robust: worlds in which mode ``robust`` certifies actions: ``corners`` (fast) means only the ends of the
             intervals, and ``interior`` means all values in the intervals.
         estimated: if True, certify actions in the estimated world, which uses only the information that the vehicle
-            received and the scenario's ranges. Possible in modes ``step`` and ``robust`` with one learner, and without
-            ``uncertainty``, ``allowance``, ``cap``, ``logging`` and ``shares``.
+            received and the scenario's ranges. Allowed only in modes ``step`` and ``robust``, with one learner, and
+            without ``uncertainty``, ``allowance``, ``cap``, ``logging`` and ``shares``.
 
     Raises ``InvalidInput`` and ``UnknownName`` as ``eb.ShieldOptions`` does.
 

@@ -5,7 +5,8 @@ A *path* is a set of worlds with the same sequence of impacts (``affine.Path``).
 affine forms [W] (module ``affine``). Arguments that several functions share:
 
 - ``stack``: the paths that still have to be simulated; the functions may add paths.
-- ``motion``: the motion of each vehicle in the present piece as if alone on the road, from ``move_alone``.
+- ``motion``: the motion of each vehicle in the present piece: as if alone on the road (``move_alone``), or as one body
+  with the other vehicle of a pair in contact (``move_together``).
 - ``p``: index of a pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
 - ``how``: closing speed and time of the contact of pair ``p``, from ``approach``.
 - ``speed``: closing speed at the impact of pair ``p``, m/s.

@@ -70,7 +70,7 @@ def rough_rest(cell: Cell, own: Floats, backwards: float, since: float, path: Pa
         own: [N] largest speed that each vehicle can reach without an impact, m/s.
         backwards: largest backward speed of any vehicle at the time ``since``, m/s.
         since: present time, s after the first decision.
-        path: only read for which pairs have had an impact.
+        path: the function reads only which pairs have had an impact.
         hit: as in ``rough_harm``.
 
     """

@@ -175,7 +175,9 @@ class Uncertainty:
         return _placed(worlds, sides, lambda k: shares[k])
 
     def _sides(self, worlds: Worlds) -> list[_Side]:
-        """Return the uncertain numbers of ``worlds``."""
+        """Return the uncertain numbers of ``worlds``, each as (quantity, index of the vehicle or pair, smallest value
+        [n], largest value [n]).
+        """
         sides: list[_Side] = []
         for interval in self.intervals:
             every, name = _values(worlds, interval.quantity), interval.quantity
@@ -216,9 +218,9 @@ def parse_uncertainty(text: str) -> Uncertainty:
     """Make an ``Uncertainty`` from a text of entries ``quantity=half-width``, separated by commas, as in
     ``UNCERTAINTY_EXAMPLE``.
 
-    A half-width is a number in the quantity's unit, or a percentage of its value. ``.vehicle_2`` or ``.pair_1`` after
-    the quantity limits the entry to one vehicle or pair. Blanks around an entry and around its ``=`` are ignored.
-    Raises ``InvalidInput`` if ``text`` does not have this form.
+    A half-width is a number in the quantity's unit, or a percentage of the reported value. ``.vehicle_2`` or
+    ``.pair_1`` after the quantity limits the entry to one vehicle or pair. Blanks around an entry and around its ``=``
+    are ignored. Raises ``InvalidInput`` if ``text`` does not have this form.
     """
     entries = [entry.strip() for entry in text.split(",")]
     if "" in entries:

@@ -10,9 +10,10 @@ the controlled vehicle may act; the leader already brakes at time 0. docs/intern
 every formula. The formulas use only + - * / and sqrt, so they give the same bits on every machine.
 
 Arrays that several functions share: ``gap`` [P], ``speed`` [N], ``braking`` and ``driving`` [N] (capacities, m/s2) and
-``limit`` [N] (speed limit, m/s) describe one world; ``onset`` [N] has the time (s from now) from which on each vehicle
-may act. ``i`` is the index of the controlled vehicle. ``out`` [RESULT_WIDTH] is the verdict, into which the functions
-write (columns: see ``decide_world``).
+``limit`` [N] (speed limit, m/s) describe one world; ``onset`` [N] has the time from which on each vehicle may act. The
+times ``onset``, ``start`` and ``until`` are in s after the moment of the given gaps and speeds. ``i`` is the index of
+the controlled vehicle. ``out`` [RESULT_WIDTH] is the verdict, into which the functions write; ``decide_world`` explains
+its columns.
 """
 
 from __future__ import annotations
@@ -148,6 +149,8 @@ def leader_at_onset(
 def decide_front(gap: Floats, speed: Floats, onset: Floats, braking: Floats, i: int, out: Floats) -> bool:
     """Return whether full braking may keep vehicle ``i`` (at least 1) behind the front vehicle; False if contact is
     certain.
+
+    The function writes the columns REASON, MARGIN, SPARE and DRIVE of ``out``.
     """
     a_l, v_f, a_f = braking[i - 1], speed[i], braking[i]
     ahead, v_l = leader_at_onset(gap[i - 1], speed[i - 1], a_l, onset[i - 1], v_f, onset[i])
@@ -186,7 +189,10 @@ def plan_behind(
 
 @compiled
 def meets_rear_early(gap: Floats, speed: Floats, onset: Floats, braking: Floats, i: int, out: Floats) -> bool:
-    """Return whether the vehicle behind vehicle ``i`` has contact with vehicle ``i`` before vehicle ``i`` may act."""
+    """Return whether the vehicle behind vehicle ``i`` has contact with vehicle ``i`` before vehicle ``i`` may act.
+
+    If it has, the function writes the columns REASON and MARGIN of ``out``.
+    """
     v_f, v_r, a_r, start = speed[i], speed[i + 1], braking[i + 1], onset[i]
     lowest = lowest_while_coasting(gap[i], v_f, v_r, a_r, onset[i + 1], start)
     after, way, _ = solo_motion(v_r, -a_r, onset[i + 1], math.inf, start)
@@ -298,9 +304,9 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
         scripts: script of each vehicle that is not controlled, by index, as in ``Scenario.roles``; only full_brake is
             allowed. None: all of them brake fully.
 
-    Raises ``InvalidInput`` for any other line, for a script other than full_brake, if the front vehicle may brake only
-    after the controlled vehicle may act, if a vehicle moves backward, or if vehicle_1 could reach an obstacle
-    (``obstacle_gap_m``) before any contact.
+    Raises ``InvalidInput`` for any other line, for a script other than full_brake, if brakes build up, if the front
+    vehicle may brake only after the controlled vehicle may act, if a vehicle moves backward, or if vehicle_1 could
+    reach an obstacle (``obstacle_gap_m``) before any contact.
 
     """
     worlds.refuse_build_up("avoidability")

@@ -5,8 +5,8 @@ that must follow (``obstacle.after``). A *cell* is a set of first contacts: a ra
 speeds. The search halves cells until the smallest bound of any cell is close to the smallest harm that the search has
 reached. docs/internals/proofs/lower-bound.md has the proof.
 
-``proofs/__init__.py`` explains the arguments that functions share. ``count`` is the number of cells on the heap. Row 0
-of the heap is always the cell with the smallest bound.
+``proofs/__init__.py`` explains the arguments that functions share. A function with the argument ``count`` changes a
+binary heap in place: the first ``count`` rows of ``heap`` are cells, and row 0 is the cell with the smallest bound.
 """
 
 from __future__ import annotations

@@ -12,8 +12,8 @@ Arguments that several functions share, in addition to those in ``proofs/__init_
 - ``since``: time from which on the rear vehicle may brake less than fully, s.
 - ``power``: largest possible value of the rear vehicle's acceleration minus its acceleration under full braking, m/s2;
   infinite if other vehicles may push the rear vehicle.
-- ``search``: the numbers SINCE, POWER, FLOOR and BEST (see below), [SEARCH]. The functions lower BEST when they reach a
-  smaller harm.
+- ``search``: ``since``, ``power``, ``floor`` and ``best`` in the columns SINCE, POWER, FLOOR and BEST, [SEARCH]. The
+  functions lower BEST when they reach a smaller harm.
 - ``moved``: working memory for a changed copy of ``at``, [LINE.WIDTH]; overwritten.
 - ``heap``: heap of cells, [SEARCHED + 4, HEAP_WIDTH], of which the first ``count`` rows are used; changed in place.
 """

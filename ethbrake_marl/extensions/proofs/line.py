@@ -1,7 +1,7 @@
 """Columns of the arrays that describe worlds in the proofs, and the motion of a front or rear vehicle that nothing
 pushes.
 
-``at`` is the state of one world: a row of such an array, [LINE.WIDTH].
+``at`` is the state of one world: a row of such an array, [LINE.WIDTH]. Times are in s after the moment of this state.
 """
 
 from __future__ import annotations

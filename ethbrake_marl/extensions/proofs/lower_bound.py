@@ -1,7 +1,6 @@
 """``lower_bound``: a proven lower bound on the harm of every world, whatever the controlled vehicle does.
 
-``proofs/__init__.py`` explains the arguments that functions share. ``front`` and ``rear`` are lower bounds on the harm
-of the front pair alone and of the rear pair alone, m2/s2.
+``proofs/__init__.py`` explains the arguments that functions share.
 """
 
 from __future__ import annotations
@@ -257,7 +256,8 @@ def combined_bound(
     """Return a lower bound (m2/s2) on the harm of a world with unavoidable contact.
 
     The first contact may be with the front or the rear vehicle. The result is 0 if some of the harm that the bound
-    counts may come after the horizon ``until`` (s).
+    counts may come after the horizon ``until`` (s). ``front`` and ``rear`` are lower bounds on the harm of each pair
+    alone (m2/s2).
     """
     if not last_rest(at)[0] < until:
         return 0.0

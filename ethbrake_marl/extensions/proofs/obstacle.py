@@ -86,12 +86,12 @@ def least_beyond(
 
 @compiled(apart=True)
 def slowest(at: Floats, early: float, late: float, faster: float) -> tuple[float, float, float]:
-    """Return the smallest possible position (m) and the smallest possible speed (m/s), at ``late``, of a vehicle that
-    brakes after its first contact.
+    """Return the smallest possible position (m) and the smallest possible speed (m/s), at ``late``, of the controlled
+    vehicle after a first contact with the front vehicle, or of the centre of mass of these two vehicles.
 
-    The third result is the deceleration of the vehicle (m/s2): the largest braking capacity of all three vehicles, so
-    that no command and no push brings the vehicle further behind. ``faster`` is the speed of the vehicle minus the
-    speed of the front vehicle after the first contact, m/s.
+    The third result is the assumed deceleration (m/s2): the largest braking capacity of all three vehicles, so that no
+    command and no push leads to a smaller position. ``faster`` is the speed right after the first contact minus the
+    speed of the front vehicle right before it, m/s.
     """
     v_l, way = leader(at, late)
     brakes = max(at[LINE.A_F], at[LINE.A_L], at[LINE.A_R])
@@ -105,8 +105,8 @@ def last_drive(room: float, speed: float, brakes: float, drive: float, time: flo
     """Return how long (s) a vehicle must drive, after braking first, to travel ``room`` metres in ``time`` seconds in
     all.
 
-    The result is infinite if the vehicle cannot travel so far. ``speed`` is the present speed (m/s), ``brakes`` the
-    deceleration and ``drive`` the acceleration (m/s2).
+    The result is above ``time`` if the vehicle cannot travel so far. ``speed`` is the present speed (m/s), ``brakes``
+    the deceleration and ``drive`` the acceleration (m/s2).
     """
     stand = speed / brakes
     if time > stand:
@@ -121,8 +121,8 @@ def stopped_there(
     at: Floats, early: float, late: float, hard: float, beyond: float, struck: float, until: float, place: float,
     speed: float, brakes: float,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """Return three limits for a vehicle that the front vehicle stops at the obstacle: distance, backward speed and
-    time.
+    """Return three limits for the controlled vehicle if the front vehicle stops it at the obstacle: distance, backward
+    speed and time.
 
     The distance (m) is the vehicle's largest distance from the obstacle; it is infinite if no limit is known. The speed
     (m/s) is the vehicle's largest backward speed. The time (s) is the longest time that the vehicle can spend near the
@@ -317,7 +317,10 @@ def after(
     other: Floats,
 ) -> float:  # fmt: skip
     """Return the smallest harm (m2/s2) that must follow a first contact: the harm of the contact with the second
-    neighbour and, if there is an obstacle, the harm at the obstacle.
+    neighbour.
+
+    After a first contact with the rear vehicle, the result includes the harm at an obstacle. After a first contact with
+    the front vehicle it does not; ``after_at_obstacle`` adds this harm.
     """
     if kind >= RAMPED_FRONT:
         return after_ramped(kind, at, early, late, closing, plan, other)

@@ -2,8 +2,9 @@
 
 A *plan* is the motion of one vehicle, an array [2, PIECES]. A *piece* is a time interval of constant acceleration. Row
 ENDS has the end of each piece (in s from now; the last piece never ends). Row ACCELERATIONS has the acceleration in
-each piece (m/s2). A vehicle that brakes to rest stays at rest. The simulation needs no time steps, because the motion
-in each piece has a closed form. A function whose name begins with ``fill`` overwrites ``plan``.
+each piece (m/s2). A vehicle that brakes to rest stays at rest until its acceleration is above 0. The simulation needs
+no time steps, because the motion in each piece has a closed form. A function whose name begins with ``fill`` overwrites
+``plan``.
 """
 
 from __future__ import annotations

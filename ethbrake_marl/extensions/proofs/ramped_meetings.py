@@ -320,7 +320,7 @@ def at_onset_of(
 
 def check_asked(where: str, harm_count: str, horizon_s: object, time_step_s: object) -> None:
     """Raise ``InvalidInput`` for an unknown harm count, a horizon that is not a number, or a time step that is neither
-    None nor a number of at least ``LEAST_TIME_STEP_S``.
+    None nor a finite number of at least ``LEAST_TIME_STEP_S``.
 
     The error message begins with ``where``, the name of the calling function.
     """

@@ -154,8 +154,8 @@ def team_bound(
             any time.
 
     Raises ``InvalidInput`` if ``vehicles`` is empty, or has an unknown or repeated index. The function also raises
-    ``InvalidInput`` for a script other than full_brake, an unknown harm count, a time step below ``LEAST_TIME_STEP_S``,
-    and a horizon that is not finite or lies before the first of the vehicles may act.
+    ``InvalidInput`` for brakes that build up, a script other than full_brake, an unknown harm count, a time step below
+    ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before the first of the vehicles may act.
 
     """
     check_asked("team_bound", harm_count, horizon_s, time_step_s)
