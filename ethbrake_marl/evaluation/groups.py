@@ -16,9 +16,10 @@ def summarise_by(evaluation: Evaluation, by: str, *, baseline: str = BASELINE) -
     """Return one results table (``summarise``) for each group of worlds, by the group's name, in alphabetical order.
 
     Args:
-        evaluation: outcomes of the agents in worlds of a mixture of scenarios, or of a scenario with vehicle types.
-        by: ``"scenario"`` (one group for each scenario of the mixture), or the type of a vehicle, such as
-            ``"vehicle_2_type"``.
+        evaluation: outcomes of the agents in worlds of a mixture of scenarios, of a scenario with vehicle types, or of
+            a table with recordings.
+        by: ``"scenario"`` (one group for each scenario of the mixture), the type of a vehicle, such as
+            ``"vehicle_2_type"``, or ``"recording"``.
         baseline: name of the agent with which the other agents are compared.
 
     Raises ``InvalidInput`` if the worlds have no groups, and ``UnknownName`` if ``by`` is unknown.
@@ -34,7 +35,8 @@ def summarise_by(evaluation: Evaluation, by: str, *, baseline: str = BASELINE) -
     if not evaluation.kinds:
         raise InvalidInput(
             f"by = {by!r}: these worlds have no groups; worlds of a mixture can be grouped by 'scenario', worlds of a"
-            " scenario with vehicle_types by 'vehicle_1_type' and so on"
+            " scenario with vehicle_types by 'vehicle_1_type' and so on, worlds of a table with recordings by"
+            " 'recording'"
         )
     if by not in evaluation.kinds:
         raise unknown_name("group", by, evaluation.kinds)
