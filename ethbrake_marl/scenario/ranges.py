@@ -108,7 +108,7 @@ def ranges(scenario: ScenarioFields) -> Ranges:
     """Return the coordinates of the scenario's unit cube, one for every random number of a world.
 
     Raises ``InvalidInput`` if the scenario has nothing random. Also raises ``InvalidInput`` for a mixture, or a channel
-    other than ``paper``, because then a point of the unit cube would not determine a world.
+    with delays or losses (``V2X.delays``), because then a point of the unit cube would not determine a world.
     """
     if scenario.members:
         members = ", ".join(member.name for member in scenario.members)
