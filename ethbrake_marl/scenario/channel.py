@@ -379,7 +379,7 @@ class V2X(FileModel):
     def heard_and_seen(self, u: Floats, equipped: Equipped) -> tuple[Floats, Floats]:
         """Return (heard, seen): time from which vehicle i can use the first message of j, and delay until i sees j.
 
-        Both arrays have the shape [n, N, N] (world, i, j) and the unit s. Infinite means never.
+        Both arrays have the shape [n, N, N] (world, i, j) and the unit s. Infinite means never, minus infinite at once.
         """
         N = equipped.sends.shape[1]
         channel, links = self.channel, u.reshape(len(u), N, N, PER_LINK)

@@ -30,7 +30,7 @@ _UNUSED = 0.5  # value of uniform numbers without effect
 
 @dataclass(frozen=True, slots=True)
 class Ranges:
-    """Coordinates of a scenario's unit cube: name, stream and column of each random number of a world."""
+    """Coordinates of a scenario's unit cube: name, stream (``scenario.sampling``) and column of each random number."""
 
     scenario: ScenarioFields  # the scenario whose worlds the points of the cube determine
     names: tuple[str, ...]  # name of each coordinate, such as ``mass_t of vehicle_1``
