@@ -227,7 +227,7 @@ class AgentFailed(InvalidInput):
     def naming(name: str, others: Collection[str] = ()) -> Iterator[None]:
         """Context manager: if the block raises ``AgentFailed``, replace the agent's name in the error by ``name``.
 
-        An error of one of the agents ``others`` keeps the agent's name.
+        ``others`` are the names of the other vehicles' agents, which stay in their errors.
         """
         try:
             yield

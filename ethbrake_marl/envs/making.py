@@ -76,8 +76,9 @@ def make_engine(
         n: number of worlds that are simulated together, at least 1.
         learners: vehicles that learn, by name (``vehicle_2``) or index (0 = front); None: the learners of the scenario.
         reward: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams`` object.
-        observation: features that every vehicle observes, or a mapping from each vehicle's name to its features; None:
-            the features that the scenario declares or, if it declares none, default features.
+        observation: features that every vehicle observes, or a mapping from the names of some vehicles to their
+            features. By default, a vehicle observes the features that the scenario declares or, if it declares none,
+            default features (``observation_for``).
         seed: seed of the stream of worlds.
         reward_vector: components of a vector reward, which the result of a step then contains as ``vector``, in
             addition to ``reward``. None: there is no vector reward.

@@ -143,8 +143,9 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
             pictures.
         learners: vehicles that learn, by name (``vehicle_2``) or index (0 = front); None: the learners of the scenario.
         reward: ``harm``, ``total-harm``, ``paper``, a mapping with settings, or a ``RewardParams`` object.
-        observation: features that every vehicle observes, or a mapping from each vehicle's name to its features; None:
-            the features that the scenario declares or, if it declares none, default features.
+        observation: features that every vehicle observes, or a mapping from the names of some vehicles to their
+            features. By default, a vehicle observes the features that the scenario declares or, if it declares none,
+            default features (``observation_for``).
         agents: which vehicles are agents: ``all`` vehicles or only the ``learners``. Choose ``learners`` for training
             libraries that train every agent.
         max_cycles: number of steps after which an episode is truncated; None: at the horizon only.

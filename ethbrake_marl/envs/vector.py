@@ -246,8 +246,8 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
     def _renew(self, rows: Bools, seed: int | None, options: Mapping[str, Any]) -> None:
         """Start new episodes in the rows for which the mask ``rows`` [n] is true; all other episodes continue.
 
-        Raises ``InvalidInput`` if ``seed`` or an option chooses the worlds, because a reset with chosen worlds must
-        include all rows.
+        Raises ``InvalidInput`` for the first reset, or if ``seed``, an option or a new ``np_random`` chooses the
+        worlds, because such a reset must include all rows.
         """
         warn_of_unknown(options, self._known_options)
         starts = [name for name in (INITIAL_STATE, LISTED_WORLD) if name in options]

@@ -3,10 +3,10 @@
 Action -1 means full braking, 0 coasting and +1 full driving. The command is linear in the action from -1 to 0 and from
 0 to 1.
 
-Arguments that several functions share: ``names`` are the names of the vehicles that act, for error messages. ``count``
-is the number of discrete actions, whose indices (``index_to_action``) take the place of the actions; None: the actions
-are continuous. ``vehicle`` is an index (0 = front). ``braking`` is the largest deceleration of a vehicle, and
-``driving`` its largest forward acceleration, m/s2.
+Arguments that several functions share: ``names`` are the names of the vehicles that act, for error messages. If
+actions are discrete, ``count`` is their number, and each action is an index (``discrete_actions.index_to_action``);
+None: actions are continuous. ``vehicle`` is an index (0 = front). ``braking`` is the largest deceleration of a vehicle,
+and ``driving`` its largest forward acceleration, m/s2.
 """
 
 from __future__ import annotations

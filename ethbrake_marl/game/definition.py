@@ -65,7 +65,7 @@ class Game(Protocol):
 
     @property
     def by_link(self) -> bool:
-        """Whether each link between two vehicles has its own delays and losses; if not, a vehicle knows everything
+        """Whether delays, losses or contents of messages limit what vehicles know; if not, a vehicle knows everything
         after its latency.
         """
 

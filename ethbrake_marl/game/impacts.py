@@ -121,9 +121,9 @@ def _some(rows: ImpactRows, index: NDArray[Any]) -> ImpactRows:
 
 
 def impacts_within(before: Worlds, command_mps2: Floats, until_s: Floats, rows: Ints) -> ImpactRows:
-    """Return every impact in the worlds ``rows`` during a segment (a time interval with constant commands).
+    """Return every impact in the worlds ``rows`` (indices) during a segment, in which commands are constant.
 
-    The segment begins in the states ``before`` and ends at the times ``until_s``, [n] s. In the result,
+    The segment begins in the n states ``before`` and ends at the times ``until_s``, [n] s. In the result,
     ``ImpactRows.world`` is the index of the impact's world in ``before``.
     """
     impacts = advance(before.take(rows), command_mps2[rows], until_s=until_s[rows], record=True)[1].rows

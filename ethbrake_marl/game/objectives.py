@@ -143,7 +143,8 @@ def check_declared(declared: object) -> None:
 def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
     """Return the parsed objective of each vehicle, front to rear.
 
-    Raises ``InvalidInput`` for an invalid objective, or if the number of texts or of weights is not ``vehicles``.
+    ``declared`` is one text for all vehicles, or one text per vehicle. Raises ``InvalidInput`` for an invalid
+    objective, or if the number of texts or weights differs from the number of ``vehicles``.
     """
     check_declared(declared)
     each = (declared,) * vehicles if isinstance(declared, str) else tuple(declared)

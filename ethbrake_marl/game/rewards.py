@@ -204,7 +204,7 @@ class RewardParams(FileModel):
         vehicles have the objective ``total``, or if harm has weight 0, ``objective`` becomes None and the tuple of
         parsed objectives is empty. If harm has weight 0 and the scenario has another objective than ``total``, a
         warning (``WithoutEffect``) says that this objective has no effect. Raises ``InvalidInput`` if the objective of
-        the reward contains texts or weights for another number than ``vehicles``.
+        the reward contains texts or weights for another number of vehicles.
         """
         declared = of_scenario if self.objective is None else self.objective
         try:

@@ -60,8 +60,8 @@ def risk(
     gap and TTC the time to collision: ``TTC = max(d - d_safe, 0) / closing speed``. If the vehicles of the pair do not
     approach each other, the first summand of the risk is 0.
 
-    The arguments are tau (``ttc_scale_s``, s), d_safe (``safety_buffer_m``, m), d_target (``target_gap_m``, m), at
-    which the second summand is 1/2, and k_d (``distance_slope_per_m``, 1/m).
+    The arguments are tau (``ttc_scale_s``, s), d_safe (``safety_buffer_m``, m), d_target (``target_gap_m``, m) and k_d
+    (``distance_slope_per_m``, 1/m). At the gap d_target the second summand is 1/2.
     """
     closing = step.speeds_mps[:, 1:] - step.speeds_mps[:, :-1]
     room = np.maximum(step.gaps_m - safety_buffer_m, 0.0)

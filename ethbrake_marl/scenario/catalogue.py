@@ -205,8 +205,8 @@ def _with_members(document: Document, folder: Path) -> Document:
 def _with_rows(document: Document, at: YamlPath, content: Any, folder: Path) -> Any:
     """Return ``content``, the content of one scenario, with the rows of its table read from the table's file.
 
-    The path of this file is relative to ``folder``. Error messages name ``document`` and the place ``at`` of the
-    scenario in it (keys and indices; ``()``: the whole document is the scenario).
+    The path of this file is relative to ``folder``. Error messages name ``document`` and ``at``, the keys and
+    indices that lead to the scenario in ``document`` (``()``: the whole document is the scenario).
     """
     table = content.get("table") if isinstance(content, dict) else None
     if not (isinstance(table, dict) and isinstance(table.get("file"), str)) or "rows" in table:

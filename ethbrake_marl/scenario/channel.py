@@ -26,9 +26,9 @@ With ``persistence: first``, vehicle i knows the present state of vehicle j afte
 ``persistence: periodic``, vehicle j sends a message in every period T, and each message may be lost in a burst. Vehicle
 i then knows the state that is contained in the newest message that has arrived (``physics.messages``).
 
-Arguments that several functions share: ``u`` has the uniform numbers in [0, 1) that draw the random values of all
-links, [n, N * N * PER_LINK]. ``equipped`` is the V2X equipment, one row per world or one row for all worlds.
-``time_step_s`` is the time between two decisions, s.
+Arguments that several methods share: ``u`` has the uniform numbers in [0, 1) that draw the random values of all links,
+[n, N * N * PER_LINK]. ``equipped`` is the V2X equipment, one row per world or one row for all worlds. ``time_step_s``
+is the time between two decisions, s.
 """
 
 from __future__ import annotations
@@ -361,7 +361,7 @@ class V2X(FileModel):
         return PER_LINK * vehicles * vehicles
 
     def with_news(self, vehicles: Vehicles, u: Floats, equipped: Equipped) -> Vehicles:
-        """Return ``vehicles`` with the channel's delays in the latencies, and times from which each knows the others.
+        """Return ``vehicles`` with the channel's delays, in the latencies and in ``known_from_s``.
 
         The latencies in the argument ``vehicles`` must not include delays of a channel; they become ``own_latency_s``
         of the result.
@@ -379,7 +379,7 @@ class V2X(FileModel):
     def heard_and_seen(self, u: Floats, equipped: Equipped) -> tuple[Floats, Floats]:
         """Return (heard, seen): time from which vehicle i can use the first message of j, and delay until i sees j.
 
-        Both arrays have the shape [n, N, N] (world, i, j) and the unit s. Infinite means never.
+        Both arrays have the shape [n, N, N] (world, i, j) and the unit s. Infinite means never, minus infinite at once.
         """
         N = equipped.sends.shape[1]
         channel, links = self.channel, u.reshape(len(u), N, N, PER_LINK)
@@ -413,10 +413,11 @@ class V2X(FileModel):
         return replace(worlds, messages=messages.columns)
 
     def with_fixed_news(self, worlds: Worlds, time_step_s: float, where: str, equipped: Equipped | None) -> Worlds:
-        """Return the user's ``worlds`` with this channel's data added; raise ``InvalidInput`` if the channel is random.
+        """Return the user's ``worlds`` with this channel's data added.
 
-        ``worlds`` do not yet contain delays or messages of a channel. ``equipped`` is None if the equipment differs
-        randomly between worlds. The error message begins with ``where``, which says where the user gave the worlds.
+        Under the preset ``paper`` there is nothing to add. Under any other channel, ``InvalidInput`` is raised if the
+        channel is random, or if the equipment is (``equipped`` is None). ``worlds`` do not yet contain delays or
+        messages of a channel. The error message begins with ``where``, which says where the user gave the worlds.
         """
         if not self.by_link:
             return worlds
@@ -431,7 +432,7 @@ class V2X(FileModel):
 
 
 def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
-    """Return the number k of message periods that a burst of losses lasts, in the shape of ``u`` (any shape).
+    """Return the number k of message periods that a burst of losses lasts, in the shape of ``u`` (uniform numbers).
 
     For m = 1, 2, ..., the result k is at least m exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``, where p is
     ``loss_begins`` and r is ``loss_ends``. This rule is the inverse of the distribution function of k in the stationary

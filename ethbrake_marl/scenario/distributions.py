@@ -125,10 +125,10 @@ class Normal(_Distribution):
         return self.normal.low, self.normal.high
 
     def value(self, u: Floats) -> Floats:
-        """Return ``mean + sd Q(p_low + (p_high - p_low) u)``, where Q is the quantile function of the standard normal
-        distribution.
+        """Return ``mean + sd Q(p_low + (p_high - p_low) u)``.
 
-        The numbers p_low and p_high are the two probabilities that ``_bounds`` returns.
+        Q is the quantile function of the standard normal distribution; p_low and p_high are the two probabilities that
+        ``_bounds`` returns.
         """
         shape = self.normal
         below, above = self._bounds()

@@ -30,7 +30,7 @@ _UNUSED = 0.5  # value of uniform numbers without effect
 
 @dataclass(frozen=True, slots=True)
 class Ranges:
-    """Coordinates of a scenario's unit cube: name, stream and column of each random number of a world."""
+    """Coordinates of a scenario's unit cube: name, stream (``scenario.sampling``) and column of each random number."""
 
     scenario: ScenarioFields  # the scenario whose worlds the points of the cube determine
     names: tuple[str, ...]  # name of each coordinate, such as ``mass_t of vehicle_1``
@@ -108,7 +108,7 @@ def ranges(scenario: ScenarioFields) -> Ranges:
     """Return the coordinates of the scenario's unit cube, one for every random number of a world.
 
     Raises ``InvalidInput`` if the scenario has nothing random. Also raises ``InvalidInput`` for a mixture, or a channel
-    other than ``paper``, because then a point of the unit cube would not determine a world.
+    with delays or losses (``V2X.delays``), because then a point of the unit cube would not determine a world.
     """
     if scenario.members:
         members = ", ".join(member.name for member in scenario.members)

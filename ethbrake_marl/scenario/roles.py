@@ -41,7 +41,7 @@ class ScriptSpec(NamedTuple):
     def parse(spec: str) -> ScriptSpec:
         """Parse ``spec``, a text ``name[:argument]``.
 
-        Raises ``InvalidInput`` unless the name matches ``[a-z][a-z0-9_@.-]*`` and the argument has no spaces, and if
+        Raises ``InvalidInput`` if the name does not match ``[a-z][a-z0-9_@.-]*``, if the argument has spaces, or if
         ``spec`` names a Python file, because loading somebody else's scenario must not run code.
         """
         match = _SPEC.fullmatch(spec) if isinstance(spec, str) else None

@@ -59,9 +59,9 @@ def sample(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, chann
     scenarios, chosen by weight, and equals world k of that scenario under the same seed, bit for bit. Results on a
     mixture can therefore be compared world by world with results on its scenarios.
 
-    Raises ``InvalidInput`` for a negative ``seed`` or ``first``, and for ``n < 1``. If the scenario rejects early
-    impacts (impacts before the first learner can act), ``InvalidInput`` is also raised for a world that has an early
-    impact in each of ``MOST_ATTEMPTS`` draws.
+    Raises ``InvalidInput`` for a negative ``seed`` or ``first``, and for ``n`` outside [1, ``MOST_AT_ONCE``]. If the
+    scenario rejects early impacts (impacts before the first learner can act), ``InvalidInput`` is also raised for a
+    world that has an early impact in each of ``MOST_ATTEMPTS`` draws.
     """
     for name, value, least in (("number of worlds", n, 1), ("seed of the list", seed, 0), ("first world", first, 0)):
         check_whole_number(name, value, least)
@@ -175,9 +175,9 @@ def uniform_numbers(
     """Return uniform numbers in [0, 1) for worlds ``first`` to ``first + n - 1``, [n, width].
 
     Row k of the result depends only on ``seed``, ``channel``, ``attempt``, ``of``, ``width`` and the world number
-    ``first + k``. Each number is the upper 53 bits of a 64-bit integer from the Philox generator, divided by 2^53. A
-    rejected world is drawn again with the next ``attempt`` number (from 0). ``width`` must be a multiple of 4. ``of``
-    names the stream.
+    ``first + k``. Each number is the upper 53 bits of a 64-bit integer from the Philox generator, divided by 2^53.
+    ``attempt`` numbers the draws of a world, from 0: a rejected world is drawn again with the next number. ``width``
+    must be a multiple of 4. ``of`` names the stream.
     """
     sequence = np.random.SeedSequence([seed], spawn_key=(CHANNELS[channel], attempt, *of))
     key = sequence.generate_state(2, np.uint64)

@@ -38,7 +38,10 @@ class Algorithm(ABC):
         return (model.policy,)
 
     def tensors(self, actor: BasePolicy, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return a copy of the weights of ``actor``: name of a tensor in a policy bundle -> its values."""
+        """Return a copy of the weights of ``actor``: name of a tensor in a policy bundle -> its values.
+
+        ``actor`` is one of ``actors``, and ``network`` the description of its network in the policy bundle.
+        """
         return tensors_of(actor, network)
 
     def optimizers(self, model: BaseAlgorithm) -> Mapping[str, Optimizer]:

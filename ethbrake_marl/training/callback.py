@@ -44,7 +44,7 @@ class StopRequested(Exception):
 
 
 class Watchers(NamedTuple):
-    """Functions that a training run calls to measure its policies, to learn whether to stop, and to report progress."""
+    """Functions that a training run calls to measure its policies, to ask whether to stop, and to report progress."""
 
     evaluate: Evaluate | None  # takes the current policies and returns their metrics; None: no measurements
     stop_at: StopAt | None  # takes the metrics of an evaluation; returns a reason to stop, or None to continue

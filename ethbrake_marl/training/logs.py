@@ -14,9 +14,9 @@ from ethbrake_marl.training.run_folder import RunDirectory
 def open_logs(run: RunDirectory, state: TrainingState | None) -> list[KVWriter]:
     """Open ``progress.csv`` and the TensorBoard events of a run for writing.
 
-    ``state`` is the checkpoint from which the training run continues: log rows that were written after it are dropped.
-    None: the logs begin empty. Returns a writer for ``progress.csv`` and a writer for the TensorBoard events, both for
-    the argument ``output_formats`` of Stable-Baselines3's ``Logger``.
+    ``state`` is the checkpoint from which the training run continues: log rows that are newer than the checkpoint
+    are dropped. None: the logs begin empty. Returns a writer for ``progress.csv`` and a writer for the TensorBoard
+    events, both for the argument ``output_formats`` of Stable-Baselines3's ``Logger``.
     """
     run.progress.unlink(missing_ok=True)  # the path may be a link, whose target must not be overwritten
     if state is None:

@@ -55,6 +55,7 @@ class RunDirectory:
 
         ``config`` and ``team`` are the contents of ``config.json`` and ``team.json``; without ``team``, ``team.json``
         is not written. With ``force``, an earlier run (a folder with a ``run.json``) or an empty folder is replaced.
+        Raises ``AlreadyExists`` for any other existing path.
         """
         path, is_run = self.path, self.status.is_file()
         replace = force and path.is_dir() and not path.is_symlink() and (is_run or not any(path.iterdir()))

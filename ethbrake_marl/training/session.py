@@ -38,8 +38,8 @@ _BUSY = "another process is training in this folder"
 class TrainResult:
     """Result of ``train`` or ``resume``: the policies, and the evaluations during the training.
 
-    ``trained`` is the best policy: the policy with the least harm on the fixed list of worlds, or the last policy if
-    nothing was measured.
+    ``trained`` is the best policy: the policy with the least harm on the fixed list of worlds (or the smallest mean of
+    the learners' objectives, if they differ from the harm of the line), or the last policy if nothing was measured.
 
     >>> import ethbrake_marl as eb
     >>> short = {"n_envs": 8, "n_steps": 16, "batch_size": 64, "n_epochs": 1}

@@ -51,8 +51,9 @@ def read_settings(
     """Parse the settings of a command, and sort them by whether they belong to scenario, recipe or agents.
 
     For instance, ``mass_t=40`` and ``scenario.mass_t=40`` belong to the scenario, ``gamma=0.9`` to a recipe.
-    ``of_agents`` has the names of the settings of agents that the command allows, such as ``harm_count``. Raises
-    ``UnknownName`` for an unknown key, and ``InvalidInput`` for an ambiguous key or an invalid value.
+    ``recipes`` are the recipes whose keys may be set. ``of_agents`` has the names of the settings of agents that the
+    command allows, such as ``harm_count``. Raises ``UnknownName`` for an unknown key, and
+    ``InvalidInput`` for an ambiguous key or an invalid value.
     """
     known = {
         "scenario": {*Scenario.model_fields} - _NO_SETTING,
