@@ -64,7 +64,7 @@ class AveragedGatingNetwork(nn.Module):
         return self.seen[some], self.more[some]
 
     def choose(self, observation: Float32s) -> NDArray[np.int64]:
-        """Return the index of the expert that ``average`` chooses for each of the observations [rows, F], [rows]."""
+        """Return the index, [rows], of the expert that ``average`` chooses for each of the observations [rows, F]."""
         with torch.no_grad():
             chosen: NDArray[np.int64] = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
         return chosen

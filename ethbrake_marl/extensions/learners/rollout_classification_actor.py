@@ -101,7 +101,7 @@ class ChoosingActor(Deterministic):
 
     @torch.no_grad()
     def choose(self, observation: Float32s) -> Ints:
-        """Return the number of the choice with the highest score for each of the observations [rows, F], [rows]."""
+        """Return the number, [rows], of the choice with the highest score for each of the observations [rows, F]."""
         chosen: Ints = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
         return chosen
 
