@@ -52,7 +52,7 @@ class Deterministic(BasePolicy):
 
 
 class AveragedActor(Deterministic):
-    """Actor with two networks: ``learning`` is trained; ``average`` has running averages of its weights.
+    """Actor with two networks: ``learning`` is trained; ``average`` has running averages of the trained weights.
 
     A trained policy uses the averaged weights. They have the same names as in PPO of Stable-Baselines3.
 
