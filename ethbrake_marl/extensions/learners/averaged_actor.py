@@ -35,7 +35,7 @@ class Deterministic(BasePolicy):
         raise NotImplementedError
 
     def expect(self, observation: Float32s) -> Floats:
-        """Return the predicted absolute gradient of the return with respect to the action, [rows]."""
+        """Return the predicted absolute gradient, [rows], of the return with respect to the action."""
         raise NotImplementedError
 
     def act(self, observation: Float32s) -> Float32s:
@@ -43,7 +43,7 @@ class Deterministic(BasePolicy):
         return np.clip(self.means(observation), -1.0, 1.0)
 
     def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return copies of the averaged weights, by their names in a policy bundle with ``network``."""
+        """Return copies of the averaged weights, by name, for a policy bundle whose network is ``network``."""
         return tensors_of(self, network)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> Tensor:
@@ -52,7 +52,7 @@ class Deterministic(BasePolicy):
 
 
 class AveragedActor(Deterministic):
-    """Actor with two networks: ``learning`` is trained; ``average`` has running averages of its weights.
+    """Actor with two networks: ``learning`` is trained; ``average`` has running averages of the trained weights.
 
     A trained policy uses the averaged weights. They have the same names as in PPO of Stable-Baselines3.
 

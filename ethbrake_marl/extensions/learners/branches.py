@@ -4,8 +4,8 @@ In a branch, an offset is added to one learner's actions for a few steps; then t
 branches from the same state differ only in the offset: they use the same random numbers, so the same messages are lost.
 
 L is the number of learners, F the number of features of an observation, and m the number of worlds (or, in ``visit``,
-of decisions in all worlds together). ``engine`` simulates n worlds or branches; its state is changed. ``act`` is the
-policy of all learners. ``gamma`` is the discount factor per time step.
+of decisions in all worlds together). ``engine`` simulates n worlds or branches; the functions that simulate change its
+state. ``act`` is the policy of all learners. ``gamma`` is the discount factor per time step.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) ->
 def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) -> Floats:
     """Simulate all n worlds of an engine to the end, and return each learner's discounted return, [n, L].
 
-    ``decide`` gets the observations [m, L, F] and the indices of the m worlds whose simulation has not ended, and the
+    ``decide`` gets the observations [m, L, F], the indices of the m worlds whose simulation has not ended, and the
     number of steps so far; it returns the actions, [m, L].
 
     If harm is the only term of the reward, a simulation ends as soon as all vehicles are at rest and will stay at rest,

@@ -21,7 +21,8 @@ from ethbrake_marl.training.networks import ACTIVATIONS
 class AveragedGatingNetwork(nn.Module):
     """Gating network: from an observation of F features it chooses which of K experts acts.
 
-    The network ``learning`` is trained; ``average`` has running averages of its weights, and chooses the expert.
+    The network ``learning`` is trained; ``average`` has running averages of the weights of ``learning``, and chooses
+    the expert.
 
     A memory stores the observation, and the extra cost of each expert, for the last M decisions at which the experts
     were compared. The extra cost is the cost minus the cost of the cheapest expert.
@@ -64,7 +65,7 @@ class AveragedGatingNetwork(nn.Module):
         return self.seen[some], self.more[some]
 
     def choose(self, observation: Float32s) -> NDArray[np.int64]:
-        """Return the index of the expert that ``average`` chooses for each of the observations [rows, F], [rows]."""
+        """Return the index, [rows], of the expert that ``average`` chooses for each of the observations [rows, F]."""
         with torch.no_grad():
             chosen: NDArray[np.int64] = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
         return chosen

@@ -39,8 +39,8 @@ def smallest_offset(measured: Floats, least: float, most: float) -> float:
     large offsets, the result is ``least``.
 
     ``measured`` [n, 2] has rows of (absolute gradient, offset with which it was measured); offset 0 means that the row
-    is still empty. The gradients of the smaller half of the offsets are compared with those of the larger half.
-    ``least`` and ``most`` are the smallest and the largest offset that the recipe allows.
+    is still empty. The gradients measured with the smaller half of the offsets are compared with the gradients measured
+    with the larger half. ``least`` and ``most`` are the smallest and the largest offset that the recipe allows.
     """
     known = measured[measured[:, 1] > 0.0]
     halves = np.array_split(known[np.argsort(known[:, 1], kind="stable")], 2)

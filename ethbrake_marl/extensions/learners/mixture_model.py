@@ -139,9 +139,10 @@ class ExpertsModel(VineModel):
     def _compare(self, seen: Float32s, moments: State) -> tuple[Float32s, Floats, Float32s]:
         """Let each of K experts drive from B visited decisions to the end of the episode, to compare their costs.
 
-        The cost of an expert is minus its return, plus ``tie_break`` times its harm. The harm in this cost is the count
-        of harm that the reward does not use. The B decisions are drawn from the visited decisions (observations
-        ``seen`` [steps, rows, F]) at which the experts choose different actions.
+        The cost of an expert is minus its return, plus ``tie_break`` times its harm. This harm is in the harm count
+        that the reward does not use. The B decisions are drawn from the visited decisions (observations ``seen``
+        [steps, rows, F]) at which the experts choose different actions; ``moments`` are the states of the worlds at the
+        visited decisions.
 
         Returns the observations at the B decisions, [B, F], the cost of each expert, [B, K], and the weight of each
         decision in the loss (importance), [B].

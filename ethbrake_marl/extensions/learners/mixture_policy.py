@@ -40,7 +40,7 @@ class ExpertsPolicy(Deterministic):
         self.gate = AveragedGatingNetwork(flatdim(observation_space), rate, recipe)
 
     def _chosen(self, observation: Float32s, ask: Callable[[AveragedActor, Float32s], NDArray[Any]]) -> Floats:
-        """Return one number for each of the observations [rows, F], computed by the actor that the gate chooses.
+        """Return one number for each of the observations [rows, F], computed by the chosen actor.
 
         ``ask`` computes an actor's numbers from observations, such as ``AveragedActor.means``.
         """

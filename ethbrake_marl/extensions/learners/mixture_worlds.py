@@ -60,8 +60,8 @@ def drive_from(
 ) -> tuple[Floats, Floats]:
     """Let one policy drive from each of n states to the end of the episode, and measure its return and harm.
 
-    Returns two arrays [n] for the first learner: the return (NaN if the simulation failed), and the harm that it should
-    make small (m2/s2) under ``count`` (None: the count that the reward uses).
+    Returns two arrays [n] for the first learner: the return (NaN if the simulation failed), and the harm that this
+    learner should make small (m2/s2) under ``count`` (None: the count that the reward uses).
     """
     rows = engine.branch(start)
     nowhere = np.zeros(rows.n, np.int64)

@@ -47,7 +47,7 @@ class ChoosingActor(Deterministic):
 
     Each choice has a number. A choice with a number below ``first`` is a trained policy, which then computes the
     action. The other choices are actions, evenly spaced from -1 to 1. The network ``learning`` is trained; ``average``
-    has running averages of its weights, and chooses when the actor drives.
+    has running averages of the weights of ``learning``, and chooses when the actor drives.
 
     A memory stores the last M decisions at which C choices were compared. The *extra cost* of a choice is its cost
     minus the cost of the cheapest choice at the same decision. F is the number of features of an observation.
@@ -101,7 +101,7 @@ class ChoosingActor(Deterministic):
 
     @torch.no_grad()
     def choose(self, observation: Float32s) -> Ints:
-        """Return the number of the choice with the highest score for each of the observations [rows, F], [rows]."""
+        """Return the number, [rows], of the choice with the highest score for each of the observations [rows, F]."""
         chosen: Ints = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
         return chosen
 

@@ -84,10 +84,10 @@ class RolloutClassificationModel(VineModel):
     def _try_actions(self, seen: Float32s, moments: State) -> tuple[Float32s, Ints, Floats]:
         """Try C choices at each of B visited decisions: simulate the episode to its end after each choice.
 
-        ``seen`` [steps, rows, F] are the observations at the visited decisions. Returns the observations [B, F], the
-        numbers of the choices [B, C] (numbered as in ``ChoosingActor``), and their costs [B, C]. Column 0 is the
-        actor's own choice. The cost of a choice is minus the return from the decision on; the recipe's keys
-        ``tie_break``, ``caution`` and ``relative`` modify this cost.
+        ``seen`` [steps, rows, F] are the observations at the visited decisions, and ``moments`` the states of the
+        worlds. Returns the observations [B, F], the numbers of the choices [B, C] (numbered as in ``ChoosingActor``),
+        and their costs [B, C]. Column 0 is the actor's own choice. The cost of a choice is minus the return from the
+        decision on; the recipe's keys ``tie_break``, ``caution`` and ``relative`` modify this cost.
         """
         recipe, actor, learners = self.recipe, self.policy, len(self.engine.learners)
         observed, first, last = seen.reshape(-1, seen.shape[2]), actor.first, recipe.network.choices - 1

@@ -75,8 +75,9 @@ def choose_rows(
     """Draw ``count`` of the decisions ``rows``, at which several actions will be tried.
 
     ``observed`` [n, F] are the observations at all decisions; ``rows`` are indices in ``observed``. Decisions are drawn
-    as in ``draw_rows``, by the sizes that ``expect`` (such as ``Scout.expect``) predicts from observations. If
-    ``focus`` is 0 or ``expect`` is None, they are drawn uniformly and without replacement.
+    as in ``draw_rows``, with the sizes that ``expect`` (such as ``Scout.expect``) predicts from observations. If
+    ``focus`` is 0 or ``expect`` is None, they are drawn uniformly and without replacement (all of them, if they are
+    fewer than ``count``).
 
     Returns the indices of the drawn decisions in ``observed``, and the weight of each in the loss (*importance*), which
     is 1 if the decisions are drawn uniformly.

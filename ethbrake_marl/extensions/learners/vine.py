@@ -49,7 +49,7 @@ class Vine(Algorithm):
         return model
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return copies of an actor's averaged weights, by their names in a policy bundle with ``network``."""
+        """Return copies of an actor's averaged weights, by name, for a policy bundle whose network is ``network``."""
         tensors: dict[str, Float32s] = actor.tensors(network)
         return tensors
 

@@ -115,7 +115,7 @@ class VineModel(BaseAlgorithm):
         """At some visited decisions, try a higher and a lower action, and simulate the episode to its end after each.
 
         A tried action is the action of ``actor`` plus or minus an offset. ``seen`` [steps, rows, F] are the
-        observations at the visited decisions.
+        observations at the visited decisions, and ``moments`` the states of the worlds.
         """
         recipe, learners = self.recipe, len(self.engine.learners)
         moving = np.flatnonzero(moving_rows(moments).repeat(learners))

@@ -35,8 +35,8 @@ def harm_by_agent(
 ) -> Figure:
     """Draw the mean harm of each agent as a bar with its 95 % interval.
 
-    A vertical line marks the mean best known harm. Markers show the mean harm of the same agent in other tests, the
-    results ``elsewhere`` (key: title of the test). The figure is narrow enough for the screen of a phone. Raises
+    A vertical line marks the mean best known harm. Markers show the agent's mean harm in other tests; ``elsewhere`` has
+    the results of each test under its title. The figure is narrow enough for the screen of a phone. Raises
     ``InvalidInput`` if ``rows`` is empty.
     """
     if not rows:

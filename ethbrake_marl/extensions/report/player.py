@@ -68,8 +68,8 @@ def _impacts(motion: EpisodeMotion) -> list[list[float]]:
 
     The numbers are the time (s), the index of the pair, the closing speed (m/s), 1 for the first impact of the pair and
     0 for a later impact, the number of the impact in the episode (from 1), the first-impact harm so far, and the total
-    harm so far (m2/s2). If a pair has several impacts within the same 1 ms (``_BIN_S``), only the last one is returned.
-    The two harms so far at the last impact equal the recorded harms of the episode exactly.
+    harm so far (m2/s2). If a pair has several later impacts within the same 1 ms (``_BIN_S``), only the last is
+    returned. The two harms so far at the last impact equal the recorded harms of the episode exactly.
     """
     rows = motion.impacts
     order = np.argsort(rows.time_s, kind="stable")

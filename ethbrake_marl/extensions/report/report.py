@@ -408,7 +408,7 @@ def _empty(rows: SummaryTable) -> list[str]:
 
 
 def _table(sheet: Sheet, caption: str, names: set[str]) -> Part:
-    """Return those columns of ``sheet`` that have values and whose name is in ``names`` as a table."""
+    """Return a table of those columns of ``sheet`` that have values and whose name is in ``names``."""
     filled = set(sheet.filled())
     some = sheet.only(k for k, name in enumerate(sheet.names) if k == 0 or (name in names and k in filled))
     rows = [
@@ -430,7 +430,8 @@ def write_evaluation(
     """Write the page of ``ethbrake evaluate --report`` to the file ``path``.
 
     The agents drive some worlds again for the episode player. ``tell`` is called with the number of agents that have
-    done so, and the number of all agents. Raises the exceptions of ``Report.write``.
+    done so, and the number of all agents. ``harm_count`` is the count that the agents minimise. Raises the exceptions
+    of ``Report.write``.
     """
     done: list[str] = []
 

@@ -201,7 +201,10 @@ def _kept_or_searched(
 
 
 def chunks_left(scenario: Scenario, sample: Sample, *, budget: int, chunks: Path) -> tuple[int, list[Path]]:
-    """Return how many worlds ``search_list`` still has to search, and the damaged files in ``chunks``."""
+    """Return how many worlds ``search_list`` still has to search, and the damaged files in the folder ``chunks``.
+
+    The result is for a call of ``search_list`` with these arguments and no others.
+    """
     left, damaged = 0, []
     identity = task_problem(sample.worlds, Task(scenario, scenario.learners)).identity
     question = {"counts": list(HARM_COUNTS), "budget": budget, "search_seed": 0}
@@ -353,7 +356,8 @@ def fold_episodes(
     The agents' commands are recorded and simulated again; the table stores the harm of the second simulation. The
     table's header says in how many worlds the harm was lowered, under the agent's name ``name``. Worlds with best known
     harm 0 are skipped. If the simulation with an agent fails in a world, the harm of this world stays as it was. Raises
-    ``InvalidInput`` unless the scenario has exactly one learner.
+    ``InvalidInput`` unless the scenario has exactly one learner, or if the table is for another objective than
+    ``total``.
 
     ``agents`` has, for each harm count, an agent that minimises this count. Each episode is compared with the table
     under both counts.

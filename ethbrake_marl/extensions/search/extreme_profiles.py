@@ -5,8 +5,8 @@ vehicle drives fully for a while, brakes fully until it meets the vehicle ahead,
 form, the vehicle brakes fully, drives fully until the vehicle behind meets it, and brakes fully again. A random search
 seldom finds such profiles.
 
-Arguments that several functions share: ``ends`` [..., K] are the time steps at which the phases of a profile end, and
-``commands`` [..., K, 1] are the commands of the phases, m/s2; both are changed in place.
+Arguments that several functions share: ``ends`` [..., K] are the time steps at which the K phases of a profile end, and
+``commands`` [..., K, 1] are the commands of these phases, m/s2; both are changed in place.
 """
 
 from __future__ import annotations

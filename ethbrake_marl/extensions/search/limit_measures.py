@@ -133,7 +133,7 @@ class LimitMeasures(MeasureSet):
         }
 
     def warnings(self, rows: Sequence[SummaryRow]) -> Sequence[str]:
-        """Return a list with a warning if the best known harm is known for only some of the worlds; else empty."""
+        """Return the text ``Limits.warning`` as a list; an empty list if there is no warning."""
         warning = rows[0].more[NAME]["best_known_warning"]
         return [warning] if warning else []
 

@@ -53,8 +53,8 @@ class Outlook(NamedTuple):
     def due(self, worlds: Worlds, planned_s: Floats) -> Ints:
         """Return the indices of worlds that need a new plan.
 
-        A world needs a new plan if a vehicle moves, the horizon is not reached, and the last plan was made (at
-        ``planned_s`` [n], s) before the present time.
+        A world needs a new plan if a vehicle moves, the horizon is not reached, and the last plan was made before the
+        present time. ``planned_s`` [n] is the time of the last plan, s.
         """
         moving = (worlds.speeds_mps != 0.0).any(axis=1)
         return np.flatnonzero((worlds.time_s > planned_s) & (worlds.time_s < self.horizon_s) & moving)
@@ -152,7 +152,7 @@ class Planner:
         return Profiles(*memory["plan"]).commands_mps2[:, 0, 0], memory
 
     def _rest(self, held: Memory, time_s: Floats, problem: ProfileProblem) -> Profiles:
-        """Return the rest of each plan in ``held``, from the present time ``time_s`` [m] (s) on, as profiles [m]."""
+        """Return the rest of each of the m plans in ``held``, from the present time ``time_s`` [m] (s) on."""
         plan = Profiles(*held["plan"])
         passed = np.rint((time_s - held["planned_s"]) / self._outlook.time_step_s).astype(np.int64)[:, np.newaxis]
         ends = np.minimum(np.maximum(plan.ends - passed, 0), problem.last_step[:, np.newaxis])
@@ -181,7 +181,7 @@ def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
 
 
 def make_estimating_planner(argument: str | None, settings: AgentSettings) -> Agent:
-    """Return the agent ``planner:estimated`` or ``planner:CANDIDATES:estimated``; it searches the estimated world."""
+    """Return the agent ``planner:estimated`` or ``planner:CANDIDATES:estimated``; it plans in the estimated world."""
     return Estimating(make_planner(argument, settings), settings.needed_scenario(), shows=True)
 
 

@@ -4,7 +4,8 @@ Arguments that several functions share: a profile has at most K phases. ``ends``
 phases end, and ``commands`` [K, C] are the commands of the C controlled vehicles in each phase, m/s2. ``seed_ends`` [Q,
 K] and ``seed_commands`` [Q, K, C] are Q starting profiles. ``world`` has the ``bounds`` [C, 2], which are the least and
 the largest command of each vehicle (m/s2), and the state of its random stream, ``random`` [1]. ``states`` [K + 1, S]
-receives the state of the world at the start of each phase, S numbers; row 0 is the state at the first decision.
+receives the state of the world at the start of each phase, S numbers; row 0 must already contain the state at the first
+decision.
 """
 
 from __future__ import annotations

@@ -43,8 +43,9 @@ class BestHarm:
 
     Args:
         recall: function that returns the stored profiles, see ``Recall``.
-        scenario: scenario of the worlds; the agent minimises the scenario's objective. If ``scenario`` is None, the
-            agent minimises the harm of the line, and does not search a second time.
+        scenario: scenario of the worlds; the agent minimises the scenario's objective (if it is not ``total``, the
+            agent uses no stored profile and searches every world). If ``scenario`` is None, the agent minimises the
+            harm of the line, and does not search a second time.
         harm_count: harm count to minimise, ``first`` or ``total``.
         horizon_s: end of the episode, s.
         budget: number of profiles that each search simulates in a world without a stored profile.

@@ -1,10 +1,10 @@
 """Compiled random search that improves the commands of an episode.
 
 The search improves two sequences of commands by random changes of a few neighbouring steps. The first sequence comes
-from the caller. The second is the best of some random *templates*, because small changes of the caller's commands may
-miss the best commands. A template is a random braking profile of three phases: one command, then another command for a
-short while, then full braking. The search simulates one decision after the other, as the engine does, and therefore
-computes exactly the same harm as the engine.
+from the caller. The second is the best of some random *templates*; it is needed because small changes of the caller's
+commands may miss the best commands. A template is a random braking profile of three phases: one command, then another
+command for a short while, then full braking. The search simulates one decision after the other, as the engine does, and
+therefore computes exactly the same harm as the engine.
 
 Arguments that several functions share: ``budget`` is the number of candidates (sequences of commands) to simulate in
 each world. ``room`` has arrays for intermediate results. ``world`` is the world to simulate; a ``SearchWorld`` also has

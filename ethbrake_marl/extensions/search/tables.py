@@ -94,7 +94,7 @@ class BestHarmTable:
         return dict(self.header.get(LEFT_OUT, {}))
 
     def rows(self, identity: UInt64s) -> NDArray[np.int64]:
-        """Return the index in the table of each world with hash ``identity`` [m], [m]; -1: not in the table."""
+        """Return the row in the table, [m], of each world with hash ``identity`` [m]; -1: not in the table."""
         order = np.argsort(self.identity, kind="stable")
         place = np.minimum(np.searchsorted(self.identity[order], identity), len(order) - 1)
         rows = order[place]
@@ -118,7 +118,7 @@ class BestHarmTable:
                 raise InvalidInput(f"table of best known harm, {harm_count}: {error}") from None
 
     def harm(self, identity: UInt64s, harm_count: HarmCount) -> Floats:
-        """Return the best known harm of each world with hash ``identity`` [m], [m] m2/s2; NaN: not in the table."""
+        """Return the best known harm, [m] m2/s2, of each world with hash ``identity`` [m]; NaN: not in the table."""
         rows = self.rows(identity)
         if harm_count not in self.best:
             return np.full(rows.shape, np.nan)
@@ -180,7 +180,7 @@ def table_bytes(table: BestHarmTable) -> bytes:
     """Return the content of a table file: a compressed .npz without pickles.
 
     The unused phases of a profile are left out. The file contains the first byte of every command, then the second byte
-    of every command, and so on, because it is smaller that way.
+    of every command, and so on; in this order the commands compress better.
     """
     arrays: dict[str, NDArray[Any]] = {
         "header": np.frombuffer(json.dumps({"format": TABLE_FORMAT, **table.header}).encode(), np.uint8),

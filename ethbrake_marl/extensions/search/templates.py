@@ -21,10 +21,11 @@ def best_templates(problem: ProfileProblem, bound: Floats, *, number: int, seed:
     """Draw random templates in each world, and return the template with the least harm.
 
     Returns the commands of this template, [n, T] m/s2, and the number of steps of the episode under these commands,
-    [n]. The number of steps is 0 if no template does less harm than ``bound``. The result for a world does not depend
-    on the other worlds. Raises ``InvalidInput`` if several vehicles are controlled, or if ``number`` is below 1.
+    [n]. The number of steps is 0 if no template does less harm than ``bound`` [n], m2/s2. The result for a world does
+    not depend on the other worlds. Raises ``InvalidInput`` if several vehicles are controlled, or if ``number`` is
+    below 1.
 
-    A template whose harm is at least ``bound`` [n] (m2/s2) is rejected. ``number`` templates are drawn in each world.
+    ``number`` templates are drawn in each world.
     """
     check_whole_number("templates", number, 1)
     if len(problem.vehicles) != 1:

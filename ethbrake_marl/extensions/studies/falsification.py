@@ -93,9 +93,8 @@ def _spread(dimensions: int, seed: int) -> Iterator[Floats]:
 def far_apart(scored: Scored, count: int) -> Ints:
     """Choose at most ``count`` points of ``scored`` that have high scores and are far apart.
 
-    Return their row numbers, highest score first.
-
-    Any two of them differ by at least 0.1 in some coordinate. Points whose score is not finite are never chosen.
+    Return their row numbers, highest score first. Any two of the points differ by at least 0.1 in some coordinate.
+    Points whose score is not finite are never chosen.
     """
     order = np.argsort(-scored.scores, kind="stable")
     order = order[np.isfinite(scored.scores[order])]

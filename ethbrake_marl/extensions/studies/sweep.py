@@ -1,8 +1,8 @@
 """A sweep: read a list of training runs (jobs) from a YAML file, do them on Ray Tune, and write one table of results.
 
 The table is computed only from the folders of the training runs. It is the same, byte for byte, in whatever order and
-on whatever computers the training runs are done, and however often they are interrupted. In methods with an argument
-``path``, this is the sweep's folder.
+on whatever computers the training runs are done, and however often they are interrupted. In ``SweepPlan``, ``path`` is
+the sweep's folder (in the method ``read``: the sweep's file).
 """
 
 from __future__ import annotations
@@ -238,7 +238,8 @@ class SweepPlan:
         """Read the file of a sweep, and load the scenario and the recipe of every job.
 
         Raises ``InvalidInput``, which names the file, the line and the job, if a scenario, a recipe or a setting is
-        unknown, if those of a job do not fit together, or if two jobs request the same training run.
+        unknown, if the scenario, recipe and settings of a job do not fit together, or if two jobs request the same
+        training run.
         """
         file = SweepFile.read_as(path, "with a grid or a list of jobs")
         if not 1 <= file.size() <= MOST_JOBS:

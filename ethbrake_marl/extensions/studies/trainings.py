@@ -60,7 +60,8 @@ class TrainingJob:
     def steps_left(self) -> int:
         """Return the number of decisions until the end of the training run; 0 if the run has finished.
 
-        Raises ``InvalidInput`` if the folder contains a training run with other settings, or no training run at all.
+        Raises ``InvalidInput`` if the folder exists but contains no training run, or a training run with other
+        settings.
         """
         run, total = RunDirectory(self.folder), self.training.recipe.total_steps
         if not run.status.exists():

@@ -45,7 +45,7 @@ def run_trials(
         given: further keyword arguments of ``work``, the same for all trials.
         folder: folder of all results; every computer of a cluster must see it.
         config: settings of Ray Tune: search algorithm, scheduler and number of trials.
-        space: values that Ray Tune tries, by key; ``config`` has one value of each key.
+        space: values that Ray Tune tries, by key; the ``config`` that ``work`` gets has one value of each key.
         jobs: number of trials that run at once; None: one for each core.
         retries: number of times that a trial is started again after its process ended unexpectedly, or after an
             exception that is not an ``EthBrakeError``.
@@ -80,7 +80,7 @@ def run_trials(
 
 
 def _attempt(config: dict[str, Any], work: Callable[..., None], given: Mapping[str, Any], folder: Path) -> None:
-    """Run one attempt at a trial; for the arguments see ``run_trials``.
+    """Run one attempt at a trial with the configuration ``config``; for the other arguments see ``run_trials``.
 
     An ``EthBrakeError`` is caught and reported as the result of the trial, because Ray would repeat the trial after an
     exception.

@@ -3,7 +3,8 @@
 The table contains no times and no paths. If only one trial runs at a time, the table is the same, byte for byte,
 however often the search was interrupted.
 
-Arguments that several methods share: ``values`` has a value for each searched key. ``path`` is the tuning's folder.
+Arguments that several methods share: ``values`` has a value for each searched key. ``path`` is the tuning's folder (in
+``TuningPlan.read``: the tuning's file).
 """
 
 from __future__ import annotations
@@ -459,7 +460,7 @@ class TuningPlan:
         retries: int = 2,
         tell: OnProgress | None = None,
     ) -> TuningResult:
-        """Run trials until the folder contains ``trials`` trials, and write a table with a row for each trial.
+        """Run trials until the folder contains ``trials`` trials, and write a table of the trials that ended.
 
         Every run repeats the search from the first trial, with the stored proposals of earlier runs. The results of
         finished trials are read from their folders. Unfinished trials continue. The table is also written if Ctrl-C
@@ -612,7 +613,7 @@ class TuningResult:
 
     @property
     def best(self) -> Trial | None:
-        """Finished trial with the least harm (the first of several); None if no trial has finished."""
+        """Finished trial with the least harm, the first one if several have it; None if no trial has finished."""
         finished = [each for each in self.trials if each.harm is not None]
         return min(finished, key=lambda each: (each.harm, each.number), default=None)
 
