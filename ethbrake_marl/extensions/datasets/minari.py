@@ -282,7 +282,8 @@ def check_dataset(
 ) -> DatasetFormat:
     """Check that a dataset of ``scenario`` can be written to ``path``; return its format.
 
-    The arguments mean the same as in ``write_dataset``, as do the exceptions before the first episode.
+    The arguments mean the same as in ``write_dataset``. Raises the exceptions that ``write_dataset`` raises before the
+    first episode.
     """
     target = Path(path)
     is_file = target.suffix.lower() == ".parquet"

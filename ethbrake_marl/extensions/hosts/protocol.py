@@ -223,7 +223,10 @@ class _Grid:
 
 
 class _Run:
-    """Episodes that run in a host. The arguments mean the same as in ``drive_host``."""
+    """Episodes that run in a host.
+
+    ``team`` has the agents of all learners; the other arguments mean the same as in ``drive_host``.
+    """
 
     def __init__(self, host: Host, worlds: Worlds, team: Team, scenario: Scenario) -> None:
         self.host, self.team, self.scenario = host, team, scenario
