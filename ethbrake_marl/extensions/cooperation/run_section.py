@@ -116,8 +116,8 @@ def _train_alone(experiment: Experiment, tell: OnProgress) -> dict[str, Team]:
 def _without_messages(experiment: Experiment, tell: OnProgress) -> tuple[list[Compared], str]:
     """Train a team with sensors instead of messages; return comparisons with this team, and a sentence about it.
 
-    The list is empty if the scenario has no messages or is a mixture of scenarios, or if such a team cannot be trained.
-    The sentence then says why.
+    The list is empty if the scenario has no messages or is a mixture of scenarios, or if such a team cannot be trained
+    or compared. The sentence then says why.
     """
     evaluation, scenario = experiment.evaluation, experiment.evaluation.scenario
     if scenario.members or scenario.v2x.channel.hears == "none":

@@ -3,6 +3,8 @@
 A Minari dataset also contains the environment, which ``dataset.recover_environment()`` returns. In this environment,
 the recorded actions repeat the episodes bit for bit. To start in the world of an episode, call ``env.reset(seed=seed,
 options=options)`` with the ``seed`` and ``options`` in the metadata of the episode.
+
+Letters in shapes mean the same as in ``recording``.
 """
 
 from __future__ import annotations
