@@ -182,7 +182,7 @@ class LineTask(TaskClass):  # type: ignore[misc]
         return None
 
     def state_spec(self, env: Any) -> Any:
-        """Return the TorchRL spec of the state in ``env`` (input of a central critic), for a single world."""
+        """Return the TorchRL spec of the state in ``env``, for a single world."""
         spec = env.full_observation_spec_unbatched.clone()
         del spec[GROUP]
         return spec

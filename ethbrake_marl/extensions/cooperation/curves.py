@@ -1,4 +1,7 @@
-"""Figures of a sweep: harm of the line and of each vehicle (y axis) for each value of the varied key (x axis)."""
+"""Figures of a sweep: harm of the line and of each vehicle (y axis) for each value of the swept key (x axis).
+
+``results`` is the content of ``ablation.json``.
+"""
 
 from __future__ import annotations
 
@@ -36,10 +39,7 @@ def swept_axis(results: Json) -> str | None:
 
 
 def sweep_figures(results: Json, caption: str) -> list[Figure]:
-    """Return the two figures of a sweep, with swept values on a linear x axis, and with 95 % confidence intervals.
-
-    ``results`` is the content of ``ablation.json``.
-    """
+    """Return the two figures of a sweep, with swept values on a linear x axis, and with 95 % confidence intervals."""
     return [_harm_curves(results, caption), _who_bears(results, caption)]
 
 

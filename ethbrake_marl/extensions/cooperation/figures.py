@@ -210,7 +210,7 @@ def _reached(
 
 
 def _short(name: str) -> str:
-    """Return the name of a level for an axis: without ``cooperation-``, on two lines of text (``2`` and ``paper``)."""
+    """Return the name of a level for an axis: without ``cooperation-``, and with a line break at the first hyphen."""
     return name.removeprefix("cooperation-").replace("-", "\n", 1)
 
 

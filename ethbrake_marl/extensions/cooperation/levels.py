@@ -230,7 +230,10 @@ class Plan:
         return tuple(algorithm(recipe) for recipe in self.recipes)
 
     def trainings(self) -> Iterator[tuple[Level, str, TrainingJob]]:
-        """Yield each training run as (level, name of the algorithm, training run), ordered by seed."""
+        """Yield each training run as (level, name of the algorithm, training run), ordered by seed.
+
+        Levels without learners have no training runs.
+        """
         for seed in range(self.seeds):
             for recipe in self.recipes:
                 for level in self.levels:
@@ -262,7 +265,7 @@ class Plan:
         }
 
     def study_folder(self) -> StudyFolder:
-        """Return a ``StudyFolder``, which refuses a folder that contains results of other settings."""
+        """Return the ablation's ``StudyFolder``, which refuses a folder that contains results of other settings."""
         advice = f"give another folder (--output); to reuse its trained policies, give a copy without {SETTINGS}"
         written = (*FIGURES, *SWEEP_FIGURES, *(f"ablation.{ending}" for ending in ("html", "md", "csv", "json")))
         return StudyFolder(self.folder, "an ablation", self.settings(), record=SETTINGS, advice=advice, writes=written)

@@ -116,8 +116,8 @@ def _train_alone(experiment: Experiment, tell: OnProgress) -> dict[str, Team]:
 def _without_messages(experiment: Experiment, tell: OnProgress) -> tuple[list[Compared], str]:
     """Train a team with sensors instead of messages; return comparisons with this team, and a sentence about it.
 
-    The list is empty if the scenario has no messages or is a mixture, or if such a team cannot be trained. The sentence
-    then says why.
+    The list is empty if the scenario has no messages or is a mixture of scenarios, or if such a team cannot be trained
+    or compared. The sentence then says why.
     """
     evaluation, scenario = experiment.evaluation, experiment.evaluation.scenario
     if scenario.members or scenario.v2x.channel.hears == "none":
@@ -152,7 +152,7 @@ def _without_messages(experiment: Experiment, tell: OnProgress) -> tuple[list[Co
 def _joint_optimum(
     experiment: Experiment, outcomes: Mapping[str, Outcome], tell: OnProgress
 ) -> tuple[list[Compared], str]:
-    """Search the joint optimum; return a list with its comparison with the team, and a sentence about the search.
+    """Search the joint optimum; return a list that compares it with the team, and a sentence about the search.
 
     If the search is impossible, the list is empty, and the sentence says why.
     """
@@ -188,8 +188,8 @@ def _joint_optimum(
 def _train(experiment: Experiment, scenario: Scenario, folder: str, share: int, tell: OnProgress) -> Team:
     """Train the learners of ``scenario`` with the recipe of the run; return the trained team.
 
-    ``folder`` is a name inside the folder of the finished run. The new run makes 1 / ``share`` of its decisions. Raises
-    ``Stopped`` if the training run was interrupted or failed.
+    The new run is stored in ``folder`` inside the folder of the finished run, and makes 1 / ``share`` of the decisions
+    of the finished run. Raises ``Stopped`` if the new run was interrupted or failed.
     """
     recipe, path = experiment.trained.training.recipe, experiment.run.path / folder
     path.parent.mkdir(exist_ok=True)

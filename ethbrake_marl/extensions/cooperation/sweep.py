@@ -70,7 +70,7 @@ class Swept(NamedTuple):
 
     @property
     def setting(self) -> str:
-        """A setting such as ``objective=social:15``."""
+        """The value as a setting, such as ``objective=social:15``."""
         return f"{self.key}={self.word}{self.text}"
 
     @property

@@ -3,6 +3,8 @@
 A Minari dataset also contains the environment, which ``dataset.recover_environment()`` returns. In this environment,
 the recorded actions repeat the episodes bit for bit. To start in the world of an episode, call ``env.reset(seed=seed,
 options=options)`` with the ``seed`` and ``options`` in the metadata of the episode.
+
+Letters in shapes mean the same as in ``recording``.
 """
 
 from __future__ import annotations
@@ -282,7 +284,8 @@ def check_dataset(
 ) -> DatasetFormat:
     """Check that a dataset of ``scenario`` can be written to ``path``; return its format.
 
-    The arguments mean the same as in ``write_dataset``, as do the exceptions before the first episode.
+    The arguments mean the same as in ``write_dataset``. Raises the exceptions that ``write_dataset`` raises before the
+    first episode.
     """
     target = Path(path)
     is_file = target.suffix.lower() == ".parquet"

@@ -1,4 +1,7 @@
-"""Write recorded episodes to a Parquet file, with one row per agent, world and decision."""
+"""Write recorded episodes to a Parquet file, with one row per agent, world and decision.
+
+Letters in shapes mean the same as in ``recording``.
+"""
 
 from __future__ import annotations
 

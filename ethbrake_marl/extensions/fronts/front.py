@@ -168,10 +168,10 @@ def search_front(
 
 
 def least_largest(scenario: Scenario, worlds: Worlds, front: Front, *, budget: int = BUDGET, threads: int = 1) -> Borne:
-    """Search for commands that minimise the largest harm of a vehicle; return each vehicle's harm, [n, N] m2/s2.
+    """Search for commands that minimise the largest harm of a vehicle; return each vehicle's harm.
 
-    In every world, the largest harm of a vehicle is at most the largest harm of a vehicle under any profile of
-    ``front``, which was searched in the same worlds.
+    The result has [n, N] m2/s2 by harm count. In every world, the largest harm of a vehicle is at most the largest harm
+    of a vehicle under any profile of ``front``, which was searched in the same worlds.
     """
     count, task = front.harm_count, Task(scenario, scenario.learners, front.harm_count)
     parts = []
@@ -200,7 +200,7 @@ class Preferring(NamedTuple):
     def of(
         cls, scenario: Scenario, weights: Floats, agents: Sequence[str], silent: Sequence[str], harm_count: HarmCount
     ) -> Preferring:
-        """Return ``scenario`` with the fixed ``weights`` [N], and its agents by the specs ``agents`` and ``silent``."""
+        """Return ``scenario`` with the fixed ``weights`` [N], and agents with the specs ``agents`` and ``silent``."""
         fixed = scenario.replace(harm_weight=weights.tolist(), objective="preference")
         made = (make_agents(specs, fixed, harm_count=harm_count) for specs in (agents, silent))
         return cls(fixed, *made)
@@ -283,7 +283,7 @@ class Pool:
         self._borne: dict[HarmCount, list[Floats]] = {count: [] for count in HARM_COUNTS}
 
     def add(self, problem: ProfileProblem, profiles: Profiles) -> Borne:
-        """Add ``profiles``, one for each world of ``problem``; return the harm of each vehicle, [n, N] m2/s2."""
+        """Add ``profiles``, one for each world of ``problem``; return each vehicle's harm, [n, N] m2/s2 by count."""
         self._profiles.append(profiles)
         all_borne = problem.borne(profiles)
         for count, borne in all_borne.items():
@@ -293,7 +293,8 @@ class Pool:
     def choice(self, weights: Floats, harm_count: HarmCount) -> Ints:
         """Return the number (from 0, in the order of ``add``) of each world's best profile, [n].
 
-        This is the profile with the least weighted harm; among equals, with the least unweighted harm of the line.
+        This is the profile with the least harm weighted by ``weights`` [N]; among profiles with equal weighted harm, it
+        is the profile with the least unweighted harm of the line.
         """
         borne = np.stack(self._borne[harm_count])
         amounts = amounts_of(borne.reshape(-1, len(weights)), weights).reshape(borne.shape[:2])
@@ -302,7 +303,7 @@ class Pool:
         return np.asarray(np.where(amounts == least, whole, np.inf).argmin(axis=0))
 
     def best(self, weights: Floats, harm_count: HarmCount) -> Profiles:
-        """Return the profile with the least weighted harm in each world, [n]."""
+        """Return each world's best profile (see ``choice``), [n]."""
         chosen = self.choice(weights, harm_count)
         parts = [(k, np.flatnonzero(chosen == k)) for k in np.unique(chosen)]
         padded = Profiles.padded([self._profiles[k].take(rows) for k, rows in parts], 1)

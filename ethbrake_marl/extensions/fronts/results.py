@@ -33,8 +33,8 @@ def front_results(
     """Return the content of ``front.json``: the front, full braking, maximin, and the agents.
 
     All means have 95 % intervals over worlds or, if the worlds come from recordings, over recordings. For each choice
-    of weights, ``ratio`` is the mean weighted harm of an agent divided by that of the front (null if the latter is 0),
-    and ``above`` is the agent's mean weighted harm minus that of the front.
+    of weights, ``ratio`` is an agent's mean weighted harm divided by the front's (null if the front's is 0), and
+    ``above`` is the agent's mean weighted harm minus the front's.
 
     Args:
         front: the front.
@@ -99,8 +99,9 @@ def hypervolumes(front: Front, full_brake: Floats, clusters: Texts | None = None
     vehicle, the larger one of two numbers: its mean harm under full braking, and its largest mean harm on the front.
     ``share`` is an agent's hypervolume divided by the front's hypervolume. The 95 % intervals are percentiles over
     ``RESAMPLES`` bootstrap samples of the worlds, or of the clusters (recordings), whose names for each world are
-    ``clusters`` [n]. ``full_brake`` is the harm of each vehicle if the learners brake fully, [n, N] m2/s2. Raises
-    ``InvalidInput`` if an agent has the name ``front``.
+    ``clusters`` [n]. ``full_brake`` is the harm of each vehicle if the learners brake fully, [n, N] m2/s2, in the harm
+    count of ``front``. The result is empty for more than ``MOST_DIMENSIONS`` vehicles. Raises ``InvalidInput`` if an
+    agent has the name ``front``.
     """
     if len(full_brake.T) > MOST_DIMENSIONS:
         return []

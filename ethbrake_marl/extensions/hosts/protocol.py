@@ -223,7 +223,10 @@ class _Grid:
 
 
 class _Run:
-    """Episodes that run in a host. The arguments mean the same as in ``drive_host``."""
+    """Episodes that run in a host.
+
+    ``team`` has the agents of all learners; the other arguments mean the same as in ``drive_host``.
+    """
 
     def __init__(self, host: Host, worlds: Worlds, team: Team, scenario: Scenario) -> None:
         self.host, self.team, self.scenario = host, team, scenario
@@ -616,7 +619,10 @@ def _checked_dt(host: Host, scenario: Scenario) -> float:
 
 
 def _check_known(worlds: Worlds, scenario: Scenario, vehicles: tuple[int, ...]) -> None:
-    """Raise ``InvalidInput`` for brakes that build up, periodic messages and obstacles, which hosts do not support."""
+    """Raise ``InvalidInput`` for brakes that build up, periodic messages and obstacles, which hosts do not support.
+
+    ``vehicles`` are the indices of the controlled vehicles.
+    """
     scenario.play_pieces(worlds, vehicles).refuse_build_up("host")
     if worlds.messages.shape[1] or worlds.obstacle_ahead.any():
         what = "periodic messages or tells (v2x)" if worlds.messages.shape[1] else "an obstacle ahead (obstacle_gap_m)"

@@ -39,7 +39,7 @@ _SUMO_OPTIONS = (
 
 
 class SumoHost:
-    """Host that runs worlds as parallel roads of one SUMO simulation. A process can run only one at a time.
+    """Host that runs worlds as parallel roads of one SUMO simulation. A process can run only one simulation at a time.
 
     At the end of each step, every vehicle has exactly the speed that its command requires. SUMO integrates the motion
     with its ballistic method, and lets vehicles pass through one another. SUMO has no negative speeds, so a vehicle

@@ -101,10 +101,11 @@ class Chains:
         return self.names.get(number) or f"{number:.0f}"
 
     def _links(self, there: list[Any], by_id: dict[float, Any], row: bool) -> dict[float, Link]:
-        """Return the follower of each vehicle at one moment, by the vehicle's id; count faulty data.
+        """Return the follower of each vehicle at one moment, by the id of the vehicle ahead; count faulty data.
 
-        ``by_id`` has the states by id; if a vehicle is recorded twice, it has the first state. Without ``row`` (no
-        chains are formed at this moment), neither omitted nor faulty data are counted.
+        ``there`` are the states of all vehicles. ``by_id`` are the same states by id; of a vehicle that is recorded
+        twice, it has the first state. Without ``row`` (no chains are formed at this moment), neither omitted nor faulty
+        data are counted.
         """
         behind, in_lane = dict[float, Link](), dict[float, float]()  # in_lane: vehicle -> vehicle ahead in the lane
         if self.entry.by_lane:

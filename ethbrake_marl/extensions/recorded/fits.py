@@ -24,8 +24,9 @@ SLOWEST_MPS, LONGEST_S = 0.5, 60.0  # least speed and longest time gap of rows t
 def fit_rows(rows: Floats, draw: DataDraw) -> dict[str, Any]:
     """Return scenario keys with distributions of time gaps, of the line's mean speed, and of deviations from this mean.
 
-    ``rows`` [k, 2 N - 1] are gaps (m) and speeds (m/s) of k chains of N vehicles. Raises ``InvalidInput`` if fewer than
-    ``QUANTILES`` chains have speeds of at least ``SLOWEST_MPS``, and time gaps above 0 and at most ``LONGEST_S``.
+    ``rows`` [k, 2 N - 1] are gaps (m) and speeds (m/s) of k chains of N vehicles. ``draw`` is the kind of
+    distribution, not ``rows``. Raises ``InvalidInput`` if fewer than ``QUANTILES`` chains have speeds of at least
+    ``SLOWEST_MPS``, and time gaps above 0 and at most ``LONGEST_S``.
     """
     gaps, speeds = np.split(rows, [rows.shape[1] // 2], axis=1)
     times = gaps / np.maximum(speeds[:, 1:], SLOWEST_MPS)

@@ -65,11 +65,11 @@ def keep_states(
     names: dict[str, float],
     progress: Callable[[int, int], None],
 ) -> None:
-    """Read a recording, and write the states of its vehicles at regular times into the empty table ``state``.
+    """Read a recording, and write the states of its vehicles at regular times into a database.
 
-    ``names`` maps names of vehicles and lanes to numbers; new names are added to it. ``progress`` is called with the
-    amount of data read so far and the size of the file (KiB). Raises ``InvalidInput``, which names file, line and
-    column, for an impossible value, for instance a length of 0 m.
+    ``store`` is the database, with an empty table ``state``. ``names`` maps names of vehicles and lanes to numbers; new
+    names are added to it. ``progress`` is called with the amount of data read so far and the size of the file (KiB).
+    Raises ``InvalidInput``, which names file, line and column, for an impossible value, for instance a length of 0 m.
     """
     turned, first, stride, cars, states = np.empty((0, 2)), None, 1, 0, 0
     for piece in read_pieces(file, entry, list(entry.columns.values()), names, progress):
@@ -165,8 +165,8 @@ def _states(piece: Piece, entry: Format, ticks: Floats, turned: Floats) -> Float
 def _of_gaps(piece: Piece, entry: Format, ticks: Floats) -> Floats:
     """Return the states in the rows ``piece`` of an OpenACC file, like ``_states``.
 
-    Car k follows car k - 1 if the speeds of both cars and the gap between these cars (column ``IVS`` with the number k
-    - 1) are recorded. The first car of a queue has position 0. The position of every other car is minus the sum of the
+    Car k + 1 follows car k if the speeds of both cars and the gap between these cars (column ``IVS`` with the number k)
+    are recorded. The first car of a queue has position 0. The position of every other car is minus the sum of the
     gaps between it and the first car of its queue.
     """
     at = {name.lower(): k for k, name in enumerate(piece.columns)}

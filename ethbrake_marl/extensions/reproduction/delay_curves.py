@@ -62,7 +62,7 @@ _NUMBER, _DECISIONS = Column("Final return", digits=3), Column("Decisions", digi
 def _shipped_ends(settings: Reproduction) -> Made:
     """Evaluate shipped policies at low and high delay; return verdicts, a table and data.
 
-    The policies are evaluated under both ``READINGS``.
+    The policies are evaluated under both assumptions on when Vehicle 2 may act (``strategies.READINGS``).
     """
     episodes = min(2_000, settings.episodes)
     verdicts, rows, data = [], [], []
@@ -126,8 +126,9 @@ class Course:
     def unrest(self, points: int) -> Floats:
         """Return how much the return fluctuates in the second half of each run, [seeds].
 
-        The return is read at ``points`` equally spaced points, so runs of different lengths can be compared. The result
-        is the standard deviation of its changes from one point to the next, divided by abs(``rise``).
+        The return is read at ``points`` equally spaced points of this half, so runs of different lengths can be
+        compared. The result is the standard deviation of the changes from one point to the next, divided by
+        abs(``rise``).
         """
         return np.asarray(np.diff(self.returns_at(np.linspace(0.5, 1.0, points)), axis=1).std(axis=1) / abs(self.rise))
 
@@ -139,7 +140,7 @@ class Course:
 
     @property
     def spread(self) -> Floats:
-        """Standard deviation of the return over the runs, at each of k steps in the second half, [k]."""
+        """Standard deviation of the return over the runs, at each of k steps in their second half, [k]."""
         return np.asarray(self.returns.values[:, len(self.returns.steps) // 2 :].std(axis=0, ddof=1))
 
 

@@ -76,7 +76,10 @@ class Reproduction:
         ]
 
     def trained(self, wanted: Collection[str]) -> dict[str, list[Path]]:
-        """Return the recipes of groups whose training runs are all finished: ``group/recipe`` -> folders of seeds."""
+        """Return the recipes of which all training runs are finished: ``group/recipe`` -> folder of each seed.
+
+        ``wanted`` are the names of the groups.
+        """
         return {
             f"{group.name}/{name}": paths
             for group, name, paths in self.seeds_of(wanted)
@@ -241,8 +244,8 @@ FIRST_IMPACTS = stated("harm", "each pair's first impact", "sec:result, Experime
 def scenario_parameters(scenario: Scenario, **places: str) -> list[Parameter]:
     """Return the main quantities of a scenario, with the place where the paper states each.
 
-    ``places`` replaces places of ``_QUANTITIES``, by key of the scenario. An empty place means that the paper does not
-    state the value, which is then our default.
+    ``places`` maps keys of the scenario to places that replace the places in ``_QUANTITIES``. An empty place means that
+    the paper does not state the value, which is then our default.
     """
     content = scenario.model_dump(mode="json", exclude_none=True)
     parameters = [

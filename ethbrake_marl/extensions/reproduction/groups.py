@@ -103,8 +103,8 @@ def over_distance(
     """Return the result for a figure of the paper that shows harm against the sum of the two gaps.
 
     ``stem`` is the file name of figure and data, without ending. ``curves`` has results of ``by_distance`` by name of
-    the ``Reading``. ``lines`` are the strategies in the figure. ``parameters`` are listed on the page in addition to
-    those of the scenario.
+    the assumption on when Vehicle 2 may act (``strategies.Reading``). ``lines`` are the strategies in the figure.
+    ``parameters`` are listed on the page in addition to the parameters of the scenario.
     """
     panels = {
         reading: {

@@ -1,6 +1,6 @@
 """The paper's strategies, and two assumptions on the time at which Vehicle 2 may act.
 
-The first assumption (``Reading``) gives Vehicle 2 the latency that the paper states, the second a latency of 0.2 s.
+The first assumption gives Vehicle 2 the latency that the paper states, the second a latency of 0.2 s (``READINGS``).
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Reading:
     acts_s: float | None = None  # time at which Vehicle 2 may act (s); None: the latency of the scenario
 
     def scenario(self, name: str, **changes: object) -> Scenario:
-        """Return the shipped scenario ``name``, with Vehicle 2's latency ``acts_s`` unless this is None.
+        """Return the shipped scenario ``name``, in which Vehicle 2 has the latency ``acts_s`` (None: unchanged).
 
         ``changes`` are new values for other keys of the scenario.
         """
@@ -66,7 +66,10 @@ READINGS = (Reading("as stated"), Reading("Vehicle 2 acts at 0.2 s", 0.2))
 
 
 def lineup(scenario: Scenario, *specs: str) -> dict[str, Agent]:
-    """Return the agents with these specs, such as ``"full_brake"``, by their name in ``NAMES`` or else by spec."""
+    """Return the agents with the specs ``specs``, such as ``"full_brake"``, as name -> agent.
+
+    The name of an agent is the entry of its spec in ``NAMES``, or the spec itself if there is no entry.
+    """
     return {NAMES.get(spec, spec): agent for spec, agent in make_agents(specs, scenario).items()}
 
 

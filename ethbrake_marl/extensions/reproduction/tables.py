@@ -109,7 +109,7 @@ def selection_verdict(one: PaperRow, other: PaperRow, chosen: PaperRow) -> Verdi
     """Return a verdict on the printed number of collisions of the hybrid ``chosen``.
 
     In each world the hybrid chooses between the strategies ``one`` and ``other``, so it avoids a collision only in
-    worlds in which at least one of them does. Therefore it cannot avoid more collisions than both together.
+    worlds in which at least one of them does. Therefore it cannot avoid more collisions than the two together.
     """
     avoided = [row.episodes - row.collisions for row in (one, other, chosen)]
     together = avoided[0] + avoided[1]

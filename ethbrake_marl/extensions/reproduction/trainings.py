@@ -34,7 +34,7 @@ class TrainedRecipe:
     per_s: int  # decisions per second on one core (Intel Xeon), to estimate the time of the training
 
     def load(self, name: str, **changes: Any) -> TrainingRecipe:
-        """Return the recipe under the name ``name``, with this object's numbers and new values ``changes``."""
+        """Return the recipe as ``name``, with ``decisions``, ``every_updates`` and new values ``changes``."""
         recipe = load_recipe(self.recipe)
         evaluation = {**recipe.evaluation.model_dump(), "every_updates": self.every_updates}
         if "log_every_updates" in type(recipe).model_fields:  # otherwise the table has a row for every update

@@ -147,7 +147,7 @@ def _record_all(settings: Reproduction) -> Records:
 def play() -> Part:
     """Return an interactive player of the episodes in Scenarios 1 and 2, as a part of the page.
 
-    The player has one episode for each scenario, strategy and ``Reading``; at the start it shows PPO and SAC.
+    The player has one episode for each scenario, strategy and ``strategies.Reading``; it first shows PPO and SAC.
     """
     records = []
     for reading, number in _CELLS:
@@ -176,8 +176,9 @@ def _parameters() -> list[Parameter]:
 def _both(records: Records, reading: Reading, number: int, what: str, column: int) -> tuple[Floats, Floats]:
     """Return the values over time of one recorded quantity: under PPO, and under SAC at the same times.
 
-    ``what`` is an attribute of ``EpisodeRecord`` such as ``gaps_m``, and ``column`` the index (0 = front) of the
-    vehicle or pair. After the end of the shorter episode, its last value is repeated.
+    ``number`` is 1 or 2 (Scenario 1 or 2). ``what`` is an attribute of ``EpisodeRecord`` such as ``gaps_m``, and
+    ``column`` the index (0 = front) of the vehicle or pair. After the end of the shorter episode, its last value is
+    repeated.
     """
     pair = [records[reading, number, name] for name in _POLICIES]
     times = np.arange(0.0, float(max(record.time_s[-1] for record in pair)), 0.02)
