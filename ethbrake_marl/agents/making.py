@@ -105,8 +105,8 @@ def make_role(scenario: Scenario, vehicle: int, *, most_candidates: int | None =
     team = None if written.around else Team.of(_make_driver(written, settings), (vehicle,))
     if team is None or team.shield is not None:
         raise InvalidInput(
-            f"agent {spec!r}: a role cannot have a search or a shield; give {scenario.vehicle_names[vehicle]} the role"
-            f" {written.core}, or make it a learner"
+            f"agent {spec!r}: a vehicle that does not learn cannot have a search or a shield; give"
+            f" {scenario.vehicle_names[vehicle]} the role {written.core}, or make it a learner"
         )
     return team.drivers[vehicle]
 

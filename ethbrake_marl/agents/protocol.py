@@ -271,7 +271,7 @@ class Team:
                 raise InvalidInput(f"team {name!r}: key {vehicle!r}: must be the index of a vehicle, at least 0")
             if not isinstance(agent, Agent):
                 raise InvalidInput(
-                    f"team {name!r}: {agent!r} of vehicle_{vehicle + 1}: must be an agent, for instance one from"
+                    f"team {name!r}: vehicle_{vehicle + 1} = {agent!r}: must be an agent, for instance one from"
                     " make_agent"
                 )
         self.drivers = {int(vehicle): drivers[vehicle] for vehicle in sorted(drivers)}

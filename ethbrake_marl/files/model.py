@@ -89,7 +89,7 @@ class Wording:
         return list(dict.fromkeys(f.alias or name for model in models for name, f in model.model_fields.items()))
 
     def needed(self, path: YamlPath) -> str:
-        """Return what must be written for the missing key at ``path``."""
+        """Return advice on what to write into the file for the missing key at ``path``."""
         return self._needed
 
     def instead(self, key: str) -> str:

@@ -93,7 +93,7 @@ class QuantityRule:
     def owner(self, index: int) -> str:
         """Return the name of vehicle or pair ``index`` (from 0): ``vehicle_1``, or ``vehicle_1 to vehicle_2``.
 
-        The name is empty for a quantity with one value per world.
+        If the quantity has one value per world, the result is empty.
         """
         front = f"vehicle_{index + 1}"
         return {"vehicle": front, "pair": f"{front} to vehicle_{index + 2}", "world": ""}[self.per]

@@ -49,7 +49,7 @@ class ScenarioWording(Wording):
         return ""
 
     def needed(self, path: YamlPath) -> str:
-        """Return what must be written at ``path`` (keys and indices inside the file), with an example."""
+        """Return advice on what to write into the file at ``path`` (keys and indices), with an example."""
         key = path[-1]
         if path[0] == "mixture":
             return "write, for instance, {scenario: paper-random, weight: 2}"

@@ -45,8 +45,9 @@ Arguments that several methods share:
 - ``worlds``: n worlds at the alert; ``possible``: the M possible worlds of each world, [n * M], with the world itself
   first.
 - ``rows``: indices of the batch rows in which new episodes start, [n].
-- ``memory``: the shield's memory before the decision; ``asked``: True for each world in which to decide, [n].
-- ``seen``: the observed worlds, [n, columns]; the columns are the first columns of ``Running.states``.
+- ``memory``: the shield's memory before the decision; ``asked``: True for each world in which the shield
+  must choose an action, [n].
+- ``seen``: the observed state of each world, [n, columns], in the order of the columns of ``Running.states``.
 """
 
 from __future__ import annotations

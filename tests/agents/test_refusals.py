@@ -102,7 +102,7 @@ SEARCHES: dict[str, Callable[[], object]] = {
     "vehicle = 3: must be an index from 0 to 2": lambda: optimise_pairwise(WORLDS, 3),
     "deceleration_mps2[0, 1] = -1: must be finite and >= 0": lambda: pairwise_harm(WORLDS.take([0]), [1.0, -1.0, 1.0]),
     "team 't': key 'vehicle_2': must be the index of a vehicle, at least 0": lambda: Team({"vehicle_2": BRAKE}, "t"),
-    "team 't': 'coast' of vehicle_2: must be an agent, for instance": lambda: Team({1: "coast"}, "t"),
+    "team 't': vehicle_2 = 'coast': must be an agent, for instance": lambda: Team({1: "coast"}, "t"),
     "team 't': drives vehicle_2; must drive exactly vehicle_2": lambda: Team.of(Team({1: BRAKE}, "t"), (1, 2)),
     "scenario 'cooperation-3-pair': this function needs exactly one controlled vehicle; the controlled": lambda: (
         eb.evaluate(PAIR.sample(2, 0), {"b": BRAKE}, scenario=PAIR).vehicle

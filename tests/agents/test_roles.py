@@ -123,12 +123,12 @@ def check_nothing_around(spec, around):
     with pytest.raises(InvalidInput) as caught:
         script_agents(scripted("paper-random", f"{spec}{around}"))
     assert str(caught.value) == (
-        f"agent '{spec}{around}': a role cannot have a search or a shield; give vehicle_2 the role"
-        f" {spec}, or make it a learner"
+        f"agent '{spec}{around}': a vehicle that does not learn cannot have a search or a shield; give vehicle_2 the"
+        f" role {spec}, or make it a learner"
     )
 
 
 def test_role__is_no_team_behind_a_shield():
     eb.register_agent("behind", lambda argument, settings: eb.make_agent("coast+step", scenario="paper-random").on([1]))
-    with pytest.raises(InvalidInput, match="agent 'behind': a role cannot have a search or a shield"):
+    with pytest.raises(InvalidInput, match="'behind': a vehicle that does not learn cannot have a search or"):
         script_agents(scripted("paper-random", "behind"))

@@ -364,8 +364,8 @@ def bound_box(
     that were examined.
 
     The search stops when the bound of the whole box is at most ``enough`` (m2/s2), or after ``cells`` parts. If
-    ``only_enough`` is True, it stops examining a part as soon as the part's harm may exceed ``enough``; a result above
-    ``enough`` is then no bound.
+    ``only_enough`` is True, the computation for a part is broken off as soon as the part's harm may exceed ``enough``;
+    a result above ``enough`` is then no bound.
     """
     N, K, Q = known.limit.shape[0], free.shape[0], low_.shape[0]
     stack, motion = new_stack(N, K + 2), new_motion(N, K + 2)

@@ -66,8 +66,8 @@ def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: 
 
     At the first decision the shield predicts, in the estimated world, the harm of ``policy`` and of E-V2X-BM. The one
     with less predicted harm controls the vehicle for the whole episode. ``argument`` is ``pairwise`` for the pairwise
-    form of E-V2X-BM, None for the coupled form. Raises ``InvalidInput`` if ``policy`` already decides on received
-    information.
+    form of E-V2X-BM, None for the coupled form. Raises ``InvalidInput`` if the name of ``policy`` already
+    ends in ``:estimated``.
     """
     hybrid = shield_episodes(policy, argument, settings)
     if isinstance(policy, Estimating):

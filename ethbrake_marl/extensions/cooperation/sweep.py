@@ -1,4 +1,4 @@
-"""A sweep: one key of a scenario with several values, such as ``objective=social:0..90:15``."""
+"""A sweep: one key of a scenario with several values. ``objective=social:0..90:15`` means 0, 15, ..., 90 degrees."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ def corners(vehicles: int) -> Floats:
 
 
 def checked_weights(weights: Sequence[Sequence[float]] | Floats, vehicles: int) -> Floats:
-    """Check W choices of weights of the N vehicles' harm, and return them as an array [W, N].
+    """Check W choices of weights, each with one weight per vehicle, and return them as an array [W, N].
 
     Raises ``InvalidInput`` if there is no choice, if a choice does not have one weight for each vehicle, if a weight is
     neither 0 nor from 1e-6 to 1e6, or if all weights of a choice are 0.

@@ -154,7 +154,8 @@ class BestHarmTable:
         """
         if harm_count not in self.best:
             raise InvalidInput(
-                f"harm_count = {harm_count!r}: the table contains only the harm counts {', '.join(self.best)}"
+                f"harm_count = {harm_count!r}: the table does not contain this harm count; it contains"
+                f" {', '.join(map(repr, self.best))}"
             )
         if harm.shape != identity.shape:
             raise InvalidInput(

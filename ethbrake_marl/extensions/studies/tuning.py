@@ -3,8 +3,8 @@
 The table contains no times and no paths. If only one trial runs at a time, the table is the same, byte for byte,
 however often the search was interrupted.
 
-Arguments that several methods share: ``values`` has a value for each searched key. ``path`` is the tuning's folder (in
-``TuningPlan.read``: the tuning's file).
+Arguments that several methods share: ``values`` has a value for each searched key. ``path`` is the folder of the
+tuning's results (in ``TuningPlan.read``: the YAML file that describes the tuning).
 """
 
 from __future__ import annotations
