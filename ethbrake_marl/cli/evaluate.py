@@ -25,6 +25,7 @@ from ethbrake_marl.cli.pages import page_of
 from ethbrake_marl.errors import InvalidInput, need
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.files.store import check_folder, write_output
+from ethbrake_marl.game.harm import HARM_COUNTS
 
 if TYPE_CHECKING:
     from ethbrake_marl.physics.left_out import LeftOutRows
@@ -127,16 +128,16 @@ def evaluate_command(
         seed = evaluation.LIST_SEED if seed is None else seed
         episodes = evaluation.EPISODES if episodes is None else episodes
         if episodes > evaluation.HELD and not (per_world or report):
-            summary = _evaluate_long_list(out, lineup, episodes, seed, jobs, ray)
-            results = evaluation.results_to_json(summary, settings=used)
+            summary, borne = _evaluate_long_list(out, lineup, episodes, seed, jobs, ray)
+            results = evaluation.results_to_json(summary, rescored=borne, settings=used)
         else:
             sample = task.scenario.sample(episodes, seed)
             evaluation.check_agents(lineup.make(), sample.worlds, task.scenario, warn=True)
             tell = _tell_worlds(out, sample.worlds.n)
             result = evaluation.evaluate_held(lineup, sample, seed, jobs=jobs, ray=ray, on_done=tell)
-            summary = evaluation.summarise(result)
+            summary, borne = evaluation.summarise(result), result.rescore(_objectives(task.scenario))
             beside_it = _write_worlds(out, output, result, per_world)
-            results = evaluation.results_to_json(summary, per_world=beside_it, settings=used)
+            results = evaluation.results_to_json(summary, rescored=borne, per_world=beside_it, settings=used)
             if write_page is not None and output is not None:
                 output.mkdir(parents=True, exist_ok=True)
                 write_page(
@@ -145,18 +146,31 @@ def evaluate_command(
                 )  # fmt: skip
                 out.note(f"report: {output / REPORT}")
         _write_results(out, output, results, f"{WORLDS}.{per_world}", REPORT if report else "")
-        out.result(results, *summary.tables())
+        out.result(
+            results, *summary.tables(), *(part for count in HARM_COUNTS if borne for part in ("", borne.sheet(count)))
+        )
         _tell_horizon(out, _moving(summary), summary[0].episodes, task.scenario.horizon_s)
 
 
 def _evaluate_long_list(
     out: Out, lineup: evaluation.Lineup, episodes: int, seed: int, jobs: int | None, ray: str | None
-) -> evaluation.SummaryTable:
-    """Return the results table of an evaluation list that is too long for the memory."""
+) -> tuple[evaluation.SummaryTable, evaluation.Rescores]:
+    """Return the results table of an evaluation list that is too long for the memory, and the vehicles' objectives."""
     scenario = lineup.scenario
     evaluation.check_agents(lineup.make(), scenario.sample(1_000, seed).worlds, scenario, warn=True)
-    tally = evaluation.tally_list(lineup, episodes, seed, jobs=jobs, ray=ray, on_done=_tell_worlds(out, episodes))
-    return evaluation.summarise_tally(lineup, tally, seed)
+    objectives, tell = _objectives(scenario), _tell_worlds(out, episodes)
+    tally = evaluation.tally_list(lineup, episodes, seed, objectives=objectives, jobs=jobs, ray=ray, on_done=tell)
+    return evaluation.summarise_tally(lineup, tally, seed), tally.rescore(objectives, scenario.vehicles)
+
+
+def _objectives(scenario: scenarios.Scenario) -> list[str]:
+    """Return the objectives to show for each vehicle: none if all vehicles minimise the harm of the whole line.
+
+    Otherwise the list has ``own``, the harm that each vehicle bears, and the scenario's objectives.
+    """
+    declared = scenario.objective
+    every = {declared} if isinstance(declared, str) else {*declared}
+    return [] if every == {"total"} else ["own", *sorted(every - {"own"})]
 
 
 def _tell_worlds(out: Out, worlds: int) -> Callable[[int], None]:

@@ -54,5 +54,8 @@ class Rescores(list[Rescored]):
         lines = [(name, row.objective, *row.each) for name, row in zip(names, shown, strict=True)]
         by = Conditions(recordings=self.recordings).by_recording
         title = f"Objectives, {'first-impact' if harm_count == 'first' else 'total'} harm"
-        note = f"Means per world in m²/s² (injury:CURVE: injuries in 1,000 lines), with their 95 % intervals{by}."
+        note = (
+            f"Means per world in m²/s² (injury:CURVE: injuries in 1,000 lines), with their 95 % intervals{by}. own: the"
+            " harm that the vehicle bears."
+        )
         return Sheet(title, ["Agent", "Objective", *columns], lines, note)

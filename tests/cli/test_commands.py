@@ -20,13 +20,15 @@ import typer
 from numba.core import event
 from rich.console import Console
 
-from ethbrake_marl import __version__, parallel
+from ethbrake_marl import __version__, evaluation, parallel
 from ethbrake_marl.cli import app as frame
 from ethbrake_marl.cli.app import add_command, app, run_command, whole_command
 from ethbrake_marl.cli.command import Out
 from ethbrake_marl.errors import AlreadyExists
+from ethbrake_marl.evaluation import evaluate, make_agents
 from ethbrake_marl.evaluation.identity import EPISODES, LIST_SEED
 from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.scenario import load_scenario
 from tests.fixtures.commands import Command, check_refused, told_json
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -389,3 +391,17 @@ def test_evaluate__says_where_the_uncertainty_of_robust_is_given_and_keeps_no_pl
     )
     (row,) = told_json(ethbrake("evaluate", "--episodes", "2", "--agents", "full_brake", "--json"))
     assert row["agent_settings"] == {"harm_count": "first"}
+
+
+def test_evaluate__shows_whose_harm_an_objective_counts_in_lists_of_any_length(ethbrake: Command, monkeypatch) -> None:
+    words = ["evaluate", "--agents", "full_brake,coast", "--episodes", "60", "--set"]
+    scenario = load_scenario("paper-random").replace(objective=("own", "total", "social:45"))
+    found = evaluate(agents=make_agents(["full_brake", "coast"], scenario), scenario=scenario, episodes=60)
+    expected = [each.to_json() for each in found.rescore(["own", "social:45", "total"])]
+    for held in (evaluation.HELD, 59):
+        monkeypatch.setattr(evaluation, "HELD", held)
+        rows = told_json(ethbrake(*words, "objective=[own, total, 'social:45']", "--json"))
+        assert [each for row in rows for each in row["objectives"]] == expected
+        assert "objectives" not in told_json(ethbrake(*words, "objective=total", "--json"))[0]
+    shown = ethbrake(*words, "objective=own").out
+    assert [shown.count(f"Objectives, {count} harm") for count in ("first-impact", "total")] == [1, 1]
