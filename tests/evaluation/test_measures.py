@@ -282,7 +282,7 @@ def test_rescored__one_impact_by_hand_in_json_and_as_columns(pair: Scenario, tmp
     result = evaluate(pair.sample(2, 0), BRAKE, scenario=pair)
     rows = {row.objective: row for row in result.rescore([*STANDARD, "weighted:1,3"]) if row.harm_count == "total"}
     shown = str(result.rescore(["own"])).splitlines()
-    assert [line.split() for line in shown if "own" in line] == [["full_brake", "own", "4.95", "4.05"]] * 2
+    assert [line.split() for line in shown if " own " in line] == [["full_brake", "own", "4.95", "4.05"]] * 2
     assert "Objectives, total harm" in result.rescore(["own"])._repr_html_()
     weighted = 2 * (4.95 + 3 * 4.05) / 4.0
     expected = {
