@@ -215,13 +215,10 @@ def policy_agent(
     whose ``predict`` also returns a state.
 
     Args:
-        policy: one of the following objects. Copies of the agent use the same policy object.
-
-            - a function that maps observations to actions;
-            - a model with a method ``predict``. A Stable-Baselines3 model is called with ``deterministic=True``, with
-              the statistics of its ``VecNormalize``, and with a separate memory for each world;
-            - a torch module, called without gradients;
-            - an ONNX session, or the path of an ``.onnx`` file.
+        policy: a function that maps observations to actions, a model with a method ``predict``, a torch module (called
+            without gradients), an ONNX session, or the path of an ``.onnx`` file. A Stable-Baselines3 model is called
+            with ``deterministic=True``, with the statistics of its ``VecNormalize``, and with a separate memory for
+            each world. Copies of the agent use the same policy object.
         name: name of the agent in tables and messages; None: the name of the function or class.
         scenario: scenario (or its name) in which the policy was trained; the scenario determines what the policy
             observes. None: unknown.

@@ -186,7 +186,7 @@ def test_compare__marks_who_exploits_what_harm_does_not_count(ethbrake: Command,
     assert found.to_json()["agents"][0]["exploits"] == [[], ["shoves", "moving"]]
     answer = ethbrake("compare", results / "before.json", results / "after.json")
     assert f"{agent} ‡" in answer.out
-    sentence = f"{agent} in the second shoves Vehicle 1 by 6.0 m on average and leaves a vehicle moving"
+    sentence = f"{agent} in the second shoves Vehicle 1 by 6.0 m on average and runs past the horizon"
     assert sentence in " ".join(answer.err.split()) and f"{agent} in the first" not in answer.err
     same = ethbrake("compare", results / "before.json", results / "before.json")
     assert f"{agent} ‡" not in same.out and f"{agent} in the" not in same.err

@@ -76,7 +76,7 @@ def _commands(group: Any, context: Any, level: int) -> Iterator[str]:
 def _option(written: str, about: str) -> tuple[str, str, str]:
     text, _, extra = about.partition("  [")
     default = re.search(r"default: (.*?)(?:; required)?\]$", extra)
-    told = "required" if "required" in extra else default[1].strip("()") if default else ""
+    told = "required" if "required" in extra else re.sub(r"^\((.*?)\)", r"\1", default[1]) if default else ""
     return " ".join(f"`{word}`" for word in written.split()), text, told
 
 

@@ -173,7 +173,7 @@ def test_exploits__mark_the_row_and_are_one_sentence_below(shoved_m: float, movi
     assert len(sentences) == bool(names)
     for sentence in sentences:
         assert (f"mine shoves Vehicle 1 by {shoved_m:.1f} m on average" in sentence) == ("shoves" in names)
-        leaves = f"leaves a vehicle moving at the horizon in {5 * moving:.1f} % of worlds"
+        leaves = f"runs past the horizon in {5 * moving:.1f} % of worlds"
         assert (leaves in sentence) == ("moving" in names)
         assert sentence in " ".join(str(rows).split()) and sentence in rows.markdown()
 

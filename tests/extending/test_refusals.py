@@ -121,7 +121,7 @@ PARTS: dict[str, Callable[[], object]] = {
     "measure 'mine': its function fails: ValueError: assignment destination is read-only": lambda: eb.register_measure(
         "mine", gives(lambda episodes: episodes.rows.closing_speed_mps.fill(0.0)), unit="1"
     ),
-    "scenarios 'nowhere': does not exist": lambda: eb.register_scenarios("nowhere"),
+    "scenarios 'nowhere': is not an existing folder": lambda: eb.register_scenarios("nowhere"),
 }
 
 

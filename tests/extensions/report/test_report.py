@@ -263,8 +263,8 @@ def test_report__says_below_its_first_sentence_what_must_not_be_overlooked(
         "The training was interrupted.",
         "In some of the 60 worlds a vehicle still moved at the horizon (1 s): full_brake 60, coast 60. Harm after the"
         " horizon is not counted.",
-        "‡ Harm does not count this: full_brake leaves a vehicle moving at the horizon in 100.0 % of worlds; coast"
-        " leaves a vehicle moving at the horizon in 100.0 % of worlds (docs/train.md).",
+        "‡ Harm does not count this: full_brake runs past the horizon in 100.0 % of worlds; coast"
+        " runs past the horizon in 100.0 % of worlds (docs/train.md).",
     ]
     assert html.index('class="lead"') < html.index('class="remarks"') < html.index('class="beside"')
     assert 'class="remarks"' not in summed_up(paper_random, "full_brake").html
