@@ -161,10 +161,13 @@ def front_sheet(results: Json) -> Sheet:
     agent (see ``front_results``). ``results`` is the content of ``front.json``.
     """
     count = results["harm_count"]
+    short = [re.sub("@[^+]*", "", name)[:14] for name in results["agents"]]
     columns: list[Column | str] = [
         Column("Weights"), *(Column(f"Vehicle {k + 1}", short=f"V{k + 1}") for k in range(len(results["vehicles"]))),
         Column("Sum, first impacts", short="First"), Column("Sum, all impacts", short="All"),
-        *(Column(name, digits=3, short=re.sub("@[^+]*", "", name)[:14]) for name in results["agents"]),
+        # two agents with the same short name have their whole names
+        *(Column(name, digits=3, short=each if short.count(each) == 1 else name.replace("/", "/\n"))
+          for name, each in zip(results["agents"], short, strict=True)),
     ]  # fmt: skip
     rows: list[Row] = []
     for k, point in enumerate(results["points"]):

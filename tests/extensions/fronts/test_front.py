@@ -1,5 +1,7 @@
 """The front of a list: no constant, agent or point of other weights is better; one answer for any batch."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from ethbrake_marl.extensions.fronts.results import front_results, front_sheet, 
 from ethbrake_marl.extensions.fronts.weights import corners, weight_grid
 from ethbrake_marl.extensions.search.best_harm import task_problem
 from ethbrake_marl.extensions.search.shipped import best_known
+from ethbrake_marl.files.sheet import Column
 from ethbrake_marl.scenario.task import Task
 from tests.evaluation.test_clusters import recorded
 
@@ -119,3 +122,13 @@ def test_results__of_recorded_rows_have_intervals_by_recording() -> None:
     assert found["recordings"] == 8 and "95 % intervals by 8 recordings." in front_sheet(found).note
     wide, narrow = (hypervolumes(front, borne["first"], names)[0]["of"]["front"]["volume"] for names in (by, None))
     assert wide["value"] == narrow["value"] and np.ptp(wide["interval"]) > np.ptp(narrow["interval"])
+
+
+def test_sheet__two_agents_have_two_headings() -> None:
+    agents: dict[str, list[Any]] = {
+        name: [] for name in ("policy@runs/a", "policy@runs/b", "policy@c+step", "universal")
+    }
+    results = {"harm_count": "first", "vehicles": [1, 2, 3], "agents": agents, "points": [], "beside": {}}
+    sheet = front_sheet(results | {"scenario": "mine", "episodes": 2})
+    headings = [column.short for column in sheet.columns if isinstance(column, Column)][-4:]
+    assert headings == ["policy@runs/\na", "policy@runs/\nb", "policy+step", "universal"]
