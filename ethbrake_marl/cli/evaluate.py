@@ -25,7 +25,6 @@ from ethbrake_marl.cli.pages import page_of
 from ethbrake_marl.errors import InvalidInput, need
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.files.store import check_folder, write_output
-from ethbrake_marl.game.harm import HARM_COUNTS
 
 if TYPE_CHECKING:
     from ethbrake_marl.physics.left_out import LeftOutRows
@@ -103,6 +102,8 @@ def evaluate_command(
     from ethbrake_marl.agents.spec import split_specs
 
     with Out(as_json=as_json, force=force) as out:
+        from ethbrake_marl.game.harm import HARM_COUNTS  # loads numba, which help does not need
+
         _check_outputs(out, output, per_world, report=report)
         write_page = page_of("evaluation", "--report") if report else None
         chosen = training.read_settings(settings, of_agents=("harm_count", "measures"))
