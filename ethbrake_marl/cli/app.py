@@ -154,8 +154,8 @@ def prepare_streams() -> None:
 def tell_compilation(folder: Path, empty: bool) -> None:
     """Announce that kernels are being compiled, and print every ten seconds how many are done.
 
-    A background thread prints, because compiling a single kernel may take a minute. ``empty`` says that this process
-    has not loaded any kernel from ``folder``, in which compiled kernels are stored.
+    A background thread prints this number, because compiling a single kernel may take a minute. ``empty`` says
+    that this process has not loaded any kernel from ``folder``, in which compiled kernels are stored.
     """
     once = "the physics for the first time, which takes minutes" if empty else "parts of the physics for the first time"
     always = (
