@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -19,16 +18,6 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 PACKAGE = "ethbrake_marl"
-
-
-# `make lint` holds the package to these contracts: layers, and no circle inside a folder, imports for types included.
-CONTRACTS = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["importlinter"]["contracts"]
-
-
-LAYERS = [layer.split(" | ") for layer in CONTRACTS[0]["layers"]]  # from the top down
-
-
-LEVEL = {room: -level for level, rooms in enumerate(LAYERS) for room in rooms}
 
 
 def modules(package: Path) -> Iterator[tuple[str, Path]]:
@@ -51,16 +40,6 @@ def imported_by_text(tree: ast.AST) -> Iterator[tuple[int, str]]:
 @cache
 def tree_of(path: Path) -> ast.Module:
     return ast.parse(path.read_text("utf-8"))
-
-
-@pytest.mark.parametrize(
-    ("contract", "elsewhere"),
-    [(CONTRACTS[3], {"extensions", "training", "agents", "envs"}), (CONTRACTS[4], {"extensions"})],
-)
-def test_contract__of_torch_and_matplotlib_holds_for_every_other_room(
-    contract: dict[str, Any], elsewhere: set[str]
-) -> None:
-    assert set(contract["source_modules"]) == {f"{PACKAGE}.{room}" for room in LEVEL if room not in elsewhere}
 
 
 def test_package__imports_no_module_of_its_own_by_a_text() -> None:
