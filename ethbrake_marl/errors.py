@@ -136,8 +136,8 @@ class CorruptBundle(EthBrakeError, ValueError):
 
 _EXTRA_OF = {
     **dict.fromkeys(("torch", "stable_baselines3", "supersuit", "tensorboard"), "train"),
-    **dict.fromkeys(("benchmarl", "torchrl", "tensordict", "hydra"), "marl"),
     **dict.fromkeys(("matplotlib", "jinja2", "markupsafe"), "report"),
+    **dict.fromkeys(("benchmarl", "torchrl", "tensordict", "hydra"), "marl"),
     **dict.fromkeys(("onnx", "onnxruntime"), "export"),
     **dict.fromkeys(("pandas", "pyarrow", "minari", "h5py"), "data"),
     **dict.fromkeys(("pygame", "imageio_ffmpeg"), "render"),
