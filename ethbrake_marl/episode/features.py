@@ -1,0 +1,250 @@
+"""Which features an observation can have: fixed scalings of single numbers, in groups that are computed together.
+
+A vehicle observes ``clip(value / scale, low, high)``. What it does not know reads 0, with the feature ``known`` 0.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.motion.layout import BRAKE_RATE, BRAKING, RELEASE_RATE, WEIGHT, Floats, Ints
+from ethbrake_marl.registry import Registry
+
+MOST_NEIGHBOURS = 64  # on each side
+
+Of = Literal["own", "neighbour"]
+
+
+class Feature(NamedTuple):
+    """One number of an observation."""
+
+    name: str  # in its group (``speed``), or in full (``own.speed``)
+    unit: str
+    scale: float  # in `unit`
+    low: float
+    high: float
+    meaning: str = ""
+
+
+OWN = (
+    Feature("speed", "m/s", 20.0, -2.0, 4.0, "own speed"),
+    Feature("acceleration", "m/s2", 10.0, -2.0, 2.0, "own acceleration in force"),
+    Feature("braking_capacity", "m/s2", 10.0, 0.0, 2.0, "own largest deceleration"),
+    Feature("driving_capacity", "m/s2", 10.0, 0.0, 2.0, "own largest forward acceleration"),
+    Feature("mass", "t", 10.0, 0.0, 8.0, "own mass"),
+    Feature("latency_left", "s", 1.0, 0.0, 4.0, "time until own commands take effect"),
+    Feature("restitution", "1", 1.0, 0.0, 1.0, "coefficient of restitution of all impacts"),
+)
+NEIGHBOUR = (
+    Feature("known", "1", 1.0, 0.0, 1.0, "1 if this neighbour exists and its state is known"),
+    Feature("gap", "m", 10.0, 0.0, 10.0, "sum of the gaps between this vehicle and the neighbour"),
+    Feature("closing_speed", "m/s", 10.0, -4.0, 4.0, "closing speed of the two, above 0 if they approach"),
+    Feature("acceleration", "m/s2", 10.0, -2.0, 2.0, "acceleration in force of the neighbour"),
+    Feature("braking_capacity", "m/s2", 10.0, 0.0, 2.0, "largest deceleration of the neighbour"),
+    Feature("mass", "t", 10.0, 0.0, 8.0, "mass of the neighbour"),
+    Feature("latency_left", "s", 1.0, 0.0, 4.0, "time until the neighbour's commands take effect"),
+    Feature("hit", "1", 1.0, 0.0, 1.0, "1 once this vehicle has had an impact on the neighbour's side"),
+    Feature("stopping_margin", "m", 10.0, -15.0, 20.0, "gap at rest if both brake fully as soon as possible"),
+    Feature(
+        "fitting_deceleration", "m/s2", 10.0, 0.0, 2.0,
+        "own constant deceleration with which both stop with gap 0 if the neighbour brakes fully",
+    ),
+)  # fmt: skip
+ROLE = (
+    Feature("vehicles_ahead", "1", 1.0, 0.0, 2.0, "number of vehicles ahead in the line; 2 means 2 or more"),
+    Feature("vehicles_behind", "1", 1.0, 0.0, 2.0, "number of vehicles behind in the line; 2 means 2 or more"),
+)
+OBSTACLE = (
+    Feature("known", "1", 1.0, 0.0, 1.0, "1 if there is an obstacle ahead of the line and this vehicle knows of it"),
+    Feature("gap", "m", 10.0, 0.0, 10.0, "sum of the gaps from this vehicle to the obstacle"),
+    Feature("hit", "1", 1.0, 0.0, 1.0, "1 once Vehicle 1 has had an impact with the obstacle"),
+    Feature("stopping_margin", "m", 10.0, -15.0, 20.0, "distance to the obstacle at rest after full braking"),
+    Feature("fitting_deceleration", "m/s2", 10.0, 0.0, 2.0, "own deceleration that stops exactly at the obstacle"),
+)
+WHOLE_GROUPS = {"own": OWN, "role": ROLE, "obstacle": OBSTACLE}  # and the neighbours front_K, rear_K
+SIDE = re.compile(r"(front|rear)_([1-9][0-9]?)")
+
+
+class Own(NamedTuple):
+    """A feature with a function of its own."""
+
+    feature: Feature
+    of: Of
+    function: Callable[..., Floats]  # (state, body) or (state, body, other body) -> value in the unit, [n]
+    unknown: float = 0.0  # value for a neighbour that is not known, in the unit
+
+
+class Group(NamedTuple):
+    """Features that a package computes together."""
+
+    features: tuple[Feature, ...]
+    function: Callable[[State, Ints, float], Floats]  # (state, bodies, time step) -> values, [n, bodies, F], unscaled
+
+
+def _build_up_s(state: State, body: int) -> Floats:
+    return state.car[:, BRAKING, body] / state.car[:, BRAKE_RATE, body]
+
+
+def _release_s(state: State, body: int) -> Floats:
+    return state.car[:, BRAKING, body] / state.car[:, RELEASE_RATE, body]
+
+
+def _weight_share(state: State, body: int) -> Floats:
+    return state.car[:, WEIGHT, body] / state.car[:, WEIGHT, 1:].sum(axis=1)
+
+
+def _of_both(name: str, unit: str, high: float, function: Callable[[State, int], Floats], meaning: str) -> dict[str, Own]:
+    """Return a feature of the vehicle itself, ``own_NAME``, and the same of a neighbour, ``NAME``."""
+    return {
+        f"own_{name}": Own(Feature(f"own_{name}", unit, 1.0, 0.0, high, f"own {meaning}"), "own", function),
+        name: Own(
+            Feature(name, unit, 1.0, 0.0, high, f"the neighbour's {meaning}"),
+            "neighbour",
+            lambda state, body, other: function(state, other),
+        ),
+    }
+
+
+def register_feature(
+    name: str,
+    function: Callable[..., Floats],
+    *,
+    unit: str,
+    scale: float,
+    low: float,
+    high: float,
+    of: Of = "own",
+    unknown: float = 0.0,
+) -> None:
+    """Register a feature, which an ``observation:`` list can then name. Entry points: ``ethbrake_marl.features``.
+
+    The docstring of ``function`` is the meaning of the feature. Raises ``AlreadyExists`` for a name in use, and
+    ``InvalidInput`` for a bad argument.
+
+    Args:
+        name: 1 to 64 characters ``a-z``, ``0-9``, ``_``. A list names a feature of a neighbour as ``front_1.NAME``.
+        function: ``function(state, body)``, or ``function(state, body, other)`` for a neighbour, returns the value in
+            every world, [n], in ``unit``. ``body`` 1 is the front vehicle.
+        unit: unit of the value.
+        scale: number above 0; ``clip(value / scale, low, high)`` is observed.
+        low: smallest number that is observed.
+        high: largest number that is observed.
+        of: whom the feature describes: the observer itself (``own``), or a ``neighbour``, where it knows one.
+        unknown: value for a neighbour that is not known, in ``unit``.
+
+    """
+    if not isinstance(name, str) or re.fullmatch(r"[a-z][a-z0-9_]{0,63}", name) is None:
+        raise InvalidInput(
+            f"feature {name!r:.80}: the name must be 1 to 64 characters a-z, 0-9 and _, beginning with a letter"
+        )
+    if name in WHOLE_GROUPS or SIDE.fullmatch(name):
+        raise InvalidInput(f"feature {name!r}: this is the name of a group; give another name")
+    if not callable(function) or not (function.__doc__ or "").strip():
+        raise InvalidInput(f"feature {name!r}: must be a function with a docstring that describes the feature")
+    numbers = {"scale": scale, "low": low, "high": high, "unknown": unknown}
+    for key, value in numbers.items():
+        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+            raise InvalidInput(f"feature {name!r}: {key} = {value!r}: must be a finite number")
+    if not scale > 0.0 or not low < high:
+        raise InvalidInput(
+            f"feature {name!r}: scale = {scale:g}, low = {low:g}, high = {high:g}: scale must be above 0, and low below"
+            " high"
+        )
+    if of not in get_args(Of):
+        raise InvalidInput(f"feature {name!r}: of = {of!r}: must be 'own' or 'neighbour'")
+    meaning = " ".join(str(function.__doc__).split())
+    entry = Own(Feature(name, str(unit), float(scale), float(low), float(high), meaning), of, function, float(unknown))
+    FEATURES.add(name, entry, lambda other: other == entry)
+
+
+def register_feature_group(
+    name: str, features: Sequence[Feature], function: Callable[[State, Ints, float], Floats]
+) -> None:
+    """Register features that are computed together. Entry points: ``ethbrake_marl.feature_groups``.
+
+    ``function(state, bodies, time_step_s)`` returns their values, [n, bodies, F], before they are scaled.
+    """
+    group = Group(tuple(features), function)
+    GROUPS.add(name, group, lambda other: other == group)
+
+
+def _place(state: State, body: int) -> Floats:
+    return np.full(state.n, body - 1.0)
+
+
+FEATURES: Registry[Own] = Registry(
+    "feature",
+    "features",
+    register_feature,
+    {
+        "place": Own(Feature("place", "1", 1.0, 0.0, 63.0, "number of vehicles ahead in the line"), "own", _place),
+        **_of_both("build_up_time", "s", 4.0, _build_up_s, "time until brakes are fully applied; 0 if at once"),
+        **_of_both("release_time", "s", 4.0, _release_s, "time until full brakes are released; 0 if at once"),
+        **_of_both("harm_weight", "1", 1.0, _weight_share, "share in the weights of harm (objective: preference)"),
+    },
+)
+GROUPS: Registry[Group] = Registry("group of features", "feature_groups", register_feature_group)
+
+
+def side_of(name: str) -> int | None:
+    """Return the offset of a neighbour's group: ``front_2`` -2 (two ahead), ``rear_1`` 1; None for another name."""
+    match = SIDE.fullmatch(name)
+    if match is None or int(match[2]) > MOST_NEIGHBOURS:
+        return None
+    return -int(match[2]) if match[1] == "front" else int(match[2])
+
+
+def group_named(name: str) -> tuple[Feature, ...] | None:
+    """Return the features of a group, such as ``own``, ``front_1`` or ``contact``; None if there is no such group."""
+    if side_of(name) is not None:
+        return NEIGHBOUR
+    return WHOLE_GROUPS[name] if name in WHOLE_GROUPS else GROUPS[name].features if name in GROUPS else None
+
+
+def feature_named(name: str) -> Feature:
+    """Return the feature with a full name, such as ``front_1.gap`` or ``place``. Raises ``UnknownName``."""
+    group, dot, own = name.partition(".")
+    if not dot and name in FEATURES and FEATURES[name].of == "own":
+        return FEATURES[name].feature
+    if side_of(group) is not None and own in FEATURES and FEATURES[own].of == "neighbour":
+        return FEATURES[own].feature._replace(name=name)
+    for feature in group_named(group) or () if dot else ():
+        if feature.name == own:
+            return feature._replace(name=name)
+    if name in FEATURES:
+        raise InvalidInput(f"feature {name!r} describes a neighbour; write front_1.{name} or rear_1.{name}")
+    raise unknown_name("feature", name, known_names(), may_be_own=True)
+
+
+def known_names() -> list[str]:
+    """Return what an ``observation:`` list may contain: groups first, then features; neighbours as ``front_1``."""
+    groups = [*WHOLE_GROUPS, "front_1", "rear_1", *GROUPS]
+    inside = [f"{group}.{feature.name}" for group in groups for feature in group_named(group) or ()]
+    return [*groups, *inside, *(name if FEATURES[name].of == "own" else f"front_1.{name}" for name in FEATURES)]
+
+
+def listed_features(listed: object) -> tuple[str, ...]:
+    """Return the full names of an ``observation:`` list, groups replaced by their features.
+
+    ``["own", "front_1.gap"]`` gives ``("own.speed", ..., "front_1.gap")``. Raises ``InvalidInput`` for something else
+    than a list, an unknown name, or a name that comes twice.
+    """
+    if isinstance(listed, str) or not isinstance(listed, Sequence) or not listed:
+        raise InvalidInput("observation: must be a list of groups and features, for instance [own, front_1, rear_1]")
+    names: list[str] = []
+    for each in listed:
+        if not isinstance(each, str):
+            raise InvalidInput(f"observation: {each!r:.60}: must be the name of a group or of a feature")
+        group = group_named(each)
+        more = [feature_named(each).name] if group is None else [f"{each}.{feature.name}" for feature in group]
+        for name in more:
+            if name in names:
+                raise InvalidInput(f"observation: {name} is listed twice; list it once")
+        names += more
+    return tuple(names)

@@ -1,0 +1,216 @@
+"""The state of a batch of episodes, as a value: a snapshot, a branch or the last state of an episode is just a State."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.motion.compiling import kernel, large
+from ethbrake_marl.motion.layout import (
+    BRAKING,
+    COUNT,
+    DRIVING,
+    FAR_M,
+    FIRST,
+    FORCE,
+    GAP,
+    HIT,
+    LATENCY,
+    MASS,
+    SPEED,
+    TOTAL,
+    Bools,
+    Floats,
+    Ints,
+)
+
+# columns of `clock`
+TIME = 0  # time since the alert (s)
+FIRST_DECISION = 1  # time of the first decision (s)
+STEPS = 2  # number of steps taken
+LAST = 3  # number of the step that ends at the horizon
+ENDED = 4  # 1 once the episode has ended
+NUMBER = 5  # number of the world in its list; -1: the caller has made it
+CLOCK_COLUMNS = 6
+
+
+class State(NamedTuple):
+    """n episodes of N vehicles, one row per world. Nobody changes it; a step returns a new one.
+
+    The arrays hold bodies 0 to N (``motion.layout``); the properties, which agents and terms read, hold vehicles: column
+    i belongs to ``vehicle_{i + 1}``, in arrays of pairs to it and the vehicle behind. Properties are views: copy before
+    you change them.
+    """
+
+    line: Floats  # [n, LINE_ROWS, N + 1] speeds, forces, gaps, harm
+    car: Floats  # [n, CAR_ROWS, N + 1] parameters
+    clock: Floats  # [n, CLOCK_COLUMNS]
+    know: Floats  # [n, N + 1, N + 1] time from which body i acts on news of body j (s); infinite: never
+    wanted: Floats  # [n, N + 1] last commands (m/s2), negative brakes
+    memories: Mapping[Any, Any]  # body -> memory of its script; a name -> memory of a shield or term
+
+    def take(self, rows: Any) -> State:
+        """Return the episodes ``rows`` (indices, a mask or a slice)."""
+        memories = {who: take(memory, rows) for who, memory in self.memories.items()}
+        return State(*(array[rows] for array in self[:5]), memories)
+
+    def put(self, rows: Any, new: State, *, donate: bool = False) -> State:
+        """Return this state with the episodes ``new`` in ``rows``. ``donate``: its own arrays may be reused."""
+        arrays = [put(old, rows, part, donate) for old, part in zip(self[:5], new[:5], strict=True)]
+        memories = {who: put(memory, rows, new.memories[who], donate) for who, memory in self.memories.items()}
+        return State(*arrays, memories)
+
+    @property
+    def n(self) -> int:
+        """Number of worlds."""
+        return len(self.line)
+
+    @property
+    def vehicles(self) -> int:
+        """Number N of vehicles."""
+        return self.wanted.shape[1] - 1
+
+    @property
+    def time_s(self) -> Floats:
+        """Time since the alert, [n] s."""
+        return self.clock[:, TIME]
+
+    @property
+    def steps(self) -> Ints:
+        """Number of steps taken, which is the number of the next decision, [n]."""
+        return self.clock[:, STEPS].astype(np.int64)
+
+    @property
+    def ended(self) -> Bools:
+        """Whether the episode has ended, [n]."""
+        return self.clock[:, ENDED] == 1.0
+
+    @property
+    def speeds_mps(self) -> Floats:
+        """Speeds, [n, N] m/s."""
+        return self.line[:, SPEED, 1:]
+
+    @property
+    def gaps_m(self) -> Floats:
+        """Gaps between neighbours, bumper to bumper, [n, N - 1] m."""
+        return self.line[:, GAP, 1:-1]
+
+    @property
+    def obstacle_gap_m(self) -> Floats:
+        """Gap between the obstacle and Vehicle 1, [n] m; infinite if there is no obstacle."""
+        gap = self.line[:, GAP, 0]
+        return np.where(gap < FAR_M, gap, np.inf)
+
+    @property
+    def forces_mps2(self) -> Floats:
+        """Acceleration that brakes or engine alone would cause now, [n, N] m/s2."""
+        return self.line[:, FORCE, 1:]
+
+    @property
+    def commands_mps2(self) -> Floats:
+        """Last commands, [n, N] m/s2. A command takes effect once the vehicle's latency has elapsed."""
+        return self.wanted[:, 1:]
+
+    @property
+    def pair_hit(self) -> Bools:
+        """Whether the pair has had an impact, [n, N - 1]."""
+        return self.line[:, HIT, 1:-1] == 1.0
+
+    @property
+    def braking_capacity_mps2(self) -> Floats:
+        """Largest deceleration on this road, [n, N] m/s2."""
+        return self.car[:, BRAKING, 1:]
+
+    @property
+    def driving_capacity_mps2(self) -> Floats:
+        """Largest acceleration forward on this road, [n, N] m/s2."""
+        return self.car[:, DRIVING, 1:]
+
+    @property
+    def mass_t(self) -> Floats:
+        """Masses, [n, N] t."""
+        return self.car[:, MASS, 1:]
+
+    @property
+    def latency_s(self) -> Floats:
+        """Time from the alert until commands take effect, [n, N] s."""
+        return self.car[:, LATENCY, 1:]
+
+    @property
+    def collided(self) -> Bools:
+        """Whether the world has had an impact, [n]."""
+        return self.line[:, COUNT].any(axis=1)
+
+    def harm(self, count: str = "first") -> Floats:
+        """Return the harm of each world so far, [n] m2/s2. ``count``: ``first`` impact of each pair, or ``total``."""
+        out = np.empty(self.n)
+        _harm(self.line, count == "total", out)
+        return out
+
+    def borne_harm(self, count: str = "first") -> Floats:
+        """Return the harm that each vehicle has borne so far, [n, N] m2/s2; both shares of a pair add up to its harm."""
+        out = np.empty((self.n, self.vehicles))
+        split_harm(self.line[:, TOTAL if count == "total" else FIRST], self.car[:, MASS], out)
+        return out
+
+
+def take(memory: Any, rows: Any) -> Any:
+    """Return ``rows`` of a memory: None, an array with one row per world, or a tuple of memories."""
+    if isinstance(memory, tuple):
+        parts = [take(part, rows) for part in memory]
+        return type(memory)(*parts) if hasattr(memory, "_fields") else tuple(parts)
+    return None if memory is None else memory[rows]
+
+
+def put(memory: Any, rows: Any, new: Any, donate: bool = False) -> Any:
+    """Return a memory with ``new`` in ``rows``: a copy, or the same arrays if they are donated."""
+    if isinstance(memory, tuple):
+        parts = [put(old, rows, part, donate) for old, part in zip(memory, new, strict=True)]
+        return type(memory)(*parts) if hasattr(memory, "_fields") else tuple(parts)
+    if memory is not None:
+        memory = memory if donate else memory.copy()
+        memory[rows] = new
+    return memory
+
+
+@kernel
+def harm_so_far(line, total):
+    """Return the harm (m2/s2) of one world, added up from the obstacle to the rear: the only order that is used."""
+    harm = 0.0
+    for p in range(line.shape[1] - 1):
+        harm += line[TOTAL if total else FIRST, p]
+    return harm
+
+
+@large
+def _harm(line, total, out):
+    for k in range(len(out)):
+        out[k] = harm_so_far(line[k], total)
+
+
+@kernel
+def front_share(harm, front_mass, rear_mass):
+    """Return the part of a pair's harm that its front vehicle bears: ``harm m_rear / (m_front + m_rear)`` (eq. harm).
+
+    The larger part is computed and the smaller one is what is left, so both add up to ``harm`` exactly.
+    """
+    if front_mass <= rear_mass:
+        return rear_mass / (front_mass + rear_mass) * harm
+    return harm - front_mass / (front_mass + rear_mass) * harm
+
+
+@large
+def split_harm(pair_harm, mass, out):
+    """Write the harm that each vehicle bears to ``out`` [n, N]; Vehicle 1 bears all harm with the obstacle.
+
+    ``pair_harm`` [n, N + 1] is the harm of each pair (m2/s2), ``mass`` [n, N + 1] the mass of each body (t).
+    """
+    for k in range(len(out)):
+        out[k] = 0.0
+        for p in range(1, out.shape[1]):
+            front = front_share(pair_harm[k, p], mass[k, p], mass[k, p + 1])
+            out[k, p - 1] += front
+            out[k, p] += pair_harm[k, p] - front
+        out[k, 0] += pair_harm[k, 0]

@@ -1,0 +1,229 @@
+"""One step of a batch of episodes: from one decision of the learners to the next, or to the end."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.episode.state import (
+    CLOCK_COLUMNS,
+    ENDED,
+    FIRST_DECISION,
+    LAST,
+    NUMBER,
+    STEPS,
+    TIME,
+    State,
+)
+from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.motion.compiling import kernel, large
+from ethbrake_marl.motion.drive import FAILED, MET, drive
+from ethbrake_marl.motion.layout import (
+    BRAKING,
+    COUNT,
+    DRIVING,
+    FORCE,
+    LATENCY,
+    NEW_FIRST,
+    NEW_TOTAL,
+    SPEED,
+    Bools,
+    Floats,
+    Ints,
+    scratch_for,
+)
+
+# rows of `out`
+HARM = 0  # first-impact harm of the step (m2/s2)
+TOTAL_HARM = 1  # harm of all impacts of the step (m2/s2)
+TERMINATED = 2  # 1 if all vehicles have come to rest
+TRUNCATED = 3  # 1 if the horizon has come first
+SAFE_END = 4  # 1 if the episode has ended without any impact
+OUT_ROWS = 5
+
+LARGEST_ACTION = float(np.nextafter(np.float32(1.0), np.float32(2.0)))  # counts as 1: the next float32 number
+ROUNDING = 1e-9  # part of a step by which the horizon may lie beyond the last whole step
+
+
+class Rules(NamedTuple):
+    """The numbers that a step needs."""
+
+    learners: Ints  # [L] bodies (1: Vehicle 1) whose actions are given
+    time_step_s: float
+    horizon_s: float
+    harm: float = 1.0  # weight of the line's harm in the reward
+    terminal: float = 0.0  # weight of an end without impact in the reward
+    total: bool = False  # the reward counts every impact, not only the first of each pair
+
+
+class Step(NamedTuple):
+    """What a step did in n worlds. An episode that had ended before does nothing."""
+
+    reward: Floats  # [n, N] reward of each vehicle
+    out: Floats  # [OUT_ROWS, n] the properties below
+    time_step_s: float
+    terms: dict[str, Floats]  # name -> value of a term of the reward before it is weighted, [n] or [n, N]
+
+    @property
+    def first_impact_harm(self) -> Floats:
+        """First-impact harm of the line in this step, [n] m2/s2."""
+        return self.out[HARM]
+
+    @property
+    def total_harm(self) -> Floats:
+        """Harm of all impacts of the line in this step, [n] m2/s2."""
+        return self.out[TOTAL_HARM]
+
+    @property
+    def terminated(self) -> Bools:
+        """Whether the step ended the episode because every vehicle is at rest and no command would move it, [n]."""
+        return self.out[TERMINATED] == 1.0
+
+    @property
+    def truncated(self) -> Bools:
+        """Whether the step ended the episode at the horizon, [n]."""
+        return self.out[TRUNCATED] == 1.0
+
+    @property
+    def safe_end(self) -> Bools:
+        """Whether the step ended an episode without any impact, [n]."""
+        return self.out[SAFE_END] == 1.0
+
+
+@kernel
+def command(car, wanted, learners, actions):
+    """Turn the learners' actions, -1 (full braking) to 0 (coasting) to 1 (full driving), into commands."""
+    for j in range(learners.shape[0]):
+        i, action = learners[j], min(max(actions[j], -1.0), 1.0)
+        wanted[i] = action * car[BRAKING, i] if action < 0.0 else action * car[DRIVING, i]
+
+
+@kernel
+def advance(line, car, clock, wanted, scratch, time_step_s, horizon_s):
+    """Advance one running world to its next decision, in place; return what ``drive`` met, and whether all is at rest.
+
+    The times of decisions are multiples from the first one, so that an episode has the same times wherever it is played.
+    """
+    clock[STEPS] += 1.0
+    over = clock[STEPS] >= clock[LAST]
+    until = horizon_s if over else clock[FIRST_DECISION] + clock[STEPS] * time_step_s
+    met = drive(line, car, wanted, scratch, clock[TIME], until)
+    clock[TIME] = until
+    at_rest = met != FAILED
+    for i in range(1, line.shape[1]):
+        at_rest = at_rest and line[SPEED, i] == 0.0 and wanted[i] <= 0.0 and line[FORCE, i] <= 0.0
+    clock[ENDED] = 1.0 if over or at_rest or met == FAILED else 0.0
+    return met, at_rest
+
+
+@large
+def step_worlds(
+    line, car, clock, wanted, actions, scratch, out, reward, learners, time_step_s, horizon_s, harm, terminal, total
+):
+    """Advance every running episode by one step, in place; return the row of a world that failed, otherwise -1.
+
+    For an action that is no number in [-1, 1] its row is returned, and nothing has moved.
+    """
+    n, bodies = wanted.shape
+    for k in range(n):
+        for c in range(learners.shape[0]):
+            if not -LARGEST_ACTION <= actions[k, c] <= LARGEST_ACTION:
+                return k
+    failed = -1
+    for k in range(n):
+        for row in range(out.shape[0]):
+            out[row, k] = 0.0
+        for i in range(bodies - 1):
+            reward[k, i] = 0.0
+        if clock[k, ENDED] == 1.0:
+            continue
+        command(car[k], wanted[k], learners, actions[k])
+        met, at_rest = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s, horizon_s)
+        if met == FAILED:
+            failed = k
+        impacts = 0.0
+        for p in range(bodies - 1):
+            impacts += line[k, COUNT, p]
+            if met == MET:
+                out[HARM, k] += scratch[NEW_FIRST, p]
+                out[TOTAL_HARM, k] += scratch[NEW_TOTAL, p]
+        over = clock[k, ENDED] == 1.0
+        out[TERMINATED, k] = 1.0 if at_rest else 0.0
+        out[TRUNCATED, k] = 1.0 if over and not at_rest else 0.0
+        out[SAFE_END, k] = 1.0 if over and impacts == 0.0 else 0.0
+        shared = (terminal if out[SAFE_END, k] == 1.0 else 0.0) - harm * out[TOTAL_HARM if total else HARM, k]
+        for i in range(bodies - 1):
+            reward[k, i] = shared
+    return failed
+
+
+@large
+def advance_worlds(line, car, time, until, wanted, scratch):
+    """Advance every world from ``time`` to ``until`` [n] under constant commands, in place; return a failed row or -1."""
+    failed = -1
+    for k in range(len(until)):
+        if drive(line[k], car[k], wanted[k], scratch, time[k], until[k]) == FAILED:
+            failed = k
+    return failed
+
+
+def at_alert(line: Floats, car: Floats, know: Floats, wanted: Floats, numbers: Ints) -> State:
+    """Return worlds at the alert: Vehicle 1 begins to brake, and nobody has decided yet."""
+    clock = np.zeros((len(line), CLOCK_COLUMNS))
+    clock[:, NUMBER] = numbers
+    return State(line, car, clock, know, wanted, {})
+
+
+def begin(alert: State, deciders: Ints, time_step_s: float, horizon_s: float) -> State:
+    """Return episodes at their first decision: when the shortest latency of the bodies ``deciders`` has elapsed.
+
+    Until then ``alert.wanted`` is commanded.
+    """
+    line, clock = alert.line.copy(), alert.clock.copy()
+    first = alert.car[:, LATENCY, deciders].min(axis=1) if len(deciders) else np.zeros(alert.n)
+    wanted = alert.wanted.copy()
+    failed = advance_worlds(line, alert.car, alert.time_s.copy(), first, wanted, scratch_for(wanted.shape[1]))
+    if failed >= 0:
+        raise failure(alert, failed, 0.0, first[failed])
+    clock[:, TIME] = clock[:, FIRST_DECISION] = first
+    clock[:, LAST] = np.ceil((horizon_s - first) / time_step_s - ROUNDING)
+    return State(line, alert.car, clock, alert.know, wanted, alert.memories)
+
+
+def step(
+    rules: Rules, scripts: dict[int, Any], state: State, actions: Floats, *, donate: bool = False
+) -> tuple[State, Step]:
+    """Return the state after one step, and what the step did.
+
+    ``actions`` [n, L] are the learners' actions in [-1, 1]; ``scripts`` are those that look at the state at every
+    decision. Raises ``InvalidInput`` for a bad action. ``state`` does not change, unless its memory is donated.
+    """
+    line, car, clock, know, wanted, memories = state
+    if not donate:
+        line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
+    if scripts:
+        memories = dict(memories)
+        for i, script in scripts.items():
+            wanted[:, i], memories[i] = script.act(state, memories[i], i)
+    reward, out = np.empty((len(clock), wanted.shape[1] - 1)), np.empty((OUT_ROWS, len(clock)))
+    failed = step_worlds(line, car, clock, wanted, actions, scratch_for(wanted.shape[1]), out, reward, *rules)
+    if failed >= 0:
+        _check_actions(rules, actions[failed])
+        raise failure(state, failed, state.time_s[failed], clock[failed, TIME])
+    return State(line, car, clock, know, wanted, memories), Step(reward, out, rules.time_step_s, {})
+
+
+def _check_actions(rules: Rules, actions: Floats) -> None:
+    for body, action in zip(rules.learners, actions, strict=True):
+        if not -LARGEST_ACTION <= action <= LARGEST_ACTION:
+            raise InvalidInput(
+                f"action of vehicle_{body} = {float(action)!r}: must be from -1 (full braking) to 1 (full driving)"
+            )
+
+
+def failure(state: State, row: int, start_s: float, until_s: float) -> PhysicsError:
+    """Return the error for a world in which a check of the physics failed: a defect of this package."""
+    number = int(state.clock[row, NUMBER])
+    where = "a world of the caller" if number < 0 else f"world {number}"
+    return PhysicsError({row: f"{where}: a check of the physics failed between {start_s:g} s and {until_s:g} s"})

@@ -1,0 +1,102 @@
+"""When a pair comes into contact. Between two events its gap is a polynomial of time, so the answer is exact.
+
+With the gap g, the closing speed w, the closing acceleration b and the closing jerk j (rear minus front, in m, m/s, m/s2
+and m/s3), the gap after the time t is ``g - w t - b t^2 / 2 - j t^3 / 6``. Where brakes act at once, j is 0.
+"""
+
+from __future__ import annotations
+
+import math
+
+from ethbrake_marl.motion.compiling import kernel, large
+
+
+@kernel
+def gap_after(gap, closing, pressing, jerk, time):
+    """Return the gap (m) after ``time`` (s)."""
+    return gap - (closing + 0.5 * (pressing + jerk * time / 3.0) * time) * time
+
+
+@kernel
+def contact(gap, closing, pressing):
+    """Return time (s) and closing speed (m/s) of the first contact at jerk 0; ``(inf, 0)`` if there is none.
+
+    Let ``D = w^2 + 2 b g``. If ``w > 0``, there is no contact for ``D < 0``, otherwise one at
+    ``t = 2 g / (w + sqrt(D))``. If ``w <= 0``, there is one only for ``b > 0``, at ``t = (sqrt(D) - w) / b``. The
+    closing speed is ``sqrt(D)`` itself; ``w + b t``, which is equal, loses digits by cancellation.
+    """
+    if closing > 0.0:
+        squared = closing * closing + 2.0 * pressing * gap
+        if squared < 0.0:
+            return math.inf, 0.0
+        speed = math.sqrt(squared)
+        return 2.0 * gap / (closing + speed), speed
+    if pressing > 0.0:
+        speed = math.sqrt(closing * closing + 2.0 * pressing * gap)
+        return (speed - closing) / pressing, speed
+    return math.inf, 0.0
+
+
+@large
+def contact_on_cubic(gap, closing, pressing, jerk, end):
+    """Return time (s) and closing speed (m/s) of the first contact before ``end`` (s); ``(inf, 0)`` if there is none.
+
+    The closing speed ``w + b t + j t^2 / 2`` has at most two roots, and the gap is monotone between them. The contact is
+    in the first part at whose end the gap is at most 0: Newton's method, with a bisection where a step leaves the part.
+    The closed formula of a cubic's roots cancels.
+    """
+    first, second = -math.inf, -math.inf
+    squared = pressing * pressing - 2.0 * jerk * closing
+    if squared > 0.0:
+        root = math.sqrt(squared)
+        both = -(pressing + root) if pressing >= 0.0 else root - pressing
+        one, other = both / jerk, 2.0 * closing / both
+        first, second = min(one, other), max(one, other)
+    elif jerk < 0.0:
+        return math.inf, 0.0
+    for part in range(2):
+        if jerk > 0.0:  # the gap closes up to the first root, and from the second one on
+            low, high = (0.0, min(first, end)) if part == 0 else (max(second, 0.0), end)
+        else:
+            low, high = (max(first, 0.0), min(second, end)) if part == 0 else (0.0, 0.0)
+        if not low < high or gap_after(gap, closing, pressing, jerk, high) > 0.0:
+            continue
+        time = low
+        for _ in range(200):
+            beyond = gap_after(gap, closing, pressing, jerk, time)
+            if beyond > 0.0:
+                low = time
+            else:
+                high = time
+            speed = closing + (pressing + 0.5 * jerk * time) * time
+            after = time + beyond / speed if speed > 0.0 else math.inf
+            if not low < after < high:
+                after = 0.5 * (low + high)
+                if after <= low or after >= high:
+                    break
+            if after == time:
+                break
+            time = after
+        return time, max(closing + (pressing + 0.5 * jerk * time) * time, 0.0)
+    return math.inf, 0.0
+
+
+@kernel
+def first_return(value, rate, jerk):
+    """Return the first t > 0 (s) at which ``value + rate t + jerk t^2 / 2`` is 0; infinite if there is none.
+
+    A ``value`` that is 0 now does not count: the result is the next time.
+    """
+    if value == 0.0:
+        return -2.0 * rate / jerk if rate * jerk < 0.0 else math.inf
+    if jerk == 0.0:
+        return -value / rate if value * rate < 0.0 else math.inf
+    squared = rate * rate - 2.0 * jerk * value
+    if squared < 0.0:
+        return math.inf
+    root = math.sqrt(squared)
+    both = -(rate + root) if rate >= 0.0 else root - rate
+    early, late = both / jerk, 2.0 * value / both if both != 0.0 else both / jerk
+    if early <= 0.0 or 0.0 < late < early:
+        early = late
+    return early if early > 0.0 else math.inf

@@ -1,0 +1,342 @@
+"""One line of bodies through an interval of constant commands, from event to event.
+
+Between two events every body has a constant jerk: 0 where brakes act at once, so the same text serves both, and the
+compiler drops the jerk where ``builds`` is the constant False. ``ahead`` is the first body that takes part: 1 where there
+is no obstacle. Times within an interval count from its start.
+"""
+
+from __future__ import annotations
+
+import math
+
+from ethbrake_marl.motion.compiling import kernel, large
+from ethbrake_marl.motion.contact import contact, contact_on_cubic, first_return, gap_after
+from ethbrake_marl.motion.forces import acts, force_now, force_range, plan_force, settle
+from ethbrake_marl.motion.impact import pool, resolve_impacts
+from ethbrake_marl.motion.layout import (
+    ACCELERATION,
+    ACTIVE,
+    BRAKE_RATE,
+    COMMAND,
+    CONTACT_SPEED,
+    CONTACT_TIME,
+    COUNT,
+    FAR_M,
+    FIRST,
+    FORCE,
+    FORCE_GOAL,
+    FORCE_RATE,
+    FORCE_TIME,
+    GAP,
+    HIGH,
+    HIGH_JERK,
+    JERK,
+    JOINED,
+    LATENCY,
+    LIMIT,
+    LOW,
+    LOW_JERK,
+    MASS,
+    NEW_COUNT,
+    NEW_FIRST,
+    NEW_TOTAL,
+    ONSET,
+    RELEASE_RATE,
+    SPEED,
+    SPEED_GOAL,
+    SPEED_TIME,
+    TOTAL,
+    WAY,
+)
+
+# what `drive` returns
+APART = 0  # no two bodies could touch
+MET = 1  # contacts were resolved
+FAILED = 2  # a check of the physics failed: never the user's fault
+
+MISSED_M = 1e-9  # a gap below minus this means that a contact was missed
+MOST_EVENTS = 1_000_000  # more events of an interval mean a defect (the most ever seen: 160,000)
+LATE_S, LATE_MPS2 = 1e-9, 1e-12  # delay of a parting, so that rounding cannot undo it (1e-26 m)
+
+
+@kernel
+def crossing_s(below, rate):
+    """Return the time (s) until ``below`` (m/s2, at most 0), which grows at ``rate`` (m/s3), is surely above 0."""
+    return math.inf if rate <= 0.0 else max(-below / rate, 0.0) + LATE_S + LATE_MPS2 / rate
+
+
+@large
+def parting_s(car, scratch, head, tail):
+    """Return the time (s) until the bodies ``head..tail``, which move as one, part or start to move; infinite: never.
+
+    A moving block splits when its front bodies alone would accelerate more than the whole. A block that its brakes hold
+    starts to move when its front bodies drive away, or when its rear bodies would move backward.
+    """
+    value, jerk, soonest = scratch[ACCELERATION, head], scratch[JERK, head], math.inf
+    held = value == 0.0 and jerk == 0.0
+    forward = value > 0.0 or (value == 0.0 and jerk > 0.0)
+    side, side_jerk = (LOW, LOW_JERK) if held or forward else (HIGH, HIGH_JERK)
+    mass, force, rate = 0.0, 0.0, 0.0
+    for i in range(head, tail + (1 if held else 0)):  # the front bodies, up to i
+        if car[MASS, i] == math.inf:
+            mass = math.inf
+            continue
+        mass += car[MASS, i]
+        force += car[MASS, i] * scratch[side, i]
+        rate += car[MASS, i] * scratch[side_jerk, i]
+        soonest = min(soonest, crossing_s(force / mass - value, rate / mass - jerk))
+    mass, force, rate = 0.0, 0.0, 0.0
+    for i in range(tail if held else head - 1, head - 1, -1):  # the rear bodies, from i on
+        if car[MASS, i] == math.inf:
+            break
+        mass += car[MASS, i]
+        force += car[MASS, i] * scratch[HIGH, i]
+        rate += car[MASS, i] * scratch[HIGH_JERK, i]
+        soonest = min(soonest, crossing_s(-force / mass, -rate / mass))
+    return soonest
+
+
+@kernel
+def accelerate(line, car, scratch, ahead, builds):
+    """Set acceleration and jerk of every body, and which pairs move as one; return the time (s) until one parts."""
+    bodies, soonest, first = line.shape[1], math.inf, ahead
+    for i in range(ahead, bodies):
+        plan_force(line, car, scratch, i, builds)
+        scratch[LOW, i], scratch[HIGH, i], scratch[LOW_JERK, i], scratch[HIGH_JERK, i] = force_range(
+            line[FORCE, i], scratch[FORCE_RATE, i] if builds else 0.0, line[SPEED, i], car[LIMIT, i]
+        )
+    while first < bodies:
+        last = first
+        while last < bodies - 1 and line[GAP, last] <= 0.0 and line[SPEED, last] == line[SPEED, last + 1]:
+            last += 1
+        if last == first:
+            scratch[ACCELERATION, first], scratch[JERK, first] = settle(
+                scratch[LOW, first],
+                scratch[HIGH, first],
+                scratch[LOW_JERK, first] if builds else 0.0,
+                scratch[HIGH_JERK, first] if builds else 0.0,
+            )
+        else:
+            pool(
+                car[MASS], scratch[LOW], scratch[HIGH], scratch[LOW_JERK], scratch[HIGH_JERK], scratch, first, last,
+                scratch[ACCELERATION], scratch[JERK],
+            )  # fmt: skip
+            head = first
+            for p in range(first, last + 1):
+                same = scratch[ACCELERATION, p] == scratch[ACCELERATION, p + 1] if p < last else False
+                same = same and scratch[JERK, p] == scratch[JERK, p + 1]
+                scratch[JOINED, p] = 1.0 if same else 0.0
+                if not same:
+                    if builds and p > head:
+                        soonest = min(soonest, parting_s(car, scratch, head, p))
+                    head = p + 1
+        scratch[JOINED, last] = 0.0
+        first = last + 1
+    return soonest
+
+
+@kernel
+def next_event(line, car, scratch, now, end, parting, ahead, builds):
+    """Return the time (s) to the next event, at most ``end - now``, and set when each speed and pair has its own.
+
+    Events: contact, parting (in ``parting`` s), rest, the speed limit, a command that takes effect, a force that reaches
+    its command or 0.
+    """
+    bodies, soonest = line.shape[1], min(end - now, parting)
+    for i in range(ahead, bodies):
+        if builds:
+            soonest = min(soonest, scratch[FORCE_TIME, i])
+        if scratch[ACTIVE, i] == 0.0:
+            soonest = min(soonest, scratch[ONSET, i] - now)
+    for i in range(ahead, bodies):
+        rate, jerk, goal = scratch[ACCELERATION, i], scratch[JERK, i] if builds else 0.0, 0.0
+        time = first_return(line[SPEED, i], rate, jerk)
+        if line[FORCE, i] > 0.0 or (builds and scratch[FORCE_RATE, i] > 0.0):
+            reach = first_return(line[SPEED, i] - car[LIMIT, i], rate, jerk)
+            if reach < time:
+                time, goal = reach, car[LIMIT, i]
+        scratch[SPEED_TIME, i], scratch[SPEED_GOAL, i] = time, goal
+        soonest = min(soonest, time)
+    for p in range(ahead, bodies - 1):
+        time, speed = math.inf, 0.0
+        if scratch[JOINED, p] == 0.0:
+            closing = line[SPEED, p + 1] - line[SPEED, p]
+            pressing = scratch[ACCELERATION, p + 1] - scratch[ACCELERATION, p]
+            jerk = scratch[JERK, p + 1] - scratch[JERK, p] if builds else 0.0
+            if jerk == 0.0:
+                time, speed = contact(line[GAP, p], closing, pressing)
+            else:
+                time, speed = contact_on_cubic(line[GAP, p], closing, pressing, jerk, soonest)
+        scratch[CONTACT_TIME, p], scratch[CONTACT_SPEED, p] = time, speed
+        soonest = min(soonest, time)
+    return soonest
+
+
+@kernel
+def move(line, scratch, duration, ahead, builds):
+    """Move gaps, speeds and forces to the next event, ``duration`` (s) later; return False if a contact was missed.
+
+    What happens at the event is set exactly: the gap of a pair in contact to 0, a speed to 0 or the limit, a force to
+    its goal, and the speed of the rear body of a contact to the front one's plus the closing speed.
+    """
+    bodies, sound, first = line.shape[1], True, ahead
+    for p in range(ahead, bodies - 1):
+        if scratch[CONTACT_TIME, p] <= duration:
+            line[GAP, p] = 0.0
+            continue
+        scratch[CONTACT_SPEED, p] = 0.0
+        if scratch[JOINED, p] == 0.0:
+            closing = line[SPEED, p + 1] - line[SPEED, p]
+            pressing = scratch[ACCELERATION, p + 1] - scratch[ACCELERATION, p]
+            jerk = scratch[JERK, p + 1] - scratch[JERK, p] if builds else 0.0
+            after = gap_after(line[GAP, p], closing, pressing, jerk, duration)
+            sound = sound and after >= -MISSED_M
+            line[GAP, p] = max(after, 0.0)
+    while first < bodies:
+        jerk = scratch[JERK, first] if builds else 0.0
+        value = line[SPEED, first] + (scratch[ACCELERATION, first] + 0.5 * jerk * duration) * duration
+        last = first
+        if scratch[SPEED_TIME, first] <= duration:
+            value = scratch[SPEED_GOAL, first]
+        while scratch[JOINED, last] == 1.0:
+            last += 1
+            if scratch[SPEED_TIME, last] <= duration:
+                value = scratch[SPEED_GOAL, last]
+        if first > ahead and scratch[CONTACT_SPEED, first - 1] > 0.0:
+            value = line[SPEED, first - 1] + scratch[CONTACT_SPEED, first - 1]
+        for i in range(first, last + 1):
+            line[SPEED, i] = value
+        first = last + 1
+    for i in range(ahead if builds else bodies, bodies):
+        if scratch[FORCE_TIME, i] <= duration:
+            line[FORCE, i] = scratch[FORCE_GOAL, i]
+        else:
+            line[FORCE, i] += scratch[FORCE_RATE, i] * duration
+    return sound
+
+
+@kernel
+def solo(speed, command, onset, limit, duration):
+    """Move a vehicle that touches nothing; return its speed (m/s), its way (m) and its acceleration (m/s2).
+
+    It coasts until ``onset`` (s), then brakes to rest or drives up to ``limit`` (m/s). Its speed is at least 0. The
+    acceleration is NaN if it changes on the way.
+    """
+    way, steady = 0.0, command
+    if onset > 0.0:
+        if onset >= duration or command == 0.0:
+            return speed, speed * duration, 0.0
+        way, duration, steady = speed * onset, duration - onset, math.nan
+    after = speed + command * duration
+    if command < 0.0:
+        if after <= 0.0:
+            return 0.0, way - speed * speed / (2.0 * command), 0.0 if speed == 0.0 else math.nan
+    elif command > 0.0:
+        if speed >= limit:
+            return speed, way + speed * duration, 0.0
+        if after >= limit:
+            driving = (limit - speed) / command
+            return limit, way + 0.5 * (speed + limit) * driving + limit * (duration - driving), math.nan
+    return after, way + (speed + 0.5 * command * duration) * duration, steady
+
+
+@kernel
+def move_apart(line, car, scratch, duration, ahead, builds):
+    """Move the line to the end of the interval at once and return True, if surely no two bodies touch; else do nothing.
+
+    Alone, a speed only rises or only falls within the interval, so a gap shrinks by at most ``duration`` times (largest
+    rear speed minus smallest front speed). Where that is too much, and both accelerations are constant, ``contact`` says
+    exactly. Forces must not build up within the interval.
+    """
+    bodies, slowest, front = line.shape[1], math.inf, 0.0
+    for i in range(ahead, bodies):
+        speed, command, onset = line[SPEED, i], scratch[COMMAND, i], scratch[ONSET, i]
+        if speed < 0.0:
+            return False
+        if builds and min(car[BRAKE_RATE, i], car[RELEASE_RATE, i]) < math.inf:
+            acting = acts(onset, duration)
+            if line[FORCE, i] != (command if acting else 0.0) or (acting and onset > 0.0):
+                return False
+        after, way, steady = solo(speed, command, onset, car[LIMIT, i], duration)
+        scratch[SPEED_GOAL, i], scratch[WAY, i] = after, way
+        if i > ahead:
+            closing = max(speed, after) - slowest
+            if closing > 0.0 and closing * duration >= line[GAP, i - 1]:
+                closing, pressing = speed - line[SPEED, i - 1], steady - front
+                if math.isnan(pressing) or (line[GAP, i - 1] <= 0.0 and closing >= 0.0):
+                    return False
+                if contact(line[GAP, i - 1], closing, pressing)[0] <= duration:
+                    return False
+        slowest, front = min(speed, after), steady
+    for i in range(ahead, bodies):
+        line[SPEED, i] = scratch[SPEED_GOAL, i]
+    for p in range(ahead, bodies - 1):
+        line[GAP, p] = max(line[GAP, p] + (scratch[WAY, p] - scratch[WAY, p + 1]), 0.0)
+    return True
+
+
+@kernel
+def move_by_events(line, car, scratch, duration, ahead, builds):
+    """Move the line to the end of the interval from event to event; return False if a check failed."""
+    now = 0.0
+    for _ in range(MOST_EVENTS):
+        if resolve_impacts(line, car, scratch, ahead):
+            continue
+        if now >= duration:
+            return True
+        parting = accelerate(line, car, scratch, ahead, builds)
+        passed = next_event(line, car, scratch, now, duration, parting, ahead, builds)
+        if not move(line, scratch, passed, ahead, builds):
+            return False
+        for i in range(ahead, line.shape[1]):
+            if scratch[ONSET, i] - now <= passed:
+                scratch[ACTIVE, i] = 1.0
+        now = duration if passed >= duration - now else now + passed
+    return False
+
+
+@kernel
+def through_interval(line, car, scratch, start, until, ahead, builds):
+    """Do the work of ``drive``. ``builds`` must be a constant."""
+    bodies, duration, met = line.shape[1], until - start, APART
+    for i in range(ahead, bodies):
+        scratch[ONSET, i] = car[LATENCY, i] - start
+        scratch[ACTIVE, i] = 1.0 if scratch[ONSET, i] <= 0.0 else 0.0
+    if not move_apart(line, car, scratch, duration, ahead, builds):
+        for i in range(ahead, bodies):
+            scratch[CONTACT_SPEED, i] = scratch[NEW_FIRST, i] = scratch[NEW_TOTAL, i] = scratch[NEW_COUNT, i] = 0.0
+            builds_here = builds and min(car[BRAKE_RATE, i], car[RELEASE_RATE, i]) < math.inf
+            if builds_here and not acts(scratch[ONSET, i], duration):
+                scratch[ONSET, i] = max(scratch[ONSET, i], duration)
+        met = MET if move_by_events(line, car, scratch, duration, ahead, builds) else FAILED
+        for p in range(ahead, bodies - 1):
+            line[FIRST, p] += scratch[NEW_FIRST, p]
+            line[TOTAL, p] += scratch[NEW_TOTAL, p]
+            line[COUNT, p] += scratch[NEW_COUNT, p]
+    for i in range(ahead, bodies):
+        wanted = scratch[COMMAND, i] if acts(car[LATENCY, i], until) else 0.0
+        line[FORCE, i] = force_now(line[FORCE, i], wanted, car[BRAKE_RATE, i], car[RELEASE_RATE, i]) if builds else wanted
+    return met
+
+
+@large
+def through_interval_building(line, car, scratch, start, until, ahead):
+    """``through_interval`` where brakes build up."""
+    return through_interval(line, car, scratch, start, until, ahead, True)
+
+
+@kernel
+def drive(line, car, wanted, scratch, start, until):
+    """Move one line from ``start`` to ``until`` (s after the alert) under the commands ``wanted`` [N + 1] (m/s2).
+
+    A command has no effect before the body's latency has elapsed. Changes ``line``; returns ``APART``, ``MET`` or
+    ``FAILED``. If it is not ``APART``, the rows NEW of ``scratch`` hold the harm of this interval.
+    """
+    ahead, builds = 0 if line[GAP, 0] < FAR_M else 1, False
+    for i in range(line.shape[1]):
+        scratch[COMMAND, i] = wanted[i]
+        builds = builds or min(car[BRAKE_RATE, i], car[RELEASE_RATE, i]) < math.inf
+    scratch[NEW_FIRST, 0] = scratch[NEW_TOTAL, 0] = scratch[NEW_COUNT, 0] = 0.0
+    if builds:
+        return through_interval_building(line, car, scratch, start, until, ahead)
+    return through_interval(line, car, scratch, start, until, ahead, False)

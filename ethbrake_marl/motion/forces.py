@@ -1,0 +1,124 @@
+"""The force of a body: what its brakes or engine do now, and what its acceleration is when it is free or pushed.
+
+The *force* is the acceleration that brakes or engine alone would cause. It goes to the command at the vehicle's rates,
+at once where a rate is infinite, and also while the vehicle is at rest.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ethbrake_marl.motion.compiling import kernel, large
+from ethbrake_marl.motion.layout import (
+    ACTIVE,
+    BRAKE_RATE,
+    COMMAND,
+    FORCE,
+    FORCE_GOAL,
+    FORCE_RATE,
+    FORCE_TIME,
+    RELEASE_RATE,
+    Floats,
+)
+
+ROUNDING_S = 1e-9  # an onset this shortly before the end of an interval is at its end
+
+
+@kernel
+def acts(latency, time):
+    """Return whether a command takes effect before ``time``. At ``time`` itself the next decision replaces it.
+
+    ``latency`` and ``time`` (s) count from the same moment.
+    """
+    return latency <= 0.0 or latency < time - ROUNDING_S
+
+
+@kernel
+def force_now(force, wanted, brake_rate, release_rate):
+    """Return the force (m/s2) just after the command ``wanted`` (m/s2) has taken effect.
+
+    The command itself if the rate (m/s3) towards it is infinite, otherwise the present ``force``.
+    """
+    return wanted if math.isinf(brake_rate if wanted < force else release_rate) else force
+
+
+@kernel
+def plan_force(line, car, scratch, i, builds):
+    """Set how the force of body i goes on: its rate, its next goal and the time until then.
+
+    The goal is the command, or 0 if the force changes its sign on the way: there the body may start to move.
+    """
+    wanted = scratch[COMMAND, i] * scratch[ACTIVE, i]
+    force = force_now(line[FORCE, i], wanted, car[BRAKE_RATE, i], car[RELEASE_RATE, i]) if builds else wanted
+    line[FORCE, i], scratch[FORCE_RATE, i], scratch[FORCE_TIME, i] = force, 0.0, math.inf
+    if builds and wanted != force:
+        rate = -car[BRAKE_RATE, i] if wanted < force else car[RELEASE_RATE, i]
+        goal = 0.0 if force < 0.0 < wanted or wanted < 0.0 < force else wanted
+        scratch[FORCE_RATE, i], scratch[FORCE_TIME, i], scratch[FORCE_GOAL, i] = rate, (goal - force) / rate, goal
+
+
+@kernel
+def force_range(force, rate, speed, limit):
+    """Return ``(forward, backward, rate of forward, rate of backward)``: what own forces do in each direction.
+
+    The acceleration (m/s2) by own forces if the body is about to move forward, the same for backward, and their rates
+    (m/s3). They differ in two cases: brakes at rest act against motion in either direction; a vehicle that drives at
+    its speed limit uses only as much force as keeps it there.
+    """
+    if force < 0.0 or (force == 0.0 and rate < 0.0):
+        if speed > 0.0:
+            return force, force, rate, rate
+        if speed < 0.0:
+            return -force, -force, -rate, -rate
+        return force, -force, rate, -rate
+    if force > 0.0 or rate > 0.0:
+        if speed < limit:
+            return force, force, rate, rate
+        if speed == limit:
+            return 0.0, force, 0.0, rate
+    return 0.0, 0.0, 0.0, 0.0
+
+
+@kernel
+def settle(low, high, low_jerk, high_jerk):
+    """Return acceleration (m/s2) and jerk (m/s3) of a body: the value nearest to 0 in the range that its forces allow.
+
+    ``[low, high]`` is the range (m/s2), ``low_jerk`` and ``high_jerk`` (m/s3) are the rates of its ends.
+    """
+    if low > 0.0 or (low == 0.0 and low_jerk > 0.0):
+        return low, low_jerk
+    if high < 0.0 or (high == 0.0 and high_jerk < 0.0):
+        return high, high_jerk
+    return 0.0, 0.0
+
+
+@kernel
+def stopping_m(speed, latency_left, capacity, rate):
+    """Return the distance (m) until a vehicle is at rest: it coasts for its latency, then brakes fully.
+
+    With speed v (m/s, at least 0), latency left tau (s), capacity a (m/s2) and rate r (m/s3), the distance is
+    ``v tau + v^2 / (2 a) + v a / (2 r) - a^3 / (24 r^2)``. A vehicle with ``v < a^2 / (2 r)`` stops before its brakes
+    have full force, after ``v tau + (2 / 3) v sqrt(2 v / r)``. For an infinite rate it is ``v tau + v^2 / (2 a)``.
+    """
+    speed = max(speed, 0.0)
+    if math.isinf(rate):
+        return speed * latency_left + speed * speed / (2.0 * capacity)
+    rise = capacity / rate
+    if speed < 0.5 * capacity * rise:
+        return speed * latency_left + 2.0 / 3.0 * speed * math.sqrt(2.0 * speed / rate)
+    return speed * latency_left + 0.5 * speed * rise - capacity * rise * rise / 24.0 + speed * speed / (2.0 * capacity)
+
+
+@large
+def _stopping_each(speed, latency_left, capacity, rate, out):
+    for k in range(len(out)):
+        out[k] = stopping_m(speed[k], latency_left[k], capacity[k], rate[k])
+
+
+def stopping_distances(speed: Floats, latency_left: Floats, capacity: Floats, rate: Floats) -> Floats:
+    """Return ``stopping_m`` of n vehicles, [n] m."""
+    out = np.empty(len(speed))
+    _stopping_each(*(np.ascontiguousarray(each) for each in (speed, latency_left, capacity, rate)), out)
+    return out

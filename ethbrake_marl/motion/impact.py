@@ -1,0 +1,159 @@
+"""Impacts, and bodies that push each other: one law for all touching bodies at once.
+
+Resolving a pair after the other would make the result depend on their order. A *cluster* (touching bodies) is therefore
+resolved together, by the mass-weighted isotonic regression P from front to rear (pool adjacent violators):
+
+* impact with speeds v- before, v+ after, and restitution e: ``v+ = (1 + e) P(v-) - e v-``; for two vehicles this is the
+  paper's eq. (13);
+* resting contact: the accelerations are ``P`` of the bodies' own ones; a block of masses m and own accelerations u has
+  ``sum(m u) / sum(m)``. Brakes at rest have any force up to a limit, so a block at rest moves only if the push exceeds it.
+
+``first`` and ``last`` are the front and rear body of a cluster.
+"""
+
+from __future__ import annotations
+
+import math
+
+from ethbrake_marl.motion.compiling import kernel, large
+from ethbrake_marl.motion.forces import settle
+from ethbrake_marl.motion.layout import (
+    BLOCK_HEAD,
+    BLOCK_HIGH,
+    BLOCK_HIGH_JERK,
+    BLOCK_LOW,
+    BLOCK_LOW_JERK,
+    BLOCK_MASS,
+    CLOSING,
+    CONTACT_SPEED,
+    GAP,
+    HIT,
+    JERK,
+    MASS,
+    NEW_COUNT,
+    NEW_FIRST,
+    NEW_TOTAL,
+    POOLED,
+    RESTITUTION,
+    SPEED,
+    ZERO,
+)
+
+TOUCH_MPS = 1e-5  # a contact at this closing speed or less is a touch: no impact, no harm
+PLASTIC_MPS = 0.05  # a cluster whose largest closing speed is below this does not bounce
+SAME_MPS2 = 5e-13  # touching bodies with accelerations closer than this move alike
+
+
+@large
+def pool(mass, low, high, low_jerk, high_jerk, scratch, first, last, value, jerk):
+    """Write the isotonic regression of the bodies ``first..last`` to ``value`` and ``jerk``; return the number of blocks.
+
+    A body whose value is above the value of the body in front forms a *block* with it. All of a block have the value
+    ``settle`` of its mean range, weighted by mass. A body of infinite mass and its block have the value 0.
+
+    ``low`` and ``high`` are the ends of each body's range (speeds or accelerations, equal for speeds), ``low_jerk`` and
+    ``high_jerk`` their rates; all are rows [N + 1]. The blocks stand in the rows BLOCK of ``scratch``.
+    """
+    count = 0
+    for i in range(first, last + 1):
+        heavy = mass[i] == math.inf
+        scratch[BLOCK_MASS, count], scratch[BLOCK_HEAD, count] = mass[i], i
+        scratch[BLOCK_LOW, count] = 0.0 if heavy else mass[i] * low[i]
+        scratch[BLOCK_HIGH, count] = 0.0 if heavy else mass[i] * high[i]
+        scratch[BLOCK_LOW_JERK, count] = 0.0 if heavy else mass[i] * low_jerk[i]
+        scratch[BLOCK_HIGH_JERK, count] = 0.0 if heavy else mass[i] * high_jerk[i]
+        top = count + first
+        value[top], jerk[top] = settle(low[i], high[i], low_jerk[i], high_jerk[i])
+        while count > 0 and (
+            value[top] > value[top - 1]
+            or ((jerk[top] != 0.0 or jerk[top - 1] != 0.0) and value[top] >= value[top - 1] - SAME_MPS2)
+        ):
+            count -= 1
+            top -= 1
+            for row in (BLOCK_MASS, BLOCK_LOW, BLOCK_HIGH, BLOCK_LOW_JERK, BLOCK_HIGH_JERK):
+                scratch[row, count] += scratch[row, count + 1]
+            whole = scratch[BLOCK_MASS, count]
+            value[top], jerk[top] = settle(
+                scratch[BLOCK_LOW, count] / whole,
+                scratch[BLOCK_HIGH, count] / whole,
+                scratch[BLOCK_LOW_JERK, count] / whole,
+                scratch[BLOCK_HIGH_JERK, count] / whole,
+            )
+        count += 1
+    member = last
+    for block in range(count - 1, -1, -1):
+        here, rate = value[block + first], jerk[block + first]
+        while member >= scratch[BLOCK_HEAD, block]:
+            value[member], jerk[member] = here, rate
+            member -= 1
+    return count
+
+
+@kernel
+def resolve_cluster(line, car, scratch, first, last):
+    """Replace the speeds of the touching bodies ``first..last`` by their speeds after the impact.
+
+    The impact is plastic (e = 0) if the largest closing speed is below ``PLASTIC_MPS``. Each block's common speed is
+    corrected by its mean rounding error, so momentum is kept to 4 eps of ``sum(m |v|)`` for any masses. In a plastic
+    impact no speed may exceed the one in front by rounding, or two blocks could exchange a rounding error forever. The
+    speed of a body that is not struck keeps its bits.
+    """
+    largest = 0.0
+    for p in range(first, last):
+        largest = max(largest, scratch[CLOSING, p])
+    bounce, end = car[RESTITUTION, 0] if largest >= PLASTIC_MPS else 0.0, last + 1
+    blocks = pool(
+        car[MASS], line[SPEED], line[SPEED], scratch[ZERO], scratch[ZERO], scratch, first, last, scratch[POOLED],
+        scratch[JERK],
+    )  # fmt: skip
+    for block in range(blocks - 1, -1, -1):
+        head = int(scratch[BLOCK_HEAD, block])
+        pooled = scratch[POOLED, head]
+        if scratch[BLOCK_MASS, block] < math.inf:
+            rest = 0.0
+            for i in range(head, end):
+                rest += car[MASS, i] * (line[SPEED, i] - pooled)
+            pooled += rest / scratch[BLOCK_MASS, block]
+        for i in range(head, end):
+            line[SPEED, i] = pooled + bounce * (pooled - line[SPEED, i])
+        end = head
+    if bounce == 0.0:
+        for i in range(first + 1, last + 1):
+            line[SPEED, i] = min(line[SPEED, i], line[SPEED, i - 1])
+
+
+@kernel
+def resolve_impacts(line, car, scratch, ahead):
+    """Resolve every cluster in which a pair closes, and count its harm; return False if no pair closes.
+
+    Harm of an impact: the squared closing speed (m2/s2), added to the rows NEW of ``scratch``. A touch does none.
+    """
+    pairs, closes, first = line.shape[1] - 1, False, ahead
+    for p in range(ahead, pairs):
+        closing = 0.0
+        if line[GAP, p] <= 0.0:
+            closing = scratch[CONTACT_SPEED, p]
+            if closing == 0.0:
+                closing = line[SPEED, p + 1] - line[SPEED, p]
+        scratch[CLOSING, p] = closing
+        closes = closes or closing > 0.0
+    if not closes:
+        return False
+    while first < pairs:
+        last, closes = first, False
+        while last < pairs and line[GAP, last] <= 0.0:
+            closes = closes or scratch[CLOSING, last] > 0.0
+            last += 1
+        if closes:
+            resolve_cluster(line, car, scratch, first, last)
+        first = last + 1
+    for p in range(ahead, pairs):
+        scratch[CONTACT_SPEED, p] = 0.0
+        if scratch[CLOSING, p] > TOUCH_MPS:
+            harm = scratch[CLOSING, p] * scratch[CLOSING, p]
+            scratch[NEW_TOTAL, p] += harm
+            scratch[NEW_COUNT, p] += 1.0
+            if line[HIT, p] == 0.0:
+                line[HIT, p] = 1.0
+                scratch[NEW_FIRST, p] += harm
+    return True

@@ -1,0 +1,81 @@
+"""One world as arrays of rows: what changes, what stays, and the scratch memory of the physics.
+
+Column 0 is the *obstacle* ahead of the line, columns 1 to N are the vehicles, front to rear; all are called *bodies*. In
+a row of pairs, column p is the pair (body p, body p + 1). The obstacle is always there: without one, it is ``FAR_M``
+ahead, and the physics leaves it out.
+
+Arrays that most functions share: ``line`` [7, N + 1] changes, ``car`` [10, N + 1] stays, ``scratch`` [ROWS, N + 1]
+belongs to one call. A batch of n worlds has one more axis in front: ``line`` [n, 7, N + 1], ``car`` [n, 10, N + 1].
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+# rows of `line`
+SPEED = 0  # m/s, positive forward
+FORCE = 1  # acceleration that brakes or engine alone would cause now (m/s2), negative brakes
+GAP = 2  # of the pair, bumper to bumper (m)
+HIT = 3  # 1 once the pair has had an impact
+FIRST = 4  # harm of the pair's first impact (m2/s2)
+TOTAL = 5  # harm of all its impacts (m2/s2)
+COUNT = 6  # number of its impacts
+LINE_ROWS = 7
+
+# rows of `car`
+MASS = 0  # t; infinite: the obstacle
+LIMIT = 1  # speed up to which the vehicle drives (m/s)
+LATENCY = 2  # time after the alert at which its commands begin to take effect (s)
+BRAKING = 3  # largest deceleration on this road (m/s2)
+DRIVING = 4  # largest acceleration forward on this road (m/s2)
+BRAKE_RATE = 5  # rate at which the force falls towards the command (m/s3); infinite: at once
+RELEASE_RATE = 6  # rate at which the force rises towards the command (m/s3); infinite: at once
+WEIGHT = 7  # weight of the vehicle's harm in the objective `preference`
+RESTITUTION = 8  # of every impact of the world, in all columns (1)
+OWN_LATENCY = 9  # latency without the wait for news of the alert (s)
+CAR_ROWS = 10
+
+# rows of `scratch`
+COMMAND = 0  # acceleration that the body wants in this interval (m/s2)
+ONSET = 1  # when the command takes effect (s from the start of the interval)
+ACTIVE = 2  # 1 once it is in effect
+ACCELERATION = 3  # until the next event (m/s2)
+JERK = 4  # until the next event (m/s3)
+LOW = 5  # acceleration by the body's own force if it is about to move forward (m/s2)
+HIGH = 6  # the same if it is about to move backward (m/s2)
+LOW_JERK = 7  # rate of LOW (m/s3)
+HIGH_JERK = 8  # rate of HIGH (m/s3)
+FORCE_RATE = 9  # rate of FORCE (m/s3)
+FORCE_TIME = 10  # time until FORCE is FORCE_GOAL (s)
+FORCE_GOAL = 11  # the command, or 0 on the way to it (m/s2)
+SPEED_TIME = 12  # time until the speed is SPEED_GOAL (s)
+SPEED_GOAL = 13  # 0 or the speed limit (m/s)
+WAY = 14  # distance travelled in the interval (m)
+CONTACT_TIME = 15  # of the pair: time until its gap is 0 (s); infinite: it stays open
+CONTACT_SPEED = 16  # of the pair: exact closing speed of a contact that has just happened (m/s), otherwise 0
+JOINED = 17  # of the pair: 1 while it moves as one body
+CLOSING = 18  # of the pair: closing speed before an impact (m/s)
+POOLED = 19  # speed that the body would have after a plastic impact (m/s)
+ZERO = 20  # zeros
+BLOCK_MASS = 21  # of a block of bodies that move alike: mass (t)
+BLOCK_LOW = 22  # sum of mass times LOW, or times speed
+BLOCK_HIGH = 23  # sum of mass times HIGH, or times speed
+BLOCK_LOW_JERK = 24  # sum of mass times LOW_JERK
+BLOCK_HIGH_JERK = 25  # sum of mass times HIGH_JERK
+BLOCK_HEAD = 26  # its front body
+NEW_FIRST = 27  # of the pair: first-impact harm of this interval (m2/s2)
+NEW_TOTAL = 28  # of the pair: harm of all its impacts in this interval (m2/s2)
+NEW_COUNT = 29  # of the pair: number of its impacts in this interval
+ROWS = 30
+
+FAR_M = 1e300  # gap ahead of a line without an obstacle
+
+
+def scratch_for(bodies: int) -> Floats:
+    """Return scratch memory for worlds of so many bodies."""
+    return np.zeros((ROWS, bodies))
