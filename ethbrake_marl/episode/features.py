@@ -99,7 +99,9 @@ def _weight_share(state: State, body: int) -> Floats:
     return state.car[:, WEIGHT, body] / state.car[:, WEIGHT, 1:].sum(axis=1)
 
 
-def _of_both(name: str, unit: str, high: float, function: Callable[[State, int], Floats], meaning: str) -> dict[str, Own]:
+def _of_both(
+    name: str, unit: str, high: float, function: Callable[[State, int], Floats], meaning: str
+) -> dict[str, Own]:
     """Return a feature of the vehicle itself, ``own_NAME``, and the same of a neighbour, ``NAME``."""
     return {
         f"own_{name}": Own(Feature(f"own_{name}", unit, 1.0, 0.0, high, f"own {meaning}"), "own", function),

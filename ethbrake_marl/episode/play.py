@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ethbrake_marl.episode.state import CLOCK_COLUMNS, ENDED, STEPS, State, harm_so_far
-from ethbrake_marl.episode.step import advance, command
+from ethbrake_marl.episode.step import advance, command, step
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.drive import FAILED, drive
 from ethbrake_marl.motion.layout import BRAKING, LINE_ROWS, Floats, scratch_for
@@ -75,10 +75,10 @@ def price(game: Game, state: State, plans: Floats, count: str, most: Any = math.
     is above ``most``. Scripts that look at the state are asked as in the episode.
     """
     if game.scripts:
-        rows, game = np.arange(len(plans)), game._replace(shield=None, terms=())
+        rows = np.arange(len(plans))
         while not state.ended.all():
             now = np.minimum(state.steps, plans.shape[1] - 1)
-            state, _ = game.step(state, plans[rows, now])
+            state, _ = step(game.rules, game.scripts, state, plans[rows, now])
         return state.harm(count)
     out, rules = np.empty(len(plans)), game.rules
     most = np.broadcast_to(np.float64(most), out.shape).copy()

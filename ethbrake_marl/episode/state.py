@@ -1,4 +1,4 @@
-"""The state of a batch of episodes, as a value: a snapshot, a branch or the last state of an episode is just a State."""
+"""The state of a batch of episodes, as a value: a snapshot, a branch, the last state of an episode are States."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ CLOCK_COLUMNS = 6
 class State(NamedTuple):
     """n episodes of N vehicles, one row per world. Nobody changes it; a step returns a new one.
 
-    The arrays hold bodies 0 to N (``motion.layout``); the properties, which agents and terms read, hold vehicles: column
-    i belongs to ``vehicle_{i + 1}``, in arrays of pairs to it and the vehicle behind. Properties are views: copy before
-    you change them.
+    The arrays hold bodies 0 to N (``motion.layout``); the properties, which agents and terms read, hold vehicles:
+    column i belongs to ``vehicle_{i + 1}``, in arrays of pairs to it and the vehicle behind. Properties are views: copy
+    before you change them.
     """
 
     line: Floats  # [n, LINE_ROWS, N + 1] speeds, forces, gaps, harm
@@ -54,13 +54,16 @@ class State(NamedTuple):
     def take(self, rows: Any) -> State:
         """Return the episodes ``rows`` (indices, a mask or a slice)."""
         memories = {who: take(memory, rows) for who, memory in self.memories.items()}
-        return State(*(array[rows] for array in self[:5]), memories)
+        line, car, clock, know, wanted = (array[rows] for array in self[:5])
+        return State(line, car, clock, know, wanted, memories)
 
     def put(self, rows: Any, new: State, *, donate: bool = False) -> State:
         """Return this state with the episodes ``new`` in ``rows``. ``donate``: its own arrays may be reused."""
-        arrays = [put(old, rows, part, donate) for old, part in zip(self[:5], new[:5], strict=True)]
+        line, car, clock, know, wanted = (
+            put(old, rows, part, donate) for old, part in zip(self[:5], new[:5], strict=True)
+        )
         memories = {who: put(memory, rows, new.memories[who], donate) for who, memory in self.memories.items()}
-        return State(*arrays, memories)
+        return State(line, car, clock, know, wanted, memories)
 
     @property
     def n(self) -> int:
@@ -141,7 +144,7 @@ class State(NamedTuple):
     @property
     def collided(self) -> Bools:
         """Whether the world has had an impact, [n]."""
-        return self.line[:, COUNT].any(axis=1)
+        return np.asarray(self.line[:, COUNT].any(axis=1))
 
     def harm(self, count: str = "first") -> Floats:
         """Return the harm of each world so far, [n] m2/s2. ``count``: ``first`` impact of each pair, or ``total``."""
@@ -150,7 +153,7 @@ class State(NamedTuple):
         return out
 
     def borne_harm(self, count: str = "first") -> Floats:
-        """Return the harm that each vehicle has borne so far, [n, N] m2/s2; both shares of a pair add up to its harm."""
+        """Return the harm that each vehicle has borne so far, [n, N] m2/s2; a pair's shares add up to its harm."""
         out = np.empty((self.n, self.vehicles))
         split_harm(self.line[:, TOTAL if count == "total" else FIRST], self.car[:, MASS], out)
         return out

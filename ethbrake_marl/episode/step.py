@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.state import (
-    CLOCK_COLUMNS,
-    ENDED,
-    FIRST_DECISION,
-    LAST,
-    NUMBER,
-    STEPS,
-    TIME,
-    State,
-)
+from ethbrake_marl.episode.state import CLOCK_COLUMNS, ENDED, FIRST_DECISION, LAST, NUMBER, STEPS, TIME, State
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.drive import FAILED, MET, drive
@@ -63,7 +56,10 @@ class Step(NamedTuple):
     reward: Floats  # [n, N] reward of each vehicle
     out: Floats  # [OUT_ROWS, n] the properties below
     time_step_s: float
-    terms: dict[str, Floats]  # name -> value of a term of the reward before it is weighted, [n] or [n, N]
+    terms: Mapping[str, Floats] = MappingProxyType(
+        {}
+    )  # name -> term of the reward before it is weighted, [n] or [n, N]
+    vector: Floats | None = None  # [n, N, K] vector reward of each vehicle, if the game has one
 
     @property
     def first_impact_harm(self) -> Floats:
@@ -103,7 +99,8 @@ def command(car, wanted, learners, actions):
 def advance(line, car, clock, wanted, scratch, time_step_s, horizon_s):
     """Advance one running world to its next decision, in place; return what ``drive`` met, and whether all is at rest.
 
-    The times of decisions are multiples from the first one, so that an episode has the same times wherever it is played.
+    The times of decisions are multiples from the first one, so that an episode has the same times wherever it is
+    played.
     """
     clock[STEPS] += 1.0
     over = clock[STEPS] >= clock[LAST]
@@ -160,7 +157,7 @@ def step_worlds(
 
 @large
 def advance_worlds(line, car, time, until, wanted, scratch):
-    """Advance every world from ``time`` to ``until`` [n] under constant commands, in place; return a failed row or -1."""
+    """Advance every world from ``time`` to ``until`` [n] (s), in place; return a failed row, otherwise -1."""
     failed = -1
     for k in range(len(until)):
         if drive(line[k], car[k], wanted[k], scratch, time[k], until[k]) == FAILED:
@@ -192,7 +189,7 @@ def begin(alert: State, deciders: Ints, time_step_s: float, horizon_s: float) ->
 
 
 def step(
-    rules: Rules, scripts: dict[int, Any], state: State, actions: Floats, *, donate: bool = False
+    rules: Rules, scripts: Mapping[int, Any], state: State, actions: Floats, *, donate: bool = False
 ) -> tuple[State, Step]:
     """Return the state after one step, and what the step did.
 
@@ -211,7 +208,7 @@ def step(
     if failed >= 0:
         _check_actions(rules, actions[failed])
         raise failure(state, failed, state.time_s[failed], clock[failed, TIME])
-    return State(line, car, clock, know, wanted, memories), Step(reward, out, rules.time_step_s, {})
+    return State(line, car, clock, know, wanted, memories), Step(reward, out, rules.time_step_s)
 
 
 def _check_actions(rules: Rules, actions: Floats) -> None:

@@ -16,7 +16,7 @@ import shutil
 import tempfile
 import warnings
 from collections.abc import Callable
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -42,8 +42,14 @@ def _compile(function: Function, **options: Any) -> Function:
     return compiled
 
 
-kernel = partial(_compile, forceinline=True)  # becomes a part of every kernel that calls it
-large = partial(_compile)  # compiled once for all its callers; also what Python calls
+def kernel(function: Function) -> Function:
+    """Compile a function that becomes a part of every kernel that calls it."""
+    return _compile(function, forceinline=True)
+
+
+def large(function: Function) -> Function:
+    """Compile a function once for all its callers, among them Python."""
+    return _compile(function)
 
 
 @cache

@@ -1,7 +1,7 @@
 """When a pair comes into contact. Between two events its gap is a polynomial of time, so the answer is exact.
 
-With the gap g, the closing speed w, the closing acceleration b and the closing jerk j (rear minus front, in m, m/s, m/s2
-and m/s3), the gap after the time t is ``g - w t - b t^2 / 2 - j t^3 / 6``. Where brakes act at once, j is 0.
+With the gap g, the closing speed w, the closing acceleration b and the closing jerk j (rear minus front, in m, m/s,
+m/s2 and m/s3), the gap after the time t is ``g - w t - b t^2 / 2 - j t^3 / 6``. Where brakes act at once, j is 0.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ def contact(gap, closing, pressing):
 def contact_on_cubic(gap, closing, pressing, jerk, end):
     """Return time (s) and closing speed (m/s) of the first contact before ``end`` (s); ``(inf, 0)`` if there is none.
 
-    The closing speed ``w + b t + j t^2 / 2`` has at most two roots, and the gap is monotone between them. The contact is
-    in the first part at whose end the gap is at most 0: Newton's method, with a bisection where a step leaves the part.
-    The closed formula of a cubic's roots cancels.
+    The closing speed ``w + b t + j t^2 / 2`` has at most two roots, and the gap is monotone between them. The contact
+    is in the first part at whose end the gap is at most 0: Newton's method, with a bisection where a step leaves the
+    part. The closed formula of a cubic's roots cancels.
     """
     first, second = -math.inf, -math.inf
     squared = pressing * pressing - 2.0 * jerk * closing

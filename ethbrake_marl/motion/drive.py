@@ -1,8 +1,8 @@
 """One line of bodies through an interval of constant commands, from event to event.
 
 Between two events every body has a constant jerk: 0 where brakes act at once, so the same text serves both, and the
-compiler drops the jerk where ``builds`` is the constant False. ``ahead`` is the first body that takes part: 1 where there
-is no obstacle. Times within an interval count from its start.
+compiler drops the jerk where ``builds`` is the constant False. ``ahead`` is the first body that takes part: 1 where
+there is no obstacle. Times within an interval count from its start.
 """
 
 from __future__ import annotations
@@ -139,8 +139,8 @@ def accelerate(line, car, scratch, ahead, builds):
 def next_event(line, car, scratch, now, end, parting, ahead, builds):
     """Return the time (s) to the next event, at most ``end - now``, and set when each speed and pair has its own.
 
-    Events: contact, parting (in ``parting`` s), rest, the speed limit, a command that takes effect, a force that reaches
-    its command or 0.
+    Events: contact, parting (in ``parting`` s), rest, the speed limit, a command that takes effect, a force that
+    reaches its command or 0.
     """
     bodies, soonest = line.shape[1], min(end - now, parting)
     for i in range(ahead, bodies):
@@ -245,8 +245,8 @@ def move_apart(line, car, scratch, duration, ahead, builds):
     """Move the line to the end of the interval at once and return True, if surely no two bodies touch; else do nothing.
 
     Alone, a speed only rises or only falls within the interval, so a gap shrinks by at most ``duration`` times (largest
-    rear speed minus smallest front speed). Where that is too much, and both accelerations are constant, ``contact`` says
-    exactly. Forces must not build up within the interval.
+    rear speed minus smallest front speed). Where that is too much, and both accelerations are constant, ``contact``
+    says exactly. Forces must not build up within the interval.
     """
     bodies, slowest, front = line.shape[1], math.inf, 0.0
     for i in range(ahead, bodies):
@@ -315,7 +315,9 @@ def through_interval(line, car, scratch, start, until, ahead, builds):
             line[COUNT, p] += scratch[NEW_COUNT, p]
     for i in range(ahead, bodies):
         wanted = scratch[COMMAND, i] if acts(car[LATENCY, i], until) else 0.0
-        line[FORCE, i] = force_now(line[FORCE, i], wanted, car[BRAKE_RATE, i], car[RELEASE_RATE, i]) if builds else wanted
+        line[FORCE, i] = (
+            force_now(line[FORCE, i], wanted, car[BRAKE_RATE, i], car[RELEASE_RATE, i]) if builds else wanted
+        )
     return met
 
 

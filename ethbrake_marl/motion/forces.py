@@ -119,6 +119,6 @@ def _stopping_each(speed, latency_left, capacity, rate, out):
 
 def stopping_distances(speed: Floats, latency_left: Floats, capacity: Floats, rate: Floats) -> Floats:
     """Return ``stopping_m`` of n vehicles, [n] m."""
-    out = np.empty(len(speed))
-    _stopping_each(*(np.ascontiguousarray(each) for each in (speed, latency_left, capacity, rate)), out)
+    out, tidy = np.empty(len(speed)), np.ascontiguousarray
+    _stopping_each(tidy(speed), tidy(latency_left), tidy(capacity), tidy(rate), out)
     return out

@@ -6,7 +6,8 @@ resolved together, by the mass-weighted isotonic regression P from front to rear
 * impact with speeds v- before, v+ after, and restitution e: ``v+ = (1 + e) P(v-) - e v-``; for two vehicles this is the
   paper's eq. (13);
 * resting contact: the accelerations are ``P`` of the bodies' own ones; a block of masses m and own accelerations u has
-  ``sum(m u) / sum(m)``. Brakes at rest have any force up to a limit, so a block at rest moves only if the push exceeds it.
+  ``sum(m u) / sum(m)``. Brakes at rest have any force up to a limit, so a block at rest moves only if the push exceeds
+  it.
 
 ``first`` and ``last`` are the front and rear body of a cluster.
 """
@@ -46,7 +47,8 @@ SAME_MPS2 = 5e-13  # touching bodies with accelerations closer than this move al
 
 @large
 def pool(mass, low, high, low_jerk, high_jerk, scratch, first, last, value, jerk):
-    """Write the isotonic regression of the bodies ``first..last`` to ``value`` and ``jerk``; return the number of blocks.
+    """Write the isotonic regression of the bodies ``first..last`` to ``value`` and ``jerk``; return the number of
+    blocks.
 
     A body whose value is above the value of the body in front forms a *block* with it. All of a block have the value
     ``settle`` of its mean range, weighted by mass. A body of infinite mass and its block have the value 0.

@@ -1,7 +1,7 @@
 """One world as arrays of rows: what changes, what stays, and the scratch memory of the physics.
 
-Column 0 is the *obstacle* ahead of the line, columns 1 to N are the vehicles, front to rear; all are called *bodies*. In
-a row of pairs, column p is the pair (body p, body p + 1). The obstacle is always there: without one, it is ``FAR_M``
+Column 0 is the *obstacle* ahead of the line, columns 1 to N are the vehicles, front to rear; all are called *bodies*.
+In a row of pairs, column p is the pair (body p, body p + 1). The obstacle is always there: without one, it is ``FAR_M``
 ahead, and the physics leaves it out.
 
 Arrays that most functions share: ``line`` [7, N + 1] changes, ``car`` [10, N + 1] stays, ``scratch`` [ROWS, N + 1]

@@ -1,0 +1,103 @@
+"""A game: everything of an episode that is not its state. It never changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from ethbrake_marl.episode import step as one_step
+from ethbrake_marl.episode.observe import Observations, View
+from ethbrake_marl.episode.reward import Rewarding
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.step import Rules, Step
+from ethbrake_marl.motion.layout import Floats, Ints
+
+
+class Script(Protocol):
+    """Drives one vehicle: a script, a policy, a search. It sees the whole state, and decides when the learners do."""
+
+    def begin(self, alert: State, body: int) -> Any:
+        """Return the memory for new episodes: None, an array with one row per world, or a tuple of memories."""
+
+    def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
+        """Return the commands of vehicle ``body`` (1: Vehicle 1), [n] m/s2, and the new memory."""
+
+
+class Shield(Protocol):
+    """Decides which of the proposed actions are applied."""
+
+    def begin(self, game: Game, alert: State, state: State) -> Any:
+        """Return the memory for new episodes, whose first decision is ``state``."""
+
+    def decide(self, game: Game, state: State, proposed: Floats, *, donate: bool) -> tuple[Floats, Any]:
+        """Return the actions to apply, [n, L], and the new memory."""
+
+
+class Game(NamedTuple):
+    """Worlds to draw, rules, scripts, what is observed and rewarded, and perhaps a shield.
+
+    Environments, evaluation, search and shields share one game and its one step.
+    """
+
+    draw: Callable[[int, int, int], State]  # (n, seed, first) -> worlds of the training stream at the alert
+    name: str  # of the scenario
+    rules: Rules
+    rewarding: Rewarding
+    views: tuple[View, ...]  # what each body observes; entry 0 belongs to the obstacle and is not used
+    deciders: Ints  # bodies whose shortest latency is the time of the first decision
+    scripts: Mapping[int, Script] = MappingProxyType(
+        {}
+    )  # body -> script that looks at the state; all others hold their first command
+    shield: Shield | None = None
+
+    def begin(self, alert: State) -> State:
+        """Return the episodes of these worlds at their first decision. Scripts have decided once, at the alert."""
+        wanted, memories = alert.wanted, dict[Any, Any]()
+        if self.scripts:
+            wanted = wanted.copy()
+            for body, script in self.scripts.items():
+                wanted[:, body], memories[body] = script.act(alert, script.begin(alert, body), body)
+        state = one_step.begin(
+            alert._replace(wanted=wanted, memories=memories),
+            self.deciders,
+            self.rules.time_step_s,
+            self.rules.horizon_s,
+        )
+        if self.rewarding.shaping is not None:
+            memories["shaping"] = self.rewarding.shaping.begin(state)
+        if self.shield is not None:
+            memories["shield"] = self.shield.begin(self, alert, state)
+        return state
+
+    def start(self, n: int, seed: int, first: int) -> State:
+        """Return worlds ``first`` to ``first + n - 1`` of the seed at their first decision."""
+        return self.begin(self.draw(n, seed, first))
+
+    def step(self, state: State, actions: Floats, *, donate: bool = False) -> tuple[State, Step]:
+        """Return the state after one step of all worlds, and what the step did.
+
+        ``actions`` [n, L] of the learners, in [-1, 1]. ``donate``: the memory of ``state`` may be reused. What raises
+        leaves ``state`` as it was.
+        """
+        if self.shield is not None:
+            actions, memory = self.shield.decide(self, state, actions, donate=donate)
+            state = state._replace(memories={**state.memories, "shield": memory})
+        if self.rewarding.is_compiled:
+            return one_step.step(self.rules, self.scripts, state, actions, donate=donate)
+        return self.rewarding.complete(state, *self._step_and_after(state, actions))
+
+    def _step_and_after(self, state: State, actions: Floats) -> tuple[Step, State]:
+        after, step = one_step.step(self.rules, self.scripts, state, actions)
+        return step, after
+
+    def observe(self, state: State, bodies: Ints) -> list[Observations]:
+        """Return what each of the ``bodies`` observes, [n, F] each."""
+        return [self.views[i].observe(state, np.array([i]), self.rules.time_step_s)[:, 0] for i in bodies.tolist()]
+
+    def observe_alike(self, state: State, bodies: Sequence[int] | Ints) -> Observations:
+        """Return what the ``bodies``, which have one view, observe, [n, len(bodies), F]."""
+        bodies = np.asarray(bodies, np.int64)
+        return self.views[bodies[0]].observe(state, bodies, self.rules.time_step_s)

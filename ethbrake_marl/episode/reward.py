@@ -1,0 +1,259 @@
+"""Rewards: a weighted sum of terms (``episode.terms``)."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from functools import partial
+from operator import not_
+from typing import Annotated, Any, Literal, NamedTuple, Self
+
+import numpy as np
+from pydantic import Field, ValidationError, field_validator, model_validator
+
+from ethbrake_marl.episode.objectives import OBJECTIVES, Declared, objectives_of
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.step import Rules, Step
+from ethbrake_marl.episode.terms import (
+    BUILT_IN,
+    TERMS,
+    Shaping,
+    TermFunction,
+    collision,
+    component,
+    components_of,
+    jerk,
+    objective_term,
+    risk,
+)
+from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.files.model import UNSHOWN, FileModel, first_mistake, require
+from ethbrake_marl.motion.layout import Floats, Ints
+
+HarmCount = Literal["first", "total"]
+NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class WithoutEffect(UserWarning):
+    """Warning: a setting has no effect, such as an objective in a reward that gives harm the weight 0."""
+
+
+def own_terms() -> list[str]:
+    """Return the names of registered terms, without loading any."""
+    return [name for name in TERMS if name not in RewardParams.model_fields]
+
+
+class RewardParams(FileModel):
+    """Weights of the terms of a reward, and their constants. A term of weight 0 is not computed.
+
+    Args:
+        harm, collision, risk, jerk, terminal, shaping: weights. With any but harm, the weight of harm must be given
+        too. harm_count: which harm the term harm counts: ``first`` impact of each pair, or ``total``. objective:
+        objective of all vehicles, or a list with one each; None: the scenario's. shaping_discount: discount in the term
+        shaping, in (0, 1]; it should be the learner's own. k_energy: factor of the term collision. ttc_scale_s: tau of
+        the term risk, s. safety_buffer_m: d_safe of the term risk, m. target_gap_m: d_target of the term risk, m.
+        distance_slope_per_m: k_d of the term risk, 1/m. terms: name of a registered term -> weight; negative for what
+        should become small.
+
+    >>> import ethbrake_marl as eb
+    >>> env = eb.EthBrakeEnv("paper-random", reward=eb.RewardParams(harm=0.05, terminal=1.0))
+
+    """
+
+    harm: NonNegative = 1.0
+    harm_count: HarmCount = "first"
+    objective: str | Annotated[tuple[str, ...], Field(strict=False)] | None = None
+    collision: NonNegative = 0.0
+    risk: NonNegative = 0.0
+    jerk: NonNegative = 0.0
+    terminal: NonNegative = 0.0
+    shaping: NonNegative = 0.0
+    shaping_discount: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
+    k_energy: NonNegative = 1.0
+    ttc_scale_s: Positive = 1.0
+    safety_buffer_m: NonNegative = 1.0
+    target_gap_m: NonNegative = 3.0
+    distance_slope_per_m: Positive = 1.0
+    # a file may also write these weights next to the other settings
+    terms: dict[str, Finite] = Field(default_factory=dict, validate_default=True, exclude_if=not_)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _own_terms(cls, value: Any) -> Any:
+        if not isinstance(value, dict):
+            return value
+        beside = {name: weight for name, weight in value.items() if name in own_terms()}
+        inside = value.get("terms", {})
+        if beside and (not isinstance(inside, dict) or beside.keys() & inside.keys()):
+            raise ValueError(
+                "write the weight of a registered term either in the mapping terms or next to the other settings, not"
+                " in both places"
+            )
+        if not beside:
+            return value
+        return {**{name: each for name, each in value.items() if name not in beside}, "terms": {**inside, **beside}}
+
+    @field_validator("terms")
+    @classmethod
+    def _known_terms(cls, value: dict[str, float]) -> dict[str, float]:
+        for name in value:
+            if name not in own_terms():
+                raise unknown_name("term", name, own_terms(), may_be_own=True)
+        return {name: value[name] for name in sorted(value) if value[name] != 0.0 and TERMS[name]}
+
+    @field_validator("objective", mode="before")
+    @classmethod
+    def _objective(cls, value: Any) -> Any:
+        if value is not None:
+            try:
+                objectives_of(value, 1 if isinstance(value, str) else len(value))
+            except (InvalidInput, TypeError) as error:
+                raise ValueError(str(error).removeprefix("objective: ")) from None
+        return value
+
+    @model_validator(mode="after")
+    def _harm_is_meant(self) -> Self:
+        """Refuse weights of other terms without a weight of harm, which would be 1 by default."""
+        names = {*self.model_fields_set, *(self.terms if "terms" in self.model_fields_set else ())}
+        beside = [name for name, weight in self.weights.items() if weight != 0.0 and name in names]
+        right = (
+            f"must be given together with {''.join(beside[:1])}, because its default weight is 1; write harm: 1, or"
+            " harm: 0 for a reward without harm"
+        )
+        require(not beside or "harm" in names, ("harm",), UNSHOWN, right)
+        right = "has no effect, because it changes only the term harm, whose weight is 0; leave it out or give a weight"
+        require(self.objective is None or self.harm > 0.0, ("objective",), UNSHOWN, right)
+        return self
+
+    @property
+    def weights(self) -> dict[str, float]:
+        """Weight of every built-in and every registered term."""
+        return {**{name: getattr(self, name) for name in BUILT_IN}, **self.terms}
+
+    @property
+    def counted(self) -> tuple[str, ...]:
+        """Names of the terms whose weight is not 0."""
+        return tuple(name for name, weight in self.weights.items() if weight != 0.0)
+
+
+REWARDS = {
+    "harm": RewardParams(),
+    "total-harm": RewardParams(harm_count="total"),
+    "paper": RewardParams(harm=0.0, collision=1.0, risk=0.1, jerk=1e-5, terminal=10.0),
+}
+Reward = str | RewardParams | Mapping[str, Any]  # a name, or settings
+
+
+def reward_params(reward: Reward) -> RewardParams:
+    """Return the settings of a reward. Raises ``UnknownName`` or ``InvalidInput``."""
+    if isinstance(reward, RewardParams):
+        return reward
+    if isinstance(reward, str):
+        if reward not in REWARDS:
+            raise unknown_name("reward", reward, REWARDS)
+        return REWARDS[reward]
+    if not isinstance(reward, Mapping):
+        raise InvalidInput(
+            f"reward = {reward!r}: must be a name ({', '.join(REWARDS)}), a mapping such as {{'harm': 1.0}}, or"
+            " RewardParams"
+        )
+    known = [*RewardParams.model_fields, *own_terms()]
+    for name in reward:
+        if name not in known:
+            raise unknown_name("setting of a reward", name, known)
+    try:
+        return RewardParams(**reward)
+    except ValidationError as error:
+        first = first_mistake(error)
+        where = "" if isinstance(first.given, dict) else f" = {first.given!r}"
+        raise InvalidInput(f"reward: {first.place.removeprefix('terms.')}{where}: {first.right}") from None
+
+
+class Rewarding(NamedTuple):
+    """A reward, ready to be computed: what the compiled step does not know of it."""
+
+    params: RewardParams
+    terms: tuple[tuple[str, float, TermFunction], ...]  # name, weight and function
+    shaping: Shaping | None
+    components: tuple[tuple[str, TermFunction], ...]  # of a vector reward
+
+    @classmethod
+    def of(
+        cls, reward: Reward, objective: Declared, vehicles: int, learners: Ints, times: tuple[float, float], vector: Any
+    ) -> tuple[Rewarding, Rules]:
+        """Return the reward, and the rules of a step with its weights.
+
+        ``objective`` is the scenario's; ``times`` are time step and horizon (s); ``vector`` are the components of a
+        vector reward, or None. Warns if an objective has no effect.
+        """
+        params = reward_params(reward)
+        declared = objective if params.objective is None else params.objective
+        try:
+            objectives = objectives_of(declared, vehicles)
+        except InvalidInput as error:
+            raise InvalidInput(f"reward: {error}") from None
+        whole = all(each.kind is OBJECTIVES["total"] for each in objectives)
+        if not whole and params.harm == 0.0:
+            what = declared if isinstance(declared, str) else ", ".join(declared)
+            warnings.warn(
+                WithoutEffect(
+                    f"the scenario's objective, {what}, has no effect: the weight of harm in this reward is 0"
+                ),
+                stacklevel=2,
+            )
+            whole = True
+        total = params.harm_count == "total"
+        rules = Rules(learners, *times, params.harm if whole else 0.0, params.terminal, total)
+        settings = params.ttc_scale_s, params.safety_buffer_m, params.target_gap_m, params.distance_slope_per_m
+        functions: dict[str, TermFunction] = {
+            "collision": lambda before, step, after: collision(step, params.k_energy),
+            "risk": lambda before, step, after: risk(after, *settings),
+            "jerk": jerk,
+            **{name: TERMS[name].value for name in params.terms},
+        }
+        if not whole:
+            functions = {"harm": objective_term(objectives, params.harm_count), **functions}
+        terms = [(name, params.weights[name], function) for name, function in functions.items() if params.weights[name]]
+        shaping = Shaping(rules, params.shaping_discount) if params.shaping else None
+        names = () if vector is None else components_of(vector, params.counted, vehicles)
+        parts = [(name, component(name, vehicles, params.harm_count) or partial(_value, name)) for name in names]
+        return cls(params, tuple(terms), shaping, tuple(parts)), rules
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether the compiled step computes the whole reward."""
+        return not self.terms and self.shaping is None and not self.components
+
+    def complete(self, before: State, step: Step, after: State) -> tuple[State, Step]:
+        """Return the state with the memory of the reward, and the step with the whole reward."""
+        values = {name: function(before, step, after) for name, _, function in self.terms}
+        if self.shaping is not None:
+            values["shaping"], memory = self.shaping.value(before, step, after)
+            after = after._replace(memories={**after.memories, "shaping": memory})
+        extra, weights = np.zeros(step.reward.shape), self.params.weights
+        for name, value in values.items():
+            extra += weights[name] * _wide(value)
+        extra[before.ended] = 0.0
+        step = step._replace(reward=step.reward + extra, terms={**self.shared(step), **values})
+        if self.components:
+            parts = [np.broadcast_to(_wide(each(before, step, after)), extra.shape) for _, each in self.components]
+            vector = np.stack(parts, axis=2)
+            vector[before.ended] = 0.0
+            step = step._replace(vector=vector)
+        return after, step
+
+    def shared(self, step: Step) -> dict[str, Floats]:
+        """Return the values of the terms that the compiled step knows, [n]."""
+        harm = step.total_harm if self.params.harm_count == "total" else step.first_impact_harm
+        known = {"harm": -harm, "terminal": step.out[-1]}
+        return {name: value for name, value in known.items() if name in self.params.counted}
+
+
+def _wide(value: Floats) -> Floats:
+    return value if value.ndim == 2 else value[:, np.newaxis]
+
+
+def _value(name: str, before: State, step: Step, after: State) -> Floats:
+    return step.terms[name]

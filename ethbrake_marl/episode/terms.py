@@ -1,0 +1,214 @@
+"""Terms: named amounts of a step, which can be rewarded, reported, or be components of a vector reward.
+
+A term is a function ``term(before, step, after)`` of two states and what the step did (``State``, ``Step``). It returns
+one number per world, [n], or per vehicle, [n, N]. Built-in terms, here for a vehicle in one step:
+
+==========  ========================================================================================================
+harm        minus the harm of the line; with an objective, minus the growth of what the vehicle should minimise
+collision   minus ``sum k_energy w^2`` over every impact, with the closing speed w
+risk        minus the sum over the vehicle's pairs of ``sigma(-TTC / tau) + sigma(k_d (d_target - d))``, with the gap d
+            and ``TTC = max(d - d_safe, 0) / closing speed``; the first summand is 0 for a pair that does not approach
+jerk        minus the squared rate of change of the vehicle's force
+terminal    1 at the end of an episode without any impact
+shaping     for learners: ``discount Phi(after) - Phi(before)``; Phi is minus the least harm that constant braking of
+the
+            learners can reach. It leaves the optimal policy unchanged (Ng, Harada and Russell 1999)
+harm_K      minus the harm that vehicle_K bears
+pair_J_K    minus the harm of the pair of vehicle_J and vehicle_K behind it
+obstacle    minus the harm of impacts with the obstacle
+==========  ========================================================================================================
+
+``collision``, ``risk``, ``jerk`` and ``terminal`` are the paper's, with its misprints corrected.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.episode.objectives import Objective, amounts
+from ethbrake_marl.episode.play import descend
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.step import Rules, Step
+from ethbrake_marl.errors import AlreadyExists, InvalidInput, describe_error, unknown_name
+from ethbrake_marl.motion.elementary import logistic
+from ethbrake_marl.motion.layout import FIRST, TOTAL, Floats
+from ethbrake_marl.registry import Registry
+
+TermFunction = Callable[[State, Step, State], Floats]
+
+BRAKING_SHARES = np.linspace(0.0, 1.0, 9)
+
+
+class Term(NamedTuple):
+    """A term that somebody has registered."""
+
+    name: str
+    function: TermFunction
+    unit: str
+    meaning: str
+
+    def value(self, before: State, step: Step, after: State) -> Floats:
+        """Return the value, [n] or [n, N]. Raises ``InvalidInput`` if the function fails or returns something else."""
+        what = f"term {self.name!r}"
+        try:
+            value = np.asarray(self.function(before, step, after))
+        except Exception as error:
+            raise InvalidInput(f"{what}: its function fails: {describe_error(error)}") from error
+        right = (after.n,), (after.n, after.vehicles)
+        if value.shape not in right or value.dtype.kind not in "fiub":
+            raise InvalidInput(
+                f"{what}: its function returned {value.dtype} of shape {value.shape}; must return numbers of shape"
+                f" {right[0]}, one per world, or {right[1]}, one per vehicle"
+            )
+        running = ~before.ended
+        value = np.where(running if value.ndim == 1 else running[:, np.newaxis], value, 0.0)
+        if not np.isfinite(value).all():
+            row, *vehicle = np.argwhere(~np.isfinite(value))[0]
+            whose = "".join(f" for vehicle_{i + 1}" for i in vehicle)
+            raise InvalidInput(
+                f"{what}: its value is {value[(row, *vehicle)]}{whose} in row {row} at step {after.steps[row]}; must be"
+                " finite"
+            )
+        return value
+
+
+def register_term(name: str, function: TermFunction, *, unit: str = "1") -> None:
+    """Register a term: rewards can weigh it and evaluations can report it. Entry points: ``ethbrake_marl.terms``.
+
+    Raises ``AlreadyExists`` for a name in use, and ``InvalidInput`` for a bad name or a function without a docstring,
+    which says what the term means.
+
+    Args:
+        name: 1 to 64 characters ``a-z``, ``0-9``, ``_``, beginning with a letter, not ending in ``_`` and a number.
+        function: ``function(before, step, after)`` returns [n] or [n, N].
+        unit: unit of the value.
+
+    """
+    if not isinstance(name, str) or re.fullmatch(r"(?!.*_[0-9]+\Z)[a-z][a-z0-9_]{0,63}", name) is None:
+        raise InvalidInput(
+            f"term {name!r:.80}: the name must be 1 to 64 characters a-z, 0-9 and _, beginning with a letter and not"
+            " ending in _ and a number"
+        )
+    if not callable(function) or not (function.__doc__ or "").strip():
+        raise InvalidInput(f"term {name!r}: must be a function with a docstring that describes the term")
+    if name in BUILT_IN:
+        raise AlreadyExists(f"term {name!r}: this name is already in use; give another name")
+    term = Term(name, function, str(unit), " ".join(str(function.__doc__).split()))
+    TERMS.add(name, term, lambda other: other == term)
+
+
+TERMS: Registry[Term] = Registry("term", "terms", register_term)
+
+BUILT_IN = {  # name -> (unit, meaning)
+    "harm": ("m2/s2", "minus the harm of the line, as harm_count and objective count it"),
+    "collision": ("m2/s2", "minus k_energy times the harm of all impacts"),
+    "risk": ("1", "minus the collision risk of the vehicle's pairs, from 0 to 1.5 (imminent) for each"),
+    "jerk": ("m2/s6", "minus the squared rate of change of the vehicle's force"),
+    "terminal": ("1", "1 at the end of an episode without any impact"),
+    "shaping": ("m2/s2", "discounted potential after the step minus the potential before it"),
+}
+
+
+def collision(step: Step, k_energy: float) -> Floats:
+    """Return the term collision, [n]."""
+    return -k_energy * step.total_harm
+
+
+def jerk(before: State, step: Step, after: State) -> Floats:
+    """Return the term jerk, [n, N]."""
+    rate = (after.forces_mps2 - before.forces_mps2) / step.time_step_s
+    return -rate * rate
+
+
+def risk(
+    after: State, ttc_scale_s: float, safety_buffer_m: float, target_gap_m: float, distance_slope_per_m: float
+) -> Floats:
+    """Return the term risk, [n, N]; tau, d_safe, d_target and k_d are the settings, in this order."""
+    closing = after.speeds_mps[:, 1:] - after.speeds_mps[:, :-1]
+    room = np.maximum(after.gaps_m - safety_buffer_m, 0.0)
+    approaching = closing > 0.0
+    time_to_collision = room / np.where(approaching, closing, 1.0)
+    urgency = np.where(approaching, logistic(-time_to_collision / ttc_scale_s), 0.0)
+    pair_risk = -(urgency + logistic(distance_slope_per_m * (target_gap_m - after.gaps_m)))
+    total = np.zeros(after.speeds_mps.shape)
+    total[:, :-1] += pair_risk
+    total[:, 1:] += pair_risk
+    return total
+
+
+def potential(rules: Rules, state: State) -> Floats:
+    """Return minus the least harm of the episode that constant decelerations of the learners can reach, [n] m2/s2.
+
+    Each learner tries nine shares of its capacity, front to rear (several learners: twice); all others brake fully.
+    """
+    learners = rules.learners.tolist()
+    rounds = 1 if len(learners) == 1 else 2
+    return -descend(state, learners, BRAKING_SHARES, rounds, rules.horizon_s, "total" if rules.total else "first")[1]
+
+
+class Shaping(NamedTuple):
+    """The term shaping. Its memory in a state is the potential, [n], 0 where the episode has terminated."""
+
+    rules: Rules
+    discount: float
+
+    def begin(self, state: State) -> Floats:
+        """Return the memory of new episodes."""
+        return potential(self.rules, state)
+
+    def value(self, before: State, step: Step, after: State) -> tuple[Floats, Floats]:
+        """Return the value, [n, N], and the new memory, [n]."""
+        new = potential(self.rules, after)
+        new[step.terminated] = 0.0
+        value = np.zeros((after.n, after.vehicles))
+        value[:, self.rules.learners - 1] = (self.discount * new - before.memories["shaping"])[:, np.newaxis]
+        return value, new
+
+
+def objective_term(objectives: Sequence[Objective], count: str) -> TermFunction:
+    """Return the term harm of vehicles with objectives, [n, N]."""
+    return lambda before, step, after: -amounts(objectives, before, after, count)
+
+
+def component(name: str, vehicles: int, count: str) -> TermFunction | None:
+    """Return the term ``harm_K``, ``pair_J_K`` or ``obstacle``, [n]; None for another name."""
+    row = TOTAL if count == "total" else FIRST
+    for k in range(vehicles):
+        if name == f"harm_{k + 1}":
+            return lambda before, step, after: 0.0 - _borne(before, after, row, count)[:, k]
+    pairs = {"obstacle": 0, **{f"pair_{p}_{p + 1}": p for p in range(1, vehicles)}}
+    if name not in pairs:
+        return None
+    return lambda before, step, after: 0.0 - (after.line[:, row, pairs[name]] - before.line[:, row, pairs[name]])
+
+
+def _borne(before: State, after: State, row: int, count: str) -> Floats:
+    since = after.line.copy()
+    since[:, row] -= before.line[:, row]
+    return after._replace(line=since).borne_harm(count)
+
+
+def components_of(vector: Any, counted: Sequence[str], vehicles: int) -> tuple[str, ...]:
+    """Return the names of a vector reward's components: ``vehicles`` stands for the harm of each vehicle.
+
+    ``counted`` are the terms of the reward, which can be components too. Raises ``InvalidInput`` for an empty list or a
+    repeated name, ``UnknownName`` for an unknown one.
+    """
+    each = [f"harm_{k + 1}" for k in range(vehicles)]
+    if isinstance(vector, str) and vector == "vehicles":
+        return tuple(each)
+    listed = isinstance(vector, Sequence) and not isinstance(vector, str) and all(isinstance(n, str) for n in vector)
+    if not listed or not vector or len(set(vector)) < len(vector):
+        raise InvalidInput(
+            f"reward_vector = {vector!r}: must be 'vehicles', or a list of different components of harm, for instance"
+            " ['harm_1', 'harm_2', 'harm_3']"
+        )
+    known = [*each, *(f"pair_{k + 1}_{k + 2}" for k in range(vehicles - 1)), "obstacle", *counted]
+    for name in vector:
+        if name not in known:
+            raise unknown_name("component of a reward", name, known)
+    return tuple(vector)
