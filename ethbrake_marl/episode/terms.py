@@ -141,13 +141,14 @@ def risk(
 
 
 def potential(rules: Rules, state: State) -> Floats:
-    """Return minus the least harm of the episode that constant decelerations of the learners can reach, [n] m2/s2.
+    """Return minus the least further harm that constant decelerations of the learners can reach, [n] m2/s2.
 
     Each learner tries nine shares of its capacity, front to rear (several learners: twice); all others brake fully.
     """
     learners = rules.learners.tolist()
     rounds = 1 if len(learners) == 1 else 2
-    return -descend(state, learners, BRAKING_SHARES, rounds, rules.horizon_s, "total" if rules.total else "first")[1]
+    count = "total" if rules.total else "first"
+    return state.harm(count) - descend(state, learners, BRAKING_SHARES, rounds, rules.horizon_s, count)[1]
 
 
 class Shaping(NamedTuple):
