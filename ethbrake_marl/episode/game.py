@@ -35,6 +35,9 @@ class Shield(Protocol):
     def decide(self, game: Game, state: State, proposed: Floats, *, donate: bool) -> tuple[Floats, Any]:
         """Return the actions to apply, [n, L], and the new memory."""
 
+    def infos(self, game: Game, state: State) -> dict[str, Any]:
+        """Return what users may want to know of it: name -> [n]."""
+
 
 class Game(NamedTuple):
     """Worlds to draw, rules, scripts, what is observed and rewarded, and perhaps a shield.

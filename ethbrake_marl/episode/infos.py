@@ -1,0 +1,117 @@
+"""Infos: the same flat numbers after a reset and after every step, whatever the interface.
+
+========================  ==========================================================================================
+time_s                    time since the alert, s
+command_in_force_mps2     acceleration that the vehicle's brakes or engine cause, m/s2
+chosen_command_mps2       last command of its policy or script, m/s2; it takes effect after the latency
+chosen_action             the same as an action, in [-1, 1]
+first_impact_harm         harm that the vehicle has borne so far, first impact of each pair, m2/s2
+total_harm                the same over all impacts
+world_first_impact_harm   harm of the whole line so far, first impact of each pair, m2/s2
+world_total_harm          the same over all impacts
+collided                  whether the world has had an impact
+cost                      harm that the last step has added to the line, as the reward counts it, m2/s2
+reward_NAME               term NAME of the reward in the last step, before it is weighted
+world_seed, world         seed and number of the world; the number is -1 if the caller has made the world
+shield_NAME               with a shield: what it reports
+========================  ==========================================================================================
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.state import NUMBER, TIME, State, front_share
+from ethbrake_marl.episode.step import Step
+from ethbrake_marl.motion.compiling import large
+from ethbrake_marl.motion.layout import BRAKING, COUNT, DRIVING, FIRST, FORCE, MASS, TOTAL, Floats, Ints
+
+NUMBERS = (
+    "time_s",
+    "command_in_force_mps2",
+    "first_impact_harm",
+    "total_harm",
+    "world_first_impact_harm",
+    "world_total_harm",
+    "collided",
+    "chosen_command_mps2",
+    "chosen_action",
+)
+COLLIDED = NUMBERS.index("collided")
+
+
+@large
+def report(line, car, clock, wanted, bodies, borne, out):
+    """Write NUMBERS of the bodies to ``out`` [n, bodies, len(NUMBERS)]; ``borne`` [2, N + 1] is working memory."""
+    for k in range(len(out)):
+        first, total, impacts = 0.0, 0.0, 0.0
+        borne[:] = 0.0
+        for p in range(line.shape[2] - 1):
+            for row in range(2):
+                harm = line[k, TOTAL if row else FIRST, p]
+                front = front_share(harm, car[k, MASS, p], car[k, MASS, p + 1]) if p > 0 else 0.0
+                borne[row, p] += front
+                borne[row, p + 1] += harm - front if p > 0 else 0.0
+            first, total = first + line[k, FIRST, p], total + line[k, TOTAL, p]
+            impacts += line[k, COUNT, p]
+        borne[0, 1] += line[k, FIRST, 0]  # Vehicle 1 bears the harm with the obstacle; added last
+        borne[1, 1] += line[k, TOTAL, 0]
+        for o in range(len(bodies)):
+            i = bodies[o]
+            command, world = wanted[k, i], out[k, o]
+            world[0], world[1], world[2], world[3] = clock[k, TIME], line[k, FORCE, i], borne[0, i], borne[1, i]
+            world[4], world[5], world[6], world[7] = first, total, 1.0 if impacts > 0.0 else 0.0, command
+            capacity = car[k, BRAKING if command < 0.0 else DRIVING, i]
+            world[8] = min(max(command / capacity, -1.0), 1.0) if capacity > 0.0 else 0.0
+
+
+def numbers(state: State, bodies: Ints) -> Floats:
+    """Return NUMBERS of the bodies in every world, [n, bodies, len(NUMBERS)]."""
+    out = np.empty((state.n, len(bodies), len(NUMBERS)))
+    report(state.line, state.car, state.clock, state.wanted, bodies, np.empty((2, state.line.shape[2])), out)
+    return out
+
+
+def of_step(game: Game, state: State, step: Step | None, seed: int) -> dict[str, Any]:
+    """Return the infos that belong to a world, and terms of vehicles: name -> [n] or [n, N]. ``step`` None: a reset."""
+    nothing = np.zeros(state.n)
+    params = game.rewarding.params
+    found: dict[str, Any] = {"cost": nothing, "world_seed": np.full(state.n, seed), "world": state.clock[:, NUMBER]}
+    found |= {f"reward_{name}": nothing for name in params.counted}
+    if step is not None:
+        found["cost"] = step.total_harm if params.harm_count == "total" else step.first_impact_harm
+        terms = step.terms or game.rewarding.shared(step)
+        found |= {f"reward_{name}": terms[name] for name in params.counted}
+    return found
+
+
+def dictionaries(game: Game, state: State, step: Step | None, seed: int, bodies: Ints) -> list[dict[str, Any]]:
+    """Return one dictionary for each world and body, world by world."""
+    infos: list[dict[str, Any]] = []
+    of_worlds = of_step(game, state, step, seed)
+    shield = {} if game.shield is None else {f"shield_{k}": v for k, v in game.shield.infos(game, state).items()}
+    for k, world in enumerate(numbers(state, bodies).tolist()):
+        shared = {name: value[k].item() for name, value in of_worlds.items() if value.ndim == 1}
+        shared["world"] = int(shared["world"])
+        shared |= {name: value[k].item() for name, value in shield.items()}
+        each = [(name, value[k, bodies - 1].tolist()) for name, value in of_worlds.items() if value.ndim == 2]
+        for o, values in enumerate(world):
+            info = dict(zip(NUMBERS, values, strict=True))
+            info["collided"] = values[COLLIDED] == 1.0
+            infos.append(info | shared | {name: column[o] for name, column in each})
+    return infos
+
+
+def arrays(game: Game, state: State, step: Step | None, seed: int, body: int) -> dict[str, Any]:
+    """Return the infos of one body in every world: name -> [n]."""
+    columns = dict(zip(NUMBERS, numbers(state, np.array([body]))[:, 0].T, strict=True))
+    columns["collided"] = columns["collided"] == 1.0
+    for name, value in of_step(game, state, step, seed).items():
+        columns[name] = value if value.ndim == 1 else value[:, body - 1]
+    columns["world"] = columns["world"].astype(np.int64)
+    if game.shield is not None:
+        columns |= {f"shield_{name}": value for name, value in game.shield.infos(game, state).items()}
+    return columns

@@ -1,0 +1,1 @@
+"""The game for other people's libraries: PettingZoo, Gymnasium, Gymnasium's vector environments, Stable-Baselines3."""

@@ -1,0 +1,44 @@
+"""Actions as callers give them: numbers in [-1, 1], or indices of evenly spaced numbers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box, Discrete
+from numpy.typing import ArrayLike
+
+from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.motion.layout import Floats
+
+
+def action_space(count: int | None) -> Any:
+    """Return the space of one learner: a box [1] from -1 (full braking) to 1 (full driving), or ``count`` indices."""
+    if count is None:
+        return Box(-1.0, 1.0, (1,), np.float32)
+    check_whole_number("actions", count, 2)
+    return Discrete(int(count))
+
+
+def checked_actions(actions: ArrayLike, shape: tuple[int, ...], whose: str, count: int | None = None) -> Floats:
+    """Return actions as float64 of ``shape``; axes of length 1 may be missing or added.
+
+    Index k of ``count`` stands for ``(2 k - count + 1) / (count - 1)``. Raises ``InvalidInput`` for a wrong shape, for
+    what is not a number, and for a wrong index. The step refuses numbers outside [-1, 1].
+    """
+    given = np.asarray(actions)
+    if given.dtype.kind not in "fiu" or np.ma.is_masked(actions):
+        right = "a number in [-1, 1]" if count is None else f"an index from 0 to {count - 1}"
+        raise InvalidInput(f"action of {whose}: {actions!r:.60}: must be {right}")
+    if count is not None:
+        good = (given >= 0) & (given < count) & (given.dtype.kind in "iu")
+        if not good.all():
+            raise InvalidInput(
+                f"action of {whose} = {given[~good].flat[0]!r}: with actions={count}, an action must be an index, a whole"
+                f" number from 0 to {count - 1}"
+            )
+        given = (2 * given.astype(np.int64) - (count - 1)) / (count - 1)
+    long = tuple(length for length in given.shape if length != 1)
+    if given.shape != shape and long != tuple(length for length in shape if length != 1):
+        raise InvalidInput(f"action of {whose}: has shape {given.shape}; must have shape {shape}")
+    return given.astype(np.float64).reshape(shape)

@@ -1,0 +1,54 @@
+"""Pictures of a running episode: an extension makes them, from states."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.registry import Registry
+
+FRAMES_PER_SECOND = 10
+
+
+class Renderer(Protocol):
+    """Draws the episodes of one environment."""
+
+    def began(self, state: State) -> None:
+        """Called after a reset."""
+
+    def stepped(self, state: State) -> None:
+        """Called after a step."""
+
+    def render(self) -> Any:
+        """Return what the render mode promises."""
+
+    def close(self) -> None:
+        """Give back windows and files."""
+
+
+MakeRenderer = Callable[[Any], Renderer]  # from an environment
+
+
+def register_renderer(mode: str, make: MakeRenderer) -> None:
+    """Register a render mode; ``make`` is called with the environment. Entry points: ``ethbrake_marl.renderers``."""
+    RENDERERS.add(mode, make, lambda other: other is make)
+
+
+RENDERERS: Registry[MakeRenderer] = Registry("render mode", "renderers", register_renderer)
+
+
+def render_metadata() -> dict[str, Any]:
+    """Return what ``metadata`` says of pictures."""
+    return {"render_modes": [*RENDERERS], "render_fps": FRAMES_PER_SECOND}
+
+
+def make_renderer(environment: Any, mode: str | None) -> Renderer | None:
+    """Return the renderer of a mode; None: no pictures. Raises ``InvalidInput``."""
+    if mode is None:
+        return None
+    if not isinstance(mode, str) or mode not in RENDERERS:
+        known = ", ".join(RENDERERS) or "none: the extension rendering is not installed"
+        raise InvalidInput(f"render_mode = {mode!r}: must be None or one of: {known}")
+    return RENDERERS[mode](environment)

@@ -1,0 +1,101 @@
+"""Which worlds come next: the training worlds of a seed, one after the other, or those that a reset asks for."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.state import NUMBER, State
+from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.worlds.describe import describe_worlds
+from ethbrake_marl.worlds.given import worlds_from_state
+from ethbrake_marl.worlds.scenario import Scenario
+
+OPTIONS = ("initial_state", "listed_world")
+
+
+class UnknownResetOption(UserWarning):
+    """Warning: ``options`` of ``reset`` has a key that nobody knows."""
+
+
+class Stream:
+    """The worlds of a game, row by row. World k of a seed is the same, in whatever row it comes."""
+
+    def __init__(self, scenario: Scenario, game: Game) -> None:
+        self.scenario, self.game = scenario, game
+        self.seed: int | None = None
+        self.next = 0  # number of the next world
+
+    def restart(self, n: int, seed: int | None, options: Any = None, known: tuple[str, ...] = OPTIONS) -> State:
+        """Return new episodes in n worlds. ``seed`` None: go on with the stream, or begin one with a random seed.
+
+        What raises changes nothing. Raises ``InvalidInput`` for a bad seed or option; warns of unknown options.
+        """
+        before = self.seed, self.next
+        if seed is not None or self.seed is None:
+            self.seed, self.next = chosen_seed(seed), 0
+        try:
+            worlds = self._asked_for(n, checked_options(options, known))
+            return self.draw(n) if worlds is None else self.game.begin(worlds)
+        except Exception:
+            self.seed, self.next = before
+            raise
+
+    def draw(self, n: int) -> State:
+        """Return the next n worlds at their first decision, in memory of their own."""
+        assert self.seed is not None
+        state = self.game.start(n, self.seed, self.next)
+        self.next += n
+        return state
+
+    def describe(self, state: State) -> dict[str, Any]:
+        """Return what was drawn for each running world: a name such as ``gap_1_m`` or ``scenario`` -> [n]."""
+        return describe_worlds(self.scenario, state, self.seed or 0)
+
+    def _asked_for(self, n: int, options: Mapping[str, Any]) -> State | None:
+        if len(options.keys() & set(OPTIONS)) == 2:
+            raise InvalidInput(f"reset: options has both {OPTIONS[0]} and {OPTIONS[1]}; pass only one of them")
+        if "initial_state" in options:
+            return worlds_from_state(self.scenario, options["initial_state"]).take(np.zeros(n, np.int64))
+        if "listed_world" not in options:
+            return None
+        wanted = options["listed_world"]
+        if not isinstance(wanted, Mapping) or set(wanted) != {"seed", "number"}:
+            raise InvalidInput(
+                f"reset: listed_world = {wanted!r}: must be seed and number of a world in an evaluation list, for instance"
+                " {'seed': 7, 'number': 3}"
+            )
+        for name in ("seed", "number"):
+            check_whole_number(f"reset: listed_world: {name}", wanted[name], 0)
+        worlds = self.scenario.sample(n, int(wanted["seed"]), first=int(wanted["number"]))
+        worlds.clock[:, NUMBER] = -1.0
+        return worlds
+
+
+def chosen_seed(seed: int | None) -> int:
+    """Return a seed as it is given, or one of 63 bits from the operating system. Raises ``InvalidInput``."""
+    if seed is None:
+        return int.from_bytes(np.random.SeedSequence().generate_state(2).tobytes(), "little") % 2**63
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not seed >= 0:
+        raise InvalidInput(f"reset: seed = {seed!r}: must be None or a whole number, at least 0")
+    return int(seed)
+
+
+def checked_options(options: Any, known: tuple[str, ...]) -> Mapping[str, Any]:
+    """Return the options of a reset; warn of keys that are not ``known``."""
+    if options is None:
+        return {}
+    if not isinstance(options, Mapping):
+        raise InvalidInput(f"reset: options = {options!r}: must be None or a mapping, for instance {{'{known[0]}': ...}}")
+    unknown = sorted(str(name) for name in options if name not in known)
+    if unknown:
+        warnings.warn(
+            f"reset: options has the unknown keys {', '.join(unknown)}, which are ignored; known keys: {', '.join(known)}",
+            UnknownResetOption,
+            stacklevel=4,
+        )
+    return options
