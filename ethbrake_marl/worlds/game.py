@@ -1,0 +1,98 @@
+"""From a scenario to a game: its worlds, rules, scripts, observations and rewards."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.episode.game import Game, Script
+from ethbrake_marl.episode.observe import View
+from ethbrake_marl.episode.reward import Reward, Rewarding
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.worlds.catalogue import load_scenario
+from ethbrake_marl.worlds.scenario import Scenario
+
+AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping is the content of a scenario file
+
+AT_ONCE = 1024  # training worlds that are drawn together: drawing one alone costs as much
+
+
+class Pool:
+    """The training worlds of a scenario, drawn many at a time. A world is the same however it is drawn."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario, self.seed, self.first = scenario, -1, 0
+        self.worlds: State | None = None
+
+    def __call__(self, n: int, seed: int, first: int) -> State:
+        """Return worlds ``first`` to ``first + n - 1`` of the seed, in memory of their own."""
+        worlds = self.worlds
+        if worlds is None or seed != self.seed or not self.first <= first or first + n > self.first + worlds.n:
+            worlds = self.scenario.sample(max(4 * n, AT_ONCE), seed, first=first, channel="training")
+            self.worlds, self.seed, self.first = worlds, seed, first
+        return worlds.take(np.arange(first - self.first, first - self.first + n))
+
+
+def game_of(
+    scenario: AnyScenario,
+    learners: Iterable[str | int] | None = None,
+    reward: Reward = "harm",
+    observation: Any = None,
+    reward_vector: Any = None,
+    scripts: Mapping[int, Script] | None = None,
+) -> tuple[Scenario, Game]:
+    """Return a scenario and its game.
+
+    Args:
+        scenario: a shipped name, the path of a YAML file, the content of one, or a ``Scenario``.
+        learners: vehicles that learn, by name or number (0 = front); None: the scenario's.
+        reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
+        observation: features of all vehicles, or vehicle -> features; None: the scenario's.
+        reward_vector: components of a vector reward (``episode.terms``).
+        scripts: body -> script, for vehicles whose role is neither ``learner``, ``full_brake`` nor ``coast``.
+
+    """
+    loaded = load_scenario(scenario)
+    if learners is not None:
+        if isinstance(learners, str) or not isinstance(learners, Iterable):
+            raise InvalidInput(f"learners = {learners!r}: must be a list of vehicle names, for instance ['vehicle_2']")
+        loaded = loaded.with_learners(learners)
+    bodies = np.array(loaded.learners, np.int64)
+    rewarding, rules = Rewarding.of(
+        reward, loaded.objective, loaded.vehicles, bodies, (loaded.time_step_s, loaded.horizon_s), reward_vector
+    )
+    views = (View(), *views_of(loaded, observation))
+    return loaded, Game(Pool(loaded), loaded.name, rules, rewarding, views, bodies, scripts or {})
+
+
+def views_of(scenario: Scenario, given: Any = None) -> tuple[View, ...]:
+    """Return what each vehicle observes, front to rear: what is given, else what the scenario says, else the default.
+
+    Both are a list of features, or a mapping from names of vehicles to lists. By default a vehicle observes itself and
+    one neighbour on each side; where there may be an obstacle, also its place in the line and the obstacle.
+    """
+    usual = View(["own", "front_1", "rear_1", *(["role", "obstacle"] if scenario.has_obstacle else [])])
+    each = dict.fromkeys(scenario.vehicle_names, usual)
+    for listed in (scenario.observation, given):
+        if isinstance(listed, View):
+            each = dict.fromkeys(each, listed)
+        elif isinstance(listed, Mapping):
+            for name, features in listed.items():
+                if name not in each:
+                    raise unknown_name("vehicle", name, scenario.vehicle_names)
+                try:
+                    each[name] = features if isinstance(features, View) else View(features)
+                except InvalidInput as error:
+                    raise type(error)(f"{name}: {error}") from None
+        elif isinstance(listed, Sequence) and not isinstance(listed, str):
+            each = dict.fromkeys(each, View(listed))
+        elif listed is not None:
+            raise InvalidInput(
+                f"observation = {listed!r}: must be a list of groups and features such as ['own', 'front_1'], or a mapping"
+                " from vehicles to such lists"
+            )
+    return tuple(each.values())
