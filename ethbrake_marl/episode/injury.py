@@ -7,9 +7,12 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import unknown_name
+from ethbrake_marl.motion.compiling import large
+from ethbrake_marl.motion.drive import MET, drive
 from ethbrake_marl.motion.elementary import exp_each, log_each, logistic
-from ethbrake_marl.motion.layout import MASS, RESTITUTION, Floats
+from ethbrake_marl.motion.layout import COUNT, FRONT_CHANGE, MASS, REAR_CHANGE, RESTITUTION, Floats, scratch_for
 
 
 class Curve(NamedTuple):
@@ -76,3 +79,43 @@ def injured_by_harm(pairs: Floats, car: Floats, curve: str) -> Floats:
         by_rear = np.where(rear[:, j] > 0.0, injury_probability(rear[:, j], "rear", curve), 0.0)
         injured = injured + 1_000.0 * np.maximum(by_front, by_rear)
     return injured
+
+
+@large
+def drive_again(line, car, wanted, start, until, scratch, out):
+    """Write each vehicle's largest change of speed at its front and rear in an interval to ``out`` [n, 2, N] (m/s).
+
+    ``line`` is used up.
+    """
+    for k in range(len(out)):
+        out[k] = 0.0
+        if drive(line[k], car[k], wanted[k], scratch, start[k], until[k]) == MET:
+            for i in range(1, line.shape[2]):
+                out[k, 0, i - 1] = scratch[FRONT_CHANGE, i]
+                out[k, 1, i - 1] = scratch[REAR_CHANGE, i]
+
+
+def speed_changes(before: State, after: State) -> Floats:
+    """Return each vehicle's largest change of speed by one impact between two states, at its front and rear.
+
+    [n, 2, N] m/s. No decision lies between the states. A push by a vehicle in contact is no impact.
+    """
+    out = np.zeros((after.n, 2, after.vehicles))
+    rows = np.flatnonzero((after.line[:, COUNT] > before.line[:, COUNT]).any(axis=1))
+    some = np.empty((len(rows), 2, after.vehicles))
+    times = before.time_s[rows], after.time_s[rows]
+    scratch = scratch_for(after.wanted.shape[1])
+    drive_again(before.line[rows], before.car[rows], after.wanted[rows], *times, scratch, some)
+    out[rows] = some
+    return out
+
+
+def injured(changes: Floats, curve: str) -> Floats:
+    """Return expected injuries of each vehicle in 1,000 lines, [n, N], from its largest changes [n, 2, N] (m/s).
+
+    The side with the larger change counts.
+    """
+    front, rear = changes[:, 0].ravel(), changes[:, 1].ravel()
+    by_front, by_rear = injury_probability(front, "front", curve), injury_probability(rear, "rear", curve)
+    probability = np.where(rear >= front, by_rear, by_front) * ((front > 0.0) | (rear > 0.0))
+    return 1_000.0 * probability.reshape(changes.shape[0], changes.shape[2])

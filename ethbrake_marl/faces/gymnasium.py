@@ -88,8 +88,8 @@ def plain(setting: Any) -> Any:
 class EthBrakeEnv(OneLearner, gymnasium.Env[Observations, Any]):
     """One learner in a line whose other vehicles follow scripts (``gymnasium.make("EthBrake-v1")``).
 
-    Action, end, infos and options of ``reset`` are those of ``EthBrakeParallelEnv``, as are the arguments; there must be
-    exactly one learner.
+    Action, end, infos and options of ``reset`` are those of ``EthBrakeParallelEnv``, as are the arguments; there must
+    be exactly one learner.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.EthBrakeEnv("paper-random")
@@ -102,7 +102,7 @@ class EthBrakeEnv(OneLearner, gymnasium.Env[Observations, Any]):
 
     """
 
-    metadata: dict[str, Any] = render_metadata()  # noqa: RUF012  # as Gymnasium declares it
+    metadata: dict[str, Any] = render_metadata()  # as Gymnasium declares it
 
     def __init__(
         self,

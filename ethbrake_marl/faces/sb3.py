@@ -44,7 +44,7 @@ def make_sb3_vec_env(
     """Return ``n_envs`` worlds for Stable-Baselines3, which are simulated together.
 
     Args:
-        scenario: as in ``EthBrakeParallelEnv``; so are ``learners``, ``reward``, ``observation`` and ``actions``.
+        scenario, learners, reward, observation, actions: as in ``EthBrakeParallelEnv``.
         n_envs: number of worlds.
         seed: seed of the stream of worlds; None: a random one.
         horizon_is_end: report an episode at the horizon as ended, not as truncated: the harm after the horizon is not
@@ -111,8 +111,8 @@ class EthBrakeVecEnv(VecEnv):
         views = {self.game.views[i] for i in self.learners}
         if len(views) > 1:
             raise InvalidInput(
-                f"observation: the learners of {self.scenario.name!r} observe different features, but must observe the same"
-                " here; give one list of features for all vehicles, use a single learner, or use parallel_env"
+                f"observation: the learners of {self.scenario.name!r} observe different features, but must observe the"
+                " same here; give one list of features for all vehicles, use a single learner, or use parallel_env"
             )
         own, last = views.pop().features, len(self.learners) - 1
         if self.appended is None:
@@ -150,8 +150,8 @@ class EthBrakeVecEnv(VecEnv):
         given, self._given = self._given, None
         if given.size != self.num_envs:
             raise InvalidInput(
-                f"step: actions have the shape {given.shape}; must have the shape ({self.num_envs}, 1), one action for each"
-                " learner of each world"
+                f"step: actions have the shape {given.shape}; must have the shape ({self.num_envs}, 1), one action for"
+                " each learner of each world"
             )
         L = len(self.learners)
         actions = checked_actions(given.reshape(self.n, L), (self.n, L), "the learners", self.actions)
@@ -226,10 +226,12 @@ class EthBrakeVecEnv(VecEnv):
         if not any(options):
             return None
         L = len(self.learners)
-        if len(options) != self.num_envs or any(options[k] != options[k - k % L] or not options[k] for k in range(len(options))):
+        if len(options) != self.num_envs or any(
+            options[k] != options[k - k % L] or not options[k] for k in range(len(options))
+        ):
             raise InvalidInput(
-                "set_options: give initial_state in all entries or in none, one for each learner of each world, and the same"
-                " for all learners of a world"
+                "set_options: give initial_state in all entries or in none, one for each learner of each world, and the"
+                " same for all learners of a world"
             )
         worlds = [worlds_from_state(self.scenario, options[k * L]["initial_state"]) for k in range(self.n)]
         line, car, clock, know, wanted = (np.concatenate(part) for part in zip(*(w[:5] for w in worlds), strict=True))

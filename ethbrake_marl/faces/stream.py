@@ -66,8 +66,8 @@ class Stream:
         wanted = options["listed_world"]
         if not isinstance(wanted, Mapping) or set(wanted) != {"seed", "number"}:
             raise InvalidInput(
-                f"reset: listed_world = {wanted!r}: must be seed and number of a world in an evaluation list, for instance"
-                " {'seed': 7, 'number': 3}"
+                f"reset: listed_world = {wanted!r}: must be seed and number of a world in an evaluation list, for"
+                " instance {'seed': 7, 'number': 3}"
             )
         for name in ("seed", "number"):
             check_whole_number(f"reset: listed_world: {name}", wanted[name], 0)
@@ -90,11 +90,14 @@ def checked_options(options: Any, known: tuple[str, ...]) -> Mapping[str, Any]:
     if options is None:
         return {}
     if not isinstance(options, Mapping):
-        raise InvalidInput(f"reset: options = {options!r}: must be None or a mapping, for instance {{'{known[0]}': ...}}")
+        raise InvalidInput(
+            f"reset: options = {options!r}: must be None or a mapping, for instance {{'{known[0]}': ...}}"
+        )
     unknown = sorted(str(name) for name in options if name not in known)
     if unknown:
         warnings.warn(
-            f"reset: options has the unknown keys {', '.join(unknown)}, which are ignored; known keys: {', '.join(known)}",
+            f"reset: options has the unknown keys {', '.join(unknown)}, which are ignored; known keys:"
+            f" {', '.join(known)}",
             UnknownResetOption,
             stacklevel=4,
         )

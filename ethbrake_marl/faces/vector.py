@@ -84,8 +84,8 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
             asked = [name for name in OPTIONS[:2] if name in (options or {})] + ["seed"] * (seed is not None)
             if asked or not hasattr(self, "episode"):
                 raise InvalidInput(
-                    f"reset: reset_mask omits some rows, but {' and '.join(asked) or 'the first reset'} requires a reset of"
-                    " all rows; remove reset_mask"
+                    f"reset: reset_mask omits some rows, but {' and '.join(asked) or 'the first reset'} requires a"
+                    " reset of all rows; remove reset_mask"
                 )
             self._renew(rows)
         if self.renderer is not None:

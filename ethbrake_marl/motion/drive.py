@@ -27,6 +27,7 @@ from ethbrake_marl.motion.layout import (
     FORCE_GOAL,
     FORCE_RATE,
     FORCE_TIME,
+    FRONT_CHANGE,
     GAP,
     HIGH,
     HIGH_JERK,
@@ -40,7 +41,10 @@ from ethbrake_marl.motion.layout import (
     NEW_COUNT,
     NEW_FIRST,
     NEW_TOTAL,
+    NEXT_CLOSING,
+    NEXT_TIME,
     ONSET,
+    REAR_CHANGE,
     RELEASE_RATE,
     SPEED,
     SPEED_GOAL,
@@ -280,7 +284,7 @@ def move_by_events(line, car, scratch, duration, ahead, builds):
     """Move the line to the end of the interval from event to event; return False if a check failed."""
     now = 0.0
     for _ in range(MOST_EVENTS):
-        if resolve_impacts(line, car, scratch, ahead):
+        if resolve_impacts(line, car, scratch, now, ahead):
             continue
         if now >= duration:
             return True
@@ -305,6 +309,8 @@ def through_interval(line, car, scratch, start, until, ahead, builds):
     if not move_apart(line, car, scratch, duration, ahead, builds):
         for i in range(ahead, bodies):
             scratch[CONTACT_SPEED, i] = scratch[NEW_FIRST, i] = scratch[NEW_TOTAL, i] = scratch[NEW_COUNT, i] = 0.0
+            scratch[NEXT_TIME, i], scratch[NEXT_CLOSING, i] = math.inf, 0.0
+            scratch[FRONT_CHANGE, i] = scratch[REAR_CHANGE, i] = 0.0
             builds_here = builds and min(car[BRAKE_RATE, i], car[RELEASE_RATE, i]) < math.inf
             if builds_here and not acts(scratch[ONSET, i], duration):
                 scratch[ONSET, i] = max(scratch[ONSET, i], duration)
@@ -332,7 +338,8 @@ def drive(line, car, wanted, scratch, start, until):
     """Move one line from ``start`` to ``until`` (s after the alert) under the commands ``wanted`` [N + 1] (m/s2).
 
     A command has no effect before the body's latency has elapsed. Changes ``line``; returns ``APART``, ``MET`` or
-    ``FAILED``. If it is not ``APART``, the rows NEW of ``scratch`` hold the harm of this interval.
+    ``FAILED``. If it is not ``APART``, the rows NEW of ``scratch`` hold the harm of this interval, the rows NEXT
+    and CHANGE its first impacts and largest changes of speed.
     """
     ahead, builds = 0 if line[GAP, 0] < FAR_M else 1, False
     for i in range(line.shape[1]):

@@ -19,6 +19,7 @@ import math
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.forces import settle
 from ethbrake_marl.motion.layout import (
+    BEFORE,
     BLOCK_HEAD,
     BLOCK_HIGH,
     BLOCK_HIGH_JERK,
@@ -27,6 +28,7 @@ from ethbrake_marl.motion.layout import (
     BLOCK_MASS,
     CLOSING,
     CONTACT_SPEED,
+    FRONT_CHANGE,
     GAP,
     HIT,
     JERK,
@@ -34,7 +36,10 @@ from ethbrake_marl.motion.layout import (
     NEW_COUNT,
     NEW_FIRST,
     NEW_TOTAL,
+    NEXT_CLOSING,
+    NEXT_TIME,
     POOLED,
+    REAR_CHANGE,
     RESTITUTION,
     SPEED,
     ZERO,
@@ -125,10 +130,11 @@ def resolve_cluster(line, car, scratch, first, last):
 
 
 @kernel
-def resolve_impacts(line, car, scratch, ahead):
+def resolve_impacts(line, car, scratch, now, ahead):
     """Resolve every cluster in which a pair closes, and count its harm; return False if no pair closes.
 
     Harm of an impact: the squared closing speed (m2/s2), added to the rows NEW of ``scratch``. A touch does none.
+    ``now`` (s from the start of the interval) is noted for the first impact of each pair.
     """
     pairs, closes, first = line.shape[1] - 1, False, ahead
     for p in range(ahead, pairs):
@@ -141,6 +147,8 @@ def resolve_impacts(line, car, scratch, ahead):
         closes = closes or closing > 0.0
     if not closes:
         return False
+    for i in range(ahead, pairs + 1):
+        scratch[BEFORE, i] = line[SPEED, i]
     while first < pairs:
         last, closes = first, False
         while last < pairs and line[GAP, last] <= 0.0:
@@ -155,6 +163,11 @@ def resolve_impacts(line, car, scratch, ahead):
             harm = scratch[CLOSING, p] * scratch[CLOSING, p]
             scratch[NEW_TOTAL, p] += harm
             scratch[NEW_COUNT, p] += 1.0
+            if scratch[NEXT_TIME, p] == math.inf:
+                scratch[NEXT_TIME, p], scratch[NEXT_CLOSING, p] = now, scratch[CLOSING, p]
+            front, rear = abs(line[SPEED, p] - scratch[BEFORE, p]), abs(line[SPEED, p + 1] - scratch[BEFORE, p + 1])
+            scratch[REAR_CHANGE, p] = max(scratch[REAR_CHANGE, p], front)
+            scratch[FRONT_CHANGE, p + 1] = max(scratch[FRONT_CHANGE, p + 1], rear)
             if line[HIT, p] == 0.0:
                 line[HIT, p] = 1.0
                 scratch[NEW_FIRST, p] += harm

@@ -71,7 +71,12 @@ BLOCK_HEAD = 26  # its front body
 NEW_FIRST = 27  # of the pair: first-impact harm of this interval (m2/s2)
 NEW_TOTAL = 28  # of the pair: harm of all its impacts in this interval (m2/s2)
 NEW_COUNT = 29  # of the pair: number of its impacts in this interval
-ROWS = 30
+NEXT_TIME = 30  # of the pair: time of its first impact in this interval (s from its start); infinite: none
+NEXT_CLOSING = 31  # of the pair: closing speed of that impact (m/s)
+BEFORE = 32  # speed before an impact (m/s)
+FRONT_CHANGE = 33  # largest change of speed by one impact at the body's front in this interval (m/s)
+REAR_CHANGE = 34  # the same at its rear (m/s)
+ROWS = 35
 
 FAR_M = 1e300  # gap ahead of a line without an obstacle
 
