@@ -84,7 +84,8 @@ class Group(NamedTuple):
     """Features that a package computes together."""
 
     features: tuple[Feature, ...]
-    function: Callable[[State, Ints, float], Floats]  # (state, bodies, time step) -> values, [n, bodies, F], unscaled
+    function: Callable[[State, Ints, float], Floats]  # (state, bodies, time step) -> values, [n, bodies, ...], unscaled
+    columns: slice = slice(None)  # of these values: groups may share a function
 
 
 def _build_up_s(state: State, body: int) -> Floats:
@@ -166,13 +167,17 @@ def register_feature(
 
 
 def register_feature_group(
-    name: str, features: Sequence[Feature], function: Callable[[State, Ints, float], Floats]
+    name: str,
+    features: Sequence[Feature],
+    function: Callable[[State, Ints, float], Floats],
+    columns: slice = slice(None),  # a constant
 ) -> None:
     """Register features that are computed together. Entry points: ``ethbrake_marl.feature_groups``.
 
-    ``function(state, bodies, time_step_s)`` returns their values, [n, bodies, F], before they are scaled.
+    ``function(state, bodies, time_step_s)`` returns values before they are scaled, [n, bodies, ...], of which
+    ``columns`` belong to ``features``. It is called once for all groups that share it.
     """
-    group = Group(tuple(features), function)
+    group = Group(tuple(features), function, columns)
     GROUPS.add(name, group, lambda other: other == group)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -17,6 +18,8 @@ from ethbrake_marl.episode.features import (
     ROLE,
     WHOLE_GROUPS,
     Feature,
+    Group,
+    Own,
     feature_named,
     group_named,
     listed_features,
@@ -51,9 +54,10 @@ class Plan(NamedTuple):
     role: bool
     obstacle: bool
     scaling: Floats  # [3, F] 1 / scale, low and high of the kernel's features
-    groups: tuple[str, ...]  # groups of other packages, whose features follow
-    picked: Ints | None  # columns of the view among all these features; None: all, in this order
-    own: tuple[tuple[int, str, int, int], ...]  # (column, name, offset, column of the neighbour's `known`)
+    groups: tuple[tuple[Group, int, Floats], ...]  # groups of other packages: group, first column, scaling
+    width: int  # number of all these features
+    picked: Ints | None  # columns of the view among them; None: all, in this order
+    own: tuple[tuple[int, Own, int, int], ...]  # column, feature, offset, column of the neighbour's `known`
 
 
 class View:
@@ -81,20 +85,22 @@ class View:
     def observe(self, state: State, observers: Ints, time_step_s: float) -> Observations:
         """Return the observations of the bodies ``observers`` (1: Vehicle 1), [n, observers, F]."""
         plan = self.plan
-        out = np.empty((state.n, len(observers), plan.scaling.shape[1]), np.float32)
+        whole = np.empty((state.n, len(observers), plan.width), np.float32)
         observe_worlds(
             state.line, state.car, state.clock, state.know, observers, plan.offsets, plan.role, plan.obstacle,
-            plan.scaling, np.empty(plan.scaling.shape[1]), out,
+            plan.scaling, np.empty(plan.scaling.shape[1]), whole,
         )  # fmt: skip
         if plan.picked is None:
-            return out
-        parts = [GROUPS[name].function(state, observers, time_step_s) for name in plan.groups]
-        features = [GROUPS[name].features for name in plan.groups]
-        whole = np.concatenate([out, *map(scaled, parts, features)], axis=2, dtype=np.float32)
+            return whole
+        values = {
+            function: function(state, observers, time_step_s) for function in {g.function for g, *_ in plan.groups}
+        }
+        for group, at, scaling in plan.groups:
+            whole[:, :, at : at + scaling.shape[1]] = scaled(values[group.function][..., group.columns], scaling)
         seen: Observations = whole.take(plan.picked, axis=2)
-        for column, name, offset, known in plan.own:
+        for column, own, offset, known in plan.own:
             for o, body in enumerate(observers.tolist()):
-                seen[:, o, column] = _own_feature(state, name, body, offset, whole[:, o, known] == 1.0)
+                seen[:, o, column] = own_feature(own, state, body, offset, whole[:, o, known] == 1.0)
         return seen
 
     @cached_property
@@ -105,52 +111,57 @@ class View:
         front, rear = max([0, *(-s for s in sides)]), max([0, *sides])
         groups = ["own", *(f"front_{k + 1}" for k in range(front)), *(f"rear_{k + 1}" for k in range(rear))]
         groups += [name for name in ("role", "obstacle") if name in listed]
-        others = tuple(name for name in listed if name not in WHOLE_GROUPS and side_of(name) is None)
+        others = [name for name in listed if name not in WHOLE_GROUPS and side_of(name) is None]
         names = [f"{group}.{f.name}" for group in (*groups, *others) for f in group_named(group) or ()]
-        kernels = [feature_named(name) for name in names if name.partition(".")[0] not in others]
+        kernel_features = [feature_named(name) for name in names if name.partition(".")[0] not in others]
         offsets = [offset for name in groups if (offset := side_of(name)) is not None]
-        place, own = {name: c for c, name in enumerate(names)}, []
+        place = {name: c for c, name in enumerate(names)}
+        own = []
         for column, name in enumerate(self.names):
             if name not in place:
                 side, _, last = name.rpartition(".")
-                own.append((column, last, side_of(side) or 0, place.get(f"{side}.known", 0)))
+                own.append((column, FEATURES[last], side_of(side) or 0, place.get(f"{side}.known", 0)))
+        packages = [(GROUPS[name], place[f"{name}.{GROUPS[name].features[0].name}"]) for name in others]
         picked = None if list(self.names) == names and not others else np.array([place.get(n, 0) for n in self.names])
         return Plan(
-            np.array(offsets, np.int64), "role" in groups, "obstacle" in groups, _scaling(kernels), others, picked,
-            tuple(own),
+            np.array(offsets, np.int64), "role" in groups, "obstacle" in groups, scaling_of(kernel_features),
+            tuple((group, at, scaling_of(group.features)) for group, at in packages), len(names), picked, tuple(own),
         )  # fmt: skip
 
 
-def _scaling(features: list[Feature]) -> Floats:
+def scaling_of(features: Sequence[Feature]) -> Floats:
+    """Return 1 / scale, low and high of features, [3, F]."""
     return np.array([[1.0 / f.scale for f in features], [f.low for f in features], [f.high for f in features]])
 
 
-def scaled(values: Floats, features: tuple[Feature, ...]) -> Floats:
+def scaled(values: Floats, scaling: Floats) -> Floats:
     """Return what is observed of ``values`` [..., F]."""
-    inverse, low, high = _scaling(list(features))
-    return np.clip(values * inverse, low, high)
+    return np.clip(values * scaling[0], scaling[1], scaling[2])
 
 
-def _own_feature(state: State, name: str, body: int, offset: int, known: NDArray[np.bool_]) -> Floats:
-    """Return the scaled feature that the function ``name`` computes, [n]; raise ``InvalidInput`` for a bad result."""
-    feature, _, function, unknown = FEATURES[name]
+def own_feature(own: Own, state: State, body: int, offset: int, known: NDArray[np.bool_]) -> Floats:
+    """Return what is observed of a feature with a function, [n]. Raises ``InvalidInput`` for a bad result.
+
+    ``offset`` is that of the neighbour, who is ``known`` [n] or not; 0: a feature of the vehicle itself.
+    """
+    name = own.feature.name
     if offset and not known.any():
-        value = np.full(state.n, unknown)
+        value = np.full(state.n, own.unknown)
     else:
-        value = np.asarray(function(state, body, body + offset) if offset else function(state, body))
+        value = np.asarray(own.function(state, body, body + offset) if offset else own.function(state, body))
         if value.shape != (state.n,) or value.dtype.kind not in "fiub":
             raise InvalidInput(
                 f"feature {name!r}: its function returned {value.dtype} values of shape {value.shape}; must return"
                 f" numbers of shape ({state.n},), one per world"
             )
-        value = np.where(known, value, unknown) if offset else value
+        value = np.where(known, value, own.unknown) if offset else value
     if not np.isfinite(value).all():
         k = int(np.argmin(np.isfinite(value)))
         raise InvalidInput(
             f"feature {name!r}: its value is {value[k]} for vehicle_{body} in row {k} at {state.time_s[k]:g} s; must be"
             " finite"
         )
-    return scaled(value[:, np.newaxis], (feature,))[:, 0]
+    return scaled(value, scaling_of([own.feature])[:, 0])
 
 
 @kernel
@@ -210,5 +221,5 @@ def observe_worlds(line, car, clock, know, observers, offsets, role, obstacle, s
                         gap += w[GAP, p]
                     value[f], value[f + 1], value[f + 2] = 1.0, gap, w[HIT, 0]
                     value[f + 3], value[f + 4] = gap - own, fitting_deceleration(w[SPEED, i], left, gap)
-            for f in range(out.shape[2]):
+            for f in range(scaling.shape[1]):
                 out[k, o, f] = min(max(value[f] * scaling[0, f], scaling[1, f]), scaling[2, f])

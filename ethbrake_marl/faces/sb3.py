@@ -43,15 +43,14 @@ def make_sb3_vec_env(
 ) -> EthBrakeVecEnv:
     """Return ``n_envs`` worlds for Stable-Baselines3, which are simulated together.
 
-    Args:
-        scenario, learners, reward, observation, actions: as in ``EthBrakeParallelEnv``.
-        n_envs: number of worlds.
-        seed: seed of the stream of worlds; None: a random one.
-        horizon_is_end: report an episode at the horizon as ended, not as truncated: the harm after the horizon is not
-            counted, so a bootstrapped estimate of it could grow without limit.
-        appended: numbers after each observation: the learner's ``number`` in its world, from 0, or the full ``state``.
-        step_infos: infos at every step, not only at the last one.
-        render_mode: ``rgb_array`` of the extension ``rendering``, or None.
+    ``scenario``, ``learners``, ``reward``, ``observation`` and ``actions`` are as in ``EthBrakeParallelEnv``.
+
+    - ``seed``: of the stream of worlds; None: a random one.
+    - ``horizon_is_end``: report an episode at the horizon as ended, not as truncated: the harm after the horizon is not
+      counted, so a bootstrapped estimate of it could grow without limit.
+    - ``appended``: numbers after each observation: the learner's ``number`` in its world, from 0, or the full
+    ``state``. - ``step_infos``: infos at every step, not only at the last one. - ``render_mode``: ``rgb_array`` of the
+    extension ``rendering``, or None.
 
     >>> import ethbrake_marl as eb
     >>> eb.make_sb3_vec_env("paper-random", 4, seed=7).reset().shape

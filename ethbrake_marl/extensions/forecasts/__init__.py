@@ -1,0 +1,1 @@
+"""Forecasts of a vehicle's next impacts, as features of its observation."""

@@ -1,0 +1,175 @@
+"""The groups ``contact`` and ``contact_far``: a vehicle's next impacts if it brakes fully, coasts, or drives fully.
+
+A forecast covers the vehicles that the observer knows, from it on without a gap, for ``FORECAST_S``. Its own command
+takes effect after its latency. Every other vehicle keeps its force, with two exceptions: one without a force brakes
+fully after its latency, and one whose brakes build up is taken to brake fully, since its force does not show its
+command.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ethbrake_marl.episode.features import Feature
+from ethbrake_marl.episode.state import TIME, State
+from ethbrake_marl.errors import PhysicsError
+from ethbrake_marl.motion.compiling import kernel, large
+from ethbrake_marl.motion.drive import FAILED, MET, drive
+from ethbrake_marl.motion.layout import (
+    BRAKE_RATE,
+    BRAKING,
+    CAR_ROWS,
+    DRIVING,
+    FAR_M,
+    FORCE,
+    GAP,
+    HIT,
+    LATENCY,
+    LINE_ROWS,
+    NEW_FIRST,
+    NEW_TOTAL,
+    NEXT_CLOSING,
+    NEXT_TIME,
+    OWN_LATENCY,
+    SPEED,
+    Floats,
+    Ints,
+    scratch_for,
+)
+from ethbrake_marl.registry import Part
+
+FORECAST_S = 10.0
+COMMANDS = {"brake": "full braking", "coast": "coasting", "drive": "full driving"}
+SIDES = {"front": "the vehicle ahead", "rear": "the vehicle behind"}
+PER_COMMAND = 10  # features of `contact` for each command
+FAR_PER_COMMAND = 4  # features of `contact_far`
+
+
+def _near(command: str, held: str) -> list[Feature]:
+    features = []
+    for side, where in SIDES.items():
+        name, impact = f"{command}_{side}", f"forecast for {held}, first impact with {where}"
+        features += [
+            Feature(f"{name}_time", "s", 2.0, 0.0, 2.0, f"{impact}: time until this impact"),
+            Feature(f"{name}_closing_speed", "m/s", 10.0, 0.0, 4.0, f"{impact}: closing speed; 0 without impact"),
+            Feature(f"{name}_fraction", "1", 1.0, 0.0, 1.0, f"{impact}: time within its decision step, 0 to 1"),
+            Feature(f"{name}_steps", "1", 10.0, 0.0, 2.0, f"{impact}: number of full decision steps before it"),
+        ]
+    for count in ("first_impact", "total"):
+        about = f"forecast for {held}: {count.replace('_', '-')} harm of known pairs"
+        features.append(Feature(f"{command}_{count}_harm", "m2/s2", 50.0, 0.0, 4.0, about))
+    return features
+
+
+def _far(command: str, held: str) -> list[Feature]:
+    times = [
+        Feature(f"{command}_{side}_time", "s", 5.0, 0.0, 2.0, f"forecast for {held}, first impact with {where}: time")
+        for side, where in SIDES.items()
+    ]
+    return times + [
+        Feature(f"{command}_{count}_speed", "m/s", 10.0, 0.0, 6.0, f"forecast for {held}: square root of {count} harm")
+        for count in ("first_impact", "total")
+    ]
+
+
+CONTACT = tuple(feature for command, held in COMMANDS.items() for feature in _near(command, held))
+CONTACT_FAR = tuple(feature for command, held in COMMANDS.items() for feature in _far(command, held))
+
+
+@kernel
+def known_line(line, car, know, time, i, known, parameters, commands):
+    """Copy a world as body i knows it, with what is assumed of the others; return the first and last known body.
+
+    Bodies that it does not know are at rest and out of reach.
+    """
+    first, last = i, i
+    while first > 1 and time >= know[i, first - 1]:
+        first -= 1
+    while last < line.shape[1] - 1 and time >= know[i, last + 1]:
+        last += 1
+    for j in range(line.shape[1]):
+        for row in range(CAR_ROWS):
+            parameters[row, j] = car[row, j]
+        inside, force = first <= j <= last, line[FORCE, j]
+        known[SPEED, j] = line[SPEED, j] if inside else 0.0
+        known[FORCE, j] = force if inside else 0.0
+        known[GAP, j] = line[GAP, j] if first <= j < last else FAR_M
+        known[HIT, j] = line[HIT, j]
+        parameters[LATENCY, j], commands[j] = 0.0, force if inside else 0.0
+        if j == i or force == 0.0:
+            parameters[LATENCY, j] = max(car[OWN_LATENCY, j] - time, 0.0)
+            commands[j] = -car[BRAKING, j] if inside else 0.0
+        elif inside and force < 0.0 and car[BRAKE_RATE, j] < math.inf:
+            commands[j] = -car[BRAKING, j]
+    if first == 1 and line[GAP, 0] < FAR_M:
+        known[GAP, 0], first = line[GAP, 0], 0
+    return first, last
+
+
+@large
+def forecast_worlds(line, car, clock, know, observers, time_step_s, memory, out):
+    """Write ``contact`` and ``contact_far``, unscaled, to ``out`` [n, observers, F]; return a failed row or -1."""
+    scratch, here, known, parameters, commands, value = memory
+    near, failed = 3 * PER_COMMAND, -1
+    for k in range(len(out)):
+        for o in range(len(observers)):
+            i = observers[o]
+            first, last = known_line(line[k], car[k], know[k], clock[k, TIME], i, known, parameters, commands)
+            for c in range(3):
+                for row in range(LINE_ROWS):
+                    for j in range(here.shape[1]):
+                        here[row, j] = known[row, j]
+                commands[i] = -car[k, BRAKING, i] if c == 0 else car[k, DRIVING, i] if c == 2 else 0.0
+                met = drive(here, parameters, commands, scratch, 0.0, FORECAST_S)
+                if met == FAILED:
+                    failed = k
+                write_features(scratch, met == MET, i, first, last, time_step_s, value)
+                for f in range(PER_COMMAND):
+                    out[k, o, c * PER_COMMAND + f] = value[f]
+                far = near + c * FAR_PER_COMMAND
+                out[k, o, far], out[k, o, far + 1] = value[0], value[4]
+                out[k, o, far + 2], out[k, o, far + 3] = math.sqrt(value[8]), math.sqrt(value[9])
+    return failed
+
+
+@kernel
+def write_features(scratch, met, i, first, last, time_step_s, value):
+    """Write the features of one forecast; 0 for a pair that is not known.
+
+    An impact exactly at the end of a time step belongs to this step, as in the episode.
+    """
+    for side in range(2):
+        p, at = i - 1 + side, 4 * side
+        for f in range(4):
+            value[at + f] = 0.0
+        if first <= p < last:
+            time = scratch[NEXT_TIME, p] if met else math.inf
+            hit = time < math.inf
+            steps = (time if hit else FORECAST_S) / time_step_s
+            whole = max(math.ceil(steps) - 1.0, 0.0)
+            value[at] = time if hit else FORECAST_S
+            value[at + 1] = scratch[NEXT_CLOSING, p] if hit else 0.0
+            value[at + 2] = steps - whole if hit else 0.0
+            value[at + 3] = whole
+    value[8] = value[9] = 0.0
+    for p in range(first, last if met else first):
+        value[8] += scratch[NEW_FIRST, p]
+        value[9] += scratch[NEW_TOTAL, p]
+
+
+def _forecasts(state: State, observers: Ints, time_step_s: float) -> Floats:
+    """Return both groups, [n, observers, 42]."""
+    bodies = state.wanted.shape[1]
+    out = np.empty((state.n, len(observers), len(CONTACT) + len(CONTACT_FAR)))
+    line, known, parameters = (np.zeros((rows, bodies)) for rows in (LINE_ROWS, LINE_ROWS, CAR_ROWS))
+    memory = scratch_for(bodies), line, known, parameters, np.zeros(bodies), np.zeros(PER_COMMAND)
+    failed = forecast_worlds(state.line, state.car, state.clock, state.know, observers, time_step_s, memory, out)
+    if failed >= 0:
+        raise PhysicsError({failed: f"a forecast of contacts failed before the end of its {FORECAST_S:g} s"})
+    return out
+
+
+NEAR_GROUP = Part(CONTACT, _forecasts, slice(0, len(CONTACT)))
+FAR_GROUP = Part(CONTACT_FAR, _forecasts, slice(len(CONTACT), None))
