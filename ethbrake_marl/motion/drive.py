@@ -306,14 +306,17 @@ def through_interval(line, car, scratch, start, until, ahead, builds):
     for i in range(ahead, bodies):
         scratch[ONSET, i] = car[LATENCY, i] - start
         scratch[ACTIVE, i] = 1.0 if scratch[ONSET, i] <= 0.0 else 0.0
+        if (
+            builds
+            and min(car[BRAKE_RATE, i], car[RELEASE_RATE, i]) < math.inf
+            and not acts(scratch[ONSET, i], duration)
+        ):
+            scratch[ONSET, i] = max(scratch[ONSET, i], duration)
     if not move_apart(line, car, scratch, duration, ahead, builds):
         for i in range(ahead, bodies):
             scratch[CONTACT_SPEED, i] = scratch[NEW_FIRST, i] = scratch[NEW_TOTAL, i] = scratch[NEW_COUNT, i] = 0.0
             scratch[NEXT_TIME, i], scratch[NEXT_CLOSING, i] = math.inf, 0.0
             scratch[FRONT_CHANGE, i] = scratch[REAR_CHANGE, i] = 0.0
-            builds_here = builds and min(car[BRAKE_RATE, i], car[RELEASE_RATE, i]) < math.inf
-            if builds_here and not acts(scratch[ONSET, i], duration):
-                scratch[ONSET, i] = max(scratch[ONSET, i], duration)
         met = MET if move_by_events(line, car, scratch, duration, ahead, builds) else FAILED
         for p in range(ahead, bodies - 1):
             line[FIRST, p] += scratch[NEW_FIRST, p]

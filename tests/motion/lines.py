@@ -1,0 +1,64 @@
+"""Lines of vehicles in the layout of the physics, and their motion, for tests."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.motion import layout as at
+from ethbrake_marl.motion.compiling import large
+from ethbrake_marl.motion.drive import drive
+from ethbrake_marl.motion.layout import Floats, scratch_for
+
+ROWS = {
+    "mass_t": at.MASS, "speed_limit_mps": at.LIMIT, "latency_s": at.LATENCY, "braking_capacity_mps2": at.BRAKING,
+    "driving_capacity_mps2": at.DRIVING, "brake_rate_mps3": at.BRAKE_RATE, "release_rate_mps3": at.RELEASE_RATE,
+    "harm_weight": at.WEIGHT,
+}  # fmt: skip
+USUAL = {
+    "mass_t": 1.0, "speed_limit_mps": 64.0, "latency_s": 0.0, "braking_capacity_mps2": 16.0,
+    "driving_capacity_mps2": 16.0, "brake_rate_mps3": np.inf, "release_rate_mps3": np.inf, "harm_weight": 1.0,
+}  # fmt: skip
+
+
+def lines(
+    gaps_m: Any,
+    speeds_mps: Any,
+    *,
+    restitution: Any = 0.0,
+    obstacle_gap_m: Any = at.FAR_M,
+    force_mps2: Any = 0.0,
+    **settings: Any,
+) -> tuple[Floats, Floats]:
+    """Return ``line`` and ``car`` of n worlds of N vehicles; a setting is a number, [N] or [n, N]."""
+    speeds = np.atleast_2d(np.asarray(speeds_mps, np.float64))
+    n, N = speeds.shape
+    line, car = np.zeros((n, at.LINE_ROWS, N + 1)), np.zeros((n, at.CAR_ROWS, N + 1))
+    line[:, at.SPEED, 1:], line[:, at.FORCE, 1:] = speeds, force_mps2
+    line[:, at.GAP, 1:N], line[:, at.GAP, 0], line[:, at.GAP, N] = gaps_m, obstacle_gap_m, np.inf
+    for name, value in {**USUAL, **settings}.items():
+        car[:, ROWS[name], 1:] = value
+    car[:, at.RESTITUTION] = np.reshape(restitution, (-1, 1))
+    car[:, at.MASS, 0] = car[:, at.BRAKE_RATE, 0] = car[:, at.RELEASE_RATE, 0] = np.inf
+    return line, car
+
+
+@large
+def _drive_each(line, car, wanted, scratch, start, until, met, rows):
+    for k in range(len(met)):
+        met[k] = drive(line[k], car[k], wanted[k], scratch, start[k], until[k])
+        for row in range(scratch.shape[0]):
+            for i in range(scratch.shape[1]):
+                rows[k, row, i] = scratch[row, i]
+
+
+def driven(line: Floats, car: Floats, command: Any, start: Any, until: Any) -> tuple[Floats, Floats, Floats]:
+    """Return the lines after an interval, what ``drive`` met, and its scratch memory [n, ROWS, N + 1]."""
+    n, bodies = len(line), line.shape[2]
+    wanted, after, met = np.zeros((n, bodies)), line.copy(), np.zeros(n, np.int64)
+    wanted[:, 1:] = command
+    rows = np.zeros((n, at.ROWS, bodies))
+    times = (np.broadcast_to(np.float64(time), (n,)).copy() for time in (start, until))
+    _drive_each(after, car, wanted, scratch_for(bodies), *times, met, rows)
+    return after, met, rows
