@@ -1,0 +1,288 @@
+"""The V2X channel: when each vehicle first knows of each other vehicle, by a message or because it sees a neighbour.
+
+A link is the way from a sender j to a receiver i. The first message of j can be used from (s after the alert)
+
+    tau_ij = U(0, T) + k T + L_radio + t_proc + t_act
+
+with the message period T, the random wait ``U(0, T)`` for the next message, the number k of periods in which a burst of
+losses destroys every message, the time of transmission L_radio, of processing t_proc, and until the brakes respond
+t_act. In each period a burst begins with probability p, and an ongoing burst ends with probability r; in the stationary
+state of this Gilbert-Elliott channel ``P(k >= m) = (p / (p + r)) (1 - r)^(m - 1)`` for m = 1, 2, ... With probability
+``lost`` no message ever arrives on a link. A direct neighbour in sight is seen after a *hop*, drawn from ``sensing_s``.
+
+Vehicle i can react from ``latency_i = max(own latency_i, min(tau_i1, latency_(i-1) + hop_(i, i-1)))`` on: its own
+latency is over, and it has the message of Vehicle 1 or has seen the vehicle ahead brake. It acts on news of j from
+``max(latency_i, min(tau_ij, hop_ij))`` on. With the preset ``paper`` it knows everything once its own latency is over.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from operator import not_
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import AfterValidator, Field, GetJsonSchemaHandler, ValidationError, model_validator
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
+
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.files.model import NAME_PATTERN, FileModel, Wording, explain, require
+from ethbrake_marl.files.yaml import Document
+from ethbrake_marl.motion.layout import Bools, Floats, Ints
+
+PER_LINK = 4  # uniform numbers of a link: wait, burst, loss, hop
+
+Hears = Literal["all", "front", "none"]
+HEARS: tuple[Hears, ...] = ("all", "front", "none")
+Seconds = Annotated[float, Field(ge=0.0, le=60.0, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
+
+
+class Equipage(FileModel):
+    """V2X equipment of one vehicle, or of all vehicles of one type."""
+
+    sends: bool = Field(default=True, description="whether the vehicle sends messages")
+    hears: Hears = Field(
+        default="all",
+        description="senders whose messages the vehicle receives, if the channel delivers them: all, front (vehicles"
+        " ahead) or none",
+    )
+
+
+class Equipped(NamedTuple):
+    """V2X equipment of the vehicles of n worlds; n = 1 if it is the same in all of them."""
+
+    sends: Bools  # [n, N]
+    hears: Ints  # [n, N] index of HEARS
+
+    @property
+    def unheard(self) -> Bools:
+        """Whether vehicle i never receives a message from vehicle j, [n, N, N]."""
+        receiver, sender = np.indices((self.sends.shape[1],) * 2)
+        hears = self.hears[:, :, np.newaxis]
+        unheard: Bools = ~self.sends[:, np.newaxis] | (hears == 2) | ((hears == 1) & (sender >= receiver))
+        return unheard
+
+
+class Channel(NamedTuple):
+    """All settings of a channel."""
+
+    timing: Literal["latency", "fixed", "messages"]  # tau is the receiver's latency, link_latency_s, or drawn
+    hears: Hears = "all"
+    senses: Literal["both", "front", "none"] = "both"
+    link_latency_s: float = 0.0
+    loss_begins: float = 0.0
+    loss_ends: float = 1.0
+    lost: float = 0.0
+    message_period_s: float = 0.1
+    radio_s: float = 0.02
+    processing_s: float = 0.1
+    actuation_s: float = 0.2
+    sensing_s: tuple[float, float] = (0.8, 1.1)
+
+    def first_message_s(self, u: Floats) -> Floats:
+        """Return tau of links (s) for uniform numbers ``u`` [..., PER_LINK]; infinite: no message arrives."""
+        delay = np.full(u.shape[:-1], -np.inf if self.timing == "latency" else self.link_latency_s)
+        if self.timing == "messages":
+            periods = burst_periods(u[..., 1], self.loss_begins, self.loss_ends)
+            on_the_way = self.radio_s + self.processing_s + self.actuation_s
+            delay = (u[..., 0] + periods) * self.message_period_s + on_the_way
+        delay[u[..., 2] < self.lost] = np.inf
+        return delay
+
+    def heard_and_seen(self, u: Floats, equipped: Equipped) -> tuple[Floats, Floats]:
+        """Return when i can use the first message of j, and the delay until i sees j, [n, N, N] s each.
+
+        Infinite: never. Minus infinite: at once.
+        """
+        N = equipped.sends.shape[1]
+        links, (receiver, sender) = u.reshape(len(u), N, N, PER_LINK), np.indices((N, N))
+        unheard = {"all": sender < 0, "front": sender >= receiver, "none": sender >= 0}[self.hears]
+        heard = np.where(unheard | equipped.unheard, np.inf, self.first_message_s(links))
+        ahead = sender == receiver - 1
+        in_sight = {"both": ahead | (sender == receiver + 1), "front": ahead, "none": sender < 0}[self.senses]
+        low, high = self.sensing_s
+        return heard, np.where(in_sight, low + (high - low) * links[..., 3], np.inf)
+
+    def news(self, own_latency: Floats, u: Floats, equipped: Equipped) -> tuple[Floats, Floats]:
+        """Return when each vehicle can react, [n, N] s, and from when it acts on news of each other, [n, N, N] s."""
+        N = own_latency.shape[1]
+        heard, seen = self.heard_and_seen(u, equipped)
+        latency = own_latency.copy()
+        for i in range(1, N if self.timing != "latency" else 0):
+            first = np.minimum(heard[:, i, 0], latency[:, i - 1] + seen[:, i, i - 1])
+            latency[:, i] = np.maximum(latency[:, i], first)
+        known = np.maximum(latency[:, :, np.newaxis], np.minimum(heard, seen))
+        known[:, np.arange(N), np.arange(N)] = latency
+        return latency, known
+
+    def latest_reaction_s(self, own_latency: Sequence[float], equipped: Equipped) -> list[float]:
+        """Return upper bounds of the times from which the vehicles can react, from those of their own latencies."""
+        latest = list(own_latency)
+        sure = self.hears != "none" and self.lost == 0.0
+        heard = float(self.first_message_s(_LATEST)[0]) if sure else np.inf
+        for i in range(1, len(latest) if self.timing != "latency" else 0):
+            seen = latest[i - 1] + self.sensing_s[1] if self.senses != "none" else np.inf
+            latest[i] = max(latest[i], min(seen, np.inf if equipped.unheard[0, i, 0] else heard))
+        return latest
+
+
+_LATEST = np.array([[1.0, 0.0, 1.0, 1.0]])  # numbers of a link with the largest delay of a message that arrives
+
+
+def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
+    """Return the number k of periods that a burst of losses lasts, for uniform numbers ``u``.
+
+    k is at least m exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``. No logarithm: every machine gets the same k.
+    """
+    bound, bounds = loss_begins / (loss_begins + loss_ends), []
+    while bound > 2.0**-53:
+        bounds.append(bound)
+        bound *= 1.0 - loss_ends
+    periods: Ints = len(bounds) - np.searchsorted(np.array(bounds[::-1]), u, side="right")
+    return periods
+
+
+CHANNELS = {
+    "paper": Channel("latency", senses="none"),
+    "clear": Channel("messages", loss_begins=0.01, loss_ends=0.5),
+    "nominal": Channel("messages", loss_begins=0.05, loss_ends=0.5),
+    "congested": Channel("messages", loss_begins=0.10, loss_ends=0.30, lost=0.05),
+    "blocked": Channel("messages", loss_begins=0.20, loss_ends=0.20, lost=0.20),
+    "sensors-only": Channel("messages", hears="none"),
+}
+
+_OF_MESSAGES = ("message_period_s", "loss_begins", "loss_ends", "radio_s", "processing_s", "actuation_s")
+
+
+def _known_preset(name: str) -> str:
+    *names, last = CHANNELS
+    require(name in CHANNELS, (), name, f"must be a preset: {', '.join(names)} or {last}")
+    return name
+
+
+class _PresetSchema:
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        return {"enum": list(CHANNELS), "type": "string"}
+
+
+class V2X(FileModel):
+    """The key ``v2x`` of a scenario: the name of a preset, or a mapping with settings that differ from a preset."""
+
+    preset: Annotated[str, AfterValidator(_known_preset), _PresetSchema] = Field(
+        default="paper", description="preset whose values are used for keys that are left out"
+    )
+    hears: Hears | None = Field(
+        default=None, description="senders whose messages a vehicle receives: all, front (vehicles ahead) or none"
+    )
+    senses: Literal["both", "front", "none"] | None = Field(
+        default=None, description="direct neighbours in sight: both, front or none"
+    )
+    link_latency_s: Seconds | None = Field(
+        default=None, description="fixed delay from every sender to every receiver, instead of a random one"
+    )
+    lost: Share | None = Field(default=None, description="share of links (not of vehicles) on which no message arrives")
+    message_period_s: Annotated[float, Field(gt=0.0, le=60.0, allow_inf_nan=False)] | None = Field(
+        default=None, description="T, time between two messages of a sender"
+    )
+    loss_begins: Share | None = Field(
+        default=None, description="p, probability per message period that a burst of losses begins"
+    )
+    loss_ends: Annotated[float, Field(ge=0.01, le=1.0, allow_inf_nan=False)] | None = Field(
+        default=None, description="r, probability per message period that a burst of losses ends"
+    )
+    radio_s: Seconds | None = Field(default=None, description="L_radio, time to transmit a message")
+    processing_s: Seconds | None = Field(
+        default=None, description="t_proc, time until the receiver has processed a message"
+    )
+    actuation_s: Seconds | None = Field(default=None, description="t_act, time until the receiver's brakes respond")
+    sensing_s: Annotated[tuple[Seconds, Seconds], Field(strict=False)] | None = Field(
+        default=None, description="[low, high]: range of the uniform delay after which a neighbour is seen"
+    )
+    vehicles: dict[str, Equipage] | None = Field(
+        default=None,
+        exclude_if=not_,
+        description="vehicles with other V2X equipment than the rest, such as {vehicle_3: {sends: false, hears: none}}",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _by_name(cls, value: Any) -> Any:
+        right = f"must be a preset ({', '.join(CHANNELS)}), or a mapping such as {{preset: nominal, lost: 0.1}}"
+        require(isinstance(value, str | dict | V2X), (), value, right)
+        return {"preset": value} if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _possible(self) -> V2X:
+        channel = self.channel
+        if channel.hears == "none":
+            why = "hears: none means that no vehicle gets messages"
+            self._leave_out(("link_latency_s", "lost", "vehicles", *_OF_MESSAGES), why)
+        elif channel.timing == "fixed":
+            self._leave_out(_OF_MESSAGES, "link_latency_s fixes the delay of messages")
+        elif channel.timing == "latency":
+            self._leave_out((*_OF_MESSAGES, "vehicles"), f"preset {self.preset} generates no messages")
+        if channel.senses == "none":
+            self._leave_out(("sensing_s",), "senses: none means that no vehicle is in sight")
+        low, high = channel.sensing_s
+        require(low <= high, ("sensing_s",), channel.sensing_s, "low must not be above high")
+        silent = channel.timing == "messages" or channel.hears == "none" or channel.lost > 0.0
+        if channel.senses == "none" and silent and channel.timing != "latency":
+            key = "senses" if self.senses is not None else "lost"  # one that the user has written
+            right = "a vehicle that may never get a message must see the vehicle ahead; use senses: both or front"
+            require(False, (key,), getattr(channel, key), right)
+        return self
+
+    def _leave_out(self, keys: tuple[str, ...], why: str) -> None:
+        for key in keys:
+            value = getattr(self, key)
+            require(value is None, (key,), value, f"has no effect, because {why}; leave it out")
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        mapping = handler(core)
+        return {"anyOf": [{"enum": list(CHANNELS), "type": "string"}, mapping]}
+
+    @property
+    def channel(self) -> Channel:
+        """The preset's settings, except those that are written here."""
+        own = {key: getattr(self, key) for key in Channel._fields[1:] if getattr(self, key) is not None}
+        base = CHANNELS[self.preset]
+        return base._replace(timing="fixed" if self.link_latency_s is not None else base.timing, **own)
+
+    @property
+    def by_link(self) -> bool:
+        """Whether the channel differs from that of the paper: each vehicle knows everything after its own latency."""
+        return self.channel != CHANNELS["paper"]
+
+    @property
+    def drawn(self) -> bool:
+        """Whether random numbers determine what vehicles know, or when."""
+        channel = self.channel
+        heard = channel.hears != "none" and (channel.timing == "messages" or 0.0 < channel.lost < 1.0)
+        seen = channel.senses != "none" and channel.sensing_s[0] != channel.sensing_s[1]
+        return self.by_link and (heard or seen)
+
+
+def register_preset(name: str, settings: Mapping[str, Any]) -> None:
+    """Register a channel as a preset, which every scenario can then use: ``v2x: name``.
+
+    ``settings`` is the content of ``v2x`` in a scenario, such as ``{"preset": "nominal", "lost": 0.1}``. Raises
+    ``AlreadyExists`` if the name belongs to another channel, ``InvalidInput`` for a bad name or bad settings.
+    """
+    if not isinstance(name, str) or re.fullmatch(NAME_PATTERN, name) is None:
+        raise InvalidInput(
+            f"preset {name!r:.80}: the name must be 1 to 64 characters a-z, 0-9, - and _, beginning with a letter or"
+            " digit"
+        )
+    if not isinstance(settings, Mapping):
+        raise InvalidInput(f"preset {name!r}: settings = {settings!r:.80}: must be a mapping such as {{'lost': 0.1}}")
+    try:
+        channel = V2X.model_validate(dict(settings)).channel
+    except ValidationError as error:
+        raise explain(Document(f"preset {name!r}", dict(settings), {}), error, Wording(V2X)) from None
+    if CHANNELS.setdefault(name, channel) != channel:
+        raise AlreadyExists(f"preset {name!r}: another channel is already registered under this name; choose another")

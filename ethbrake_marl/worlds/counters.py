@@ -1,0 +1,57 @@
+"""Random numbers by counter: world k of a seed has the same numbers, whatever else is drawn with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.motion.layout import Floats, Ints
+
+Channel = Literal["list", "training"]  # worlds for evaluation, or for training: two independent lists of one seed
+
+Numbers = Callable[[int, tuple[int, ...]], Floats]  # (width, stream) -> uniform numbers of each world, [n, width]
+
+CHANNELS: dict[str, int] = {"list": 0, "training": 1}
+
+MOST_AT_ONCE = 10_000_000  # worlds of one call
+_MOST_WORLDS = 2**62  # worlds of one seed: their numbers are 64-bit integers
+_PER_COUNTER = 4  # 64-bit integers that Philox makes from one counter
+
+
+def world_numbers(n: int, seed: int, first: int, channel: str) -> Ints:
+    """Return ``first`` to ``first + n - 1``, [n]. Raises ``InvalidInput`` unless there are such worlds."""
+    for name, value, least in (("number of worlds", n, 1), ("seed of the list", seed, 0), ("first world", first, 0)):
+        check_whole_number(name, value, least)
+    if not n <= MOST_AT_ONCE:
+        raise InvalidInput(f"number of worlds = {n}: must be at most {MOST_AT_ONCE:,}; draw more with several calls")
+    if not int(first) + int(n) <= _MOST_WORLDS:
+        raise InvalidInput(
+            f"sample: first = {first!r}: first + n must be at most {_MOST_WORLDS}, the number of worlds of one seed"
+        )
+    if channel not in CHANNELS:
+        raise InvalidInput(f"sample: channel = {channel!r}: must be one of {', '.join(CHANNELS)}")
+    return np.arange(int(first), int(first) + int(n), dtype=np.int64)
+
+
+def numbers_of(seed: int, channel: str, attempt: int, index: Ints) -> Numbers:
+    """Return the random numbers of the worlds ``index`` [n], ascending, in one attempt to draw them (from 0).
+
+    A number is the upper 53 bits of an integer from Philox, divided by 2^53. The key of Philox comes from seed,
+    channel, attempt and stream; world k has the counters from ``k width / 4`` on. A width is a multiple of 4.
+    """
+    first, count = int(index[0]), int(index[-1]) - int(index[0]) + 1
+
+    def numbers(width: int, stream: tuple[int, ...]) -> Floats:
+        sequence = np.random.SeedSequence([int(seed)], spawn_key=(CHANNELS[channel], attempt, *stream))
+        key = sequence.generate_state(2, np.uint64)
+        philox = np.random.Philox(key=key, counter=first * (width // _PER_COUNTER))
+        integers = np.asarray(philox.random_raw(count * width)).reshape(count, width)
+        if count > len(index):
+            integers = integers[index - first]
+        u: Floats = (integers >> np.uint64(11)).astype(np.float64)
+        return u * 2.0**-53
+
+    return numbers

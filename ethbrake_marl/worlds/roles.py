@@ -1,0 +1,86 @@
+"""Roles: which vehicles learn, and what the others do.
+
+A scenario knows four roles: ``learner``, and the scripts ``full_brake``, ``coast`` and ``constant:a``, which hold one
+command. Every other role is the name of an agent, which is made later.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from typing import NoReturn
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.yaml import parse_numeral
+from ethbrake_marl.motion.layout import Floats
+
+LEARNER = "learner"
+HELD = ("full_brake", "coast", "constant")  # scripts that hold one command
+
+_FORM = re.compile(r"(?P<name>[a-z][a-z0-9_@.-]*)(:(?P<argument>\S+))?")
+
+
+def check_role(role: str) -> None:
+    """Raise ``InvalidInput`` unless ``role`` has the form ``name[:argument]`` and names no Python file.
+
+    Loading somebody else's scenario must not run code.
+    """
+    match = _FORM.fullmatch(role)
+    if match is None:
+        raise InvalidInput(
+            f"agent {role!r}: must be name or name:argument, for instance full_brake or constant:3.5; a name begins"
+            " with a letter a-z and continues with a-z, 0-9, _, @, . and -"
+        )
+    name, argument = match["name"], match["argument"]
+    if name.endswith(".py") or ".py:" in role:
+        raise InvalidInput(
+            f"agent {role!r}: is a function in a Python file, which a scenario cannot use (the option --agents can)"
+            "; to use the function in a scenario, register it as an agent in a package that you install"
+        )
+    if name in ("full_brake", "coast") and argument is not None:
+        raise InvalidInput(f"agent {role!r}: {name} takes no argument")
+    if name == LEARNER and argument is not None:
+        raise InvalidInput(f"{LEARNER} takes no argument")
+    number = parse_numeral(argument or "")
+    if name == "constant" and not (number is not None and math.isfinite(number)):
+        raise InvalidInput(
+            f"agent {role!r}: constant needs a finite deceleration in m/s2 after the colon, for instance constant:3.5"
+        )
+
+
+def deceleration_of(role: str) -> float | None:
+    """Return the deceleration a of a role ``constant:a`` (m/s2, negative: drives); None for another role."""
+    name, _, argument = role.partition(":")
+    return parse_numeral(argument) if name == "constant" else None
+
+
+def first_command(role: str, braking_capacity: Floats) -> Floats:
+    """Return the command (m/s2) that a role holds, or until its agent decides, for capacities [n]."""
+    deceleration = deceleration_of(role)
+    if deceleration is not None:
+        return np.full(braking_capacity.shape, 0.0 - deceleration)
+    return -braking_capacity if role == "full_brake" else np.zeros(braking_capacity.shape)
+
+
+class Roles(dict[str, str]):
+    """Vehicle -> role, which nobody changes."""
+
+    def _refuse(self, *args: object, **kwargs: object) -> NoReturn:
+        raise InvalidInput(
+            "roles of a scenario cannot be changed; make a new scenario with scenario.replace(roles=...) or"
+            " scenario.with_learners"
+        )
+
+    __setitem__ = __delitem__ = __ior__ = _refuse
+    update = setdefault = pop = popitem = clear = _refuse
+
+    def __reduce__(self) -> tuple[type[Roles], tuple[dict[str, str]]]:
+        return Roles, (dict(self),)
+
+    @classmethod
+    def complete(cls, given: Mapping[str, str], vehicles: int) -> Roles:
+        """Return the role of each vehicle; one without a role brakes fully."""
+        return cls({f"vehicle_{i + 1}": given.get(f"vehicle_{i + 1}", "full_brake") for i in range(vehicles)})

@@ -1,0 +1,194 @@
+"""The quantities of a world: key, unit, range, meaning, and the random number that draws each of them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from ethbrake_marl.files.model import UNITS
+from ethbrake_marl.motion.layout import BRAKE_RATE, BRAKING, DRIVING, LATENCY, LIMIT, MASS, RELEASE_RATE, WEIGHT
+
+# A stream is an independent sequence of uniform random numbers, named by a tuple.
+MAIN: tuple[int, ...] = ()
+NEWS = (1,)  # delays and losses of the links
+OBSTACLE = (2,)
+TYPES = (3,)  # types and loads of the vehicles
+MIXTURE = (4,)  # scenario of a mixture
+SURROUNDINGS = (6,)  # friction, row of the table, time before the alert
+BRAKES = (7,)  # brake rates, release rates, weights of harm
+
+BLOCK = 8  # numbers of one vehicle in the streams MAIN and BRAKES
+PER_TYPE = 4  # numbers of one vehicle in TYPES: type, load, two unused
+OF_WORLD = 4  # numbers of a world in the other streams
+
+Place = tuple[tuple[int, ...], int]  # a stream and a column in it
+Entry = tuple[str, int]  # key of a quantity, and index (from 0) of the vehicle or pair
+
+ROW: Place = (SURROUNDINGS, 1)  # number that selects the row of a table
+RECORDING = "recording"  # column of a table with texts: the recording and the vehicles that a row comes from
+
+
+class Rule(NamedTuple):
+    """Meaning, unit and range of a quantity, and which random number draws it."""
+
+    key: str
+    unit: str  # a key of UNITS; "": a plain number
+    per: str  # vehicle, pair or world: what has one value
+    high: float  # largest allowed value
+    positive: bool  # whether 0 is not allowed
+    slot: int  # column of its number in the block of a vehicle. Another slot would give other worlds for a seed
+    meaning: str
+    example: str
+    column: str = ""  # name of its columns in a table, such as gap_{}_m; "": none
+    low: float = 0.0
+    block: int = 0  # vehicle (from 0) in whose block the number of entry 0 stands; entry i in block + i
+    stream: tuple[int, ...] = MAIN
+
+    @property
+    def symbol(self) -> str:
+        """Symbol of the unit, such as ``m/s2``; empty for a plain number."""
+        return {"mps": "m/s", "mps2": "m/s2", "mps3": "m/s3"}.get(self.unit, self.unit)
+
+    @property
+    def label(self) -> str:
+        """Name in words and unit, for the axis of a figure: ``braking capacity (m/s²)``."""
+        words = self.key.removesuffix(f"_{self.unit}").replace("_", " ")
+        return f"{words} ({self.symbol.replace('s2', 's²').replace('s3', 's³')})" if self.unit else words
+
+    @property
+    def interval(self) -> str:
+        """Allowed range for error messages: ``finite and in (0, 1000] t (tonnes)``."""
+        unit = f" {self.symbol} ({UNITS[self.unit]})" if self.unit else ""
+        return f"finite and in {'(' if self.positive else '['}{self.low:g}, {self.high:g}]{unit}"
+
+    def allows(self, low: float, high: float) -> bool:
+        """Return whether all values from ``low`` to ``high`` are allowed; False for NaN."""
+        return (low > 0.0 if self.positive else low >= self.low) and high <= self.high
+
+    def count(self, vehicles: int) -> int:
+        """Return how many values the quantity has in a world."""
+        return {"vehicle": vehicles, "pair": vehicles - 1, "world": 1}[self.per]
+
+    def place(self, index: int) -> Place:
+        """Return which random number draws the value of vehicle or pair ``index``."""
+        return self.stream, BLOCK * (self.block + index) + self.slot
+
+    def column_of(self, index: int) -> str:
+        """Return the name of the column of vehicle or pair ``index``: ``gap_1_m``."""
+        return self.column.format(index + 1)
+
+    def owner(self, index: int) -> str:
+        """Return ``vehicle_1``, or ``vehicle_1 to vehicle_2`` for a pair, or an empty text for the world."""
+        front = f"vehicle_{index + 1}"
+        return {"vehicle": front, "pair": f"{front} to vehicle_{index + 2}", "world": ""}[self.per]
+
+
+# The largest values are far above those of traffic: they catch a wrong unit (kilograms, kilometres per hour).
+_USUAL = (
+    Rule(
+        "gaps_m", "m", "pair", 1e4, False, 0,
+        "bumper-to-bumper gap of each pair at the alert, front to rear", "[7, 7]", "gap_{}_m",
+    ),
+    Rule(
+        "speeds_mps", "mps", "vehicle", 200.0, False, 1,
+        "speed of each vehicle at the alert", "[20, 18, 20]", "speed_{}_mps",
+    ),
+    Rule(
+        "braking_capacity_mps2", "mps2", "vehicle", 100.0, True, 2,
+        "largest deceleration of each vehicle", "[6, 7, 6]", "braking_capacity_{}_mps2",
+    ),
+    Rule(
+        "driving_capacity_mps2", "mps2", "vehicle", 100.0, False, 3,
+        "largest forward acceleration of each vehicle", "[6, 7, 6]", "driving_capacity_{}_mps2",
+    ),
+    Rule(
+        "latency_s", "s", "vehicle", 3600.0, False, 4,
+        "time from the alert until a vehicle's commands take effect; until then it coasts", "[0, 0.5, 0.8]",
+        "latency_{}_s",
+    ),
+    Rule("mass_t", "t", "vehicle", 1000.0, True, 5, "mass of each vehicle", "[4.5, 5.5, 5.9]", "mass_{}_t"),
+    Rule(
+        "speed_limit_mps", "mps", "vehicle", 200.0, True, 6,
+        "speed at which each vehicle stops accelerating", "40", "speed_limit_{}_mps",
+    ),
+    Rule(
+        "restitution", "", "world", 1.0, False, 7,
+        "coefficient of restitution of every impact: 0 plastic, 1 elastic", "0.1", "restitution",
+    ),
+)  # fmt: skip
+
+# Other ways to declare speeds, gaps and an obstacle, drawn by the numbers of what they replace. The speed of the line
+# has slot 7 of vehicle_2: restitution needs only that of vehicle_1.
+_OTHERWISE = (
+    Rule(
+        "time_gaps_s", "s", "pair", 60.0, True, 0,
+        "gap of each pair divided by the speed of its rear vehicle, front to rear", "[1, 1]",
+    ),
+    Rule(
+        "line_speed_mps", "mps", "world", 200.0, False, 7, "speed that all vehicles share at the alert", "20", block=1
+    ),
+    Rule(
+        "speed_deviations_mps", "mps", "vehicle", 200.0, False, 1,
+        "speed of each vehicle at the alert minus line_speed_mps", "[0, -2, 0]", low=-200.0,
+    ),
+    Rule(
+        "obstacle_margin_m", "m", "world", 1e4, True, 0,
+        "distance from the point where vehicle_1 stops by full braking to an unmovable obstacle ahead", "1.7",
+        stream=OBSTACLE,
+    ),
+    Rule(
+        "alert_s", "s", "world", 3600.0, False, 2,
+        "time from the start of the episode to the alert; the declared gaps and speeds are those at the start, and"
+        " latencies begin at the alert", "{uniform: [1, 5]}", stream=SURROUNDINGS,
+    ),
+)  # fmt: skip
+
+_OPTIONAL = (
+    Rule(
+        "obstacle_gap_m", "m", "world", 1e4, True, 0,
+        "distance from the front of vehicle_1 to an unmovable obstacle ahead, at the alert", "42", "obstacle_gap_m",
+        stream=OBSTACLE,
+    ),
+    Rule(
+        "friction", "", "world", 2.0, True, 0,
+        "friction of the road; it limits braking and driving capacities to friction x 9.81 m/s2",
+        "{uniform: [0.2, 0.9]}", "friction", stream=SURROUNDINGS,
+    ),
+    Rule(
+        "brake_rate_mps3", "mps3", "vehicle", 1e6, True, 0,
+        "rate at which the deceleration of each vehicle builds up; without this key brakes act at once", "12.65",
+        "brake_rate_{}_mps3", stream=BRAKES,
+    ),
+    Rule(
+        "release_rate_mps3", "mps3", "vehicle", 1e6, True, 1,
+        "rate at which the deceleration of each vehicle falls, and its forward acceleration builds up; without this"
+        " key both change at once", "25", "release_rate_{}_mps3", stream=BRAKES,
+    ),
+    Rule(
+        "harm_weight", "", "vehicle", 1e6, False, 2,
+        "weight of the harm that each vehicle bears, for objective: preference; 1 without this key", "[1, 4, 1]",
+        "harm_weight_{}", stream=BRAKES,
+    ),
+)  # fmt: skip
+
+RULES = {rule.key: rule for rule in (*_USUAL, *_OTHERWISE, *_OPTIONAL)}
+USUAL = tuple(rule.key for rule in _USUAL)  # quantities that every world has
+OPTIONAL = tuple(rule.key for rule in _OPTIONAL)  # quantities that a world may lack
+ALTERNATIVES = {"gaps_m": "time_gaps_s", "speeds_mps": "line_speed_mps", "obstacle_gap_m": "obstacle_margin_m"}
+NEEDED = ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "latency_s")  # have no default
+OF_A_TYPE = (*NEEDED, "speed_limit_mps", "brake_rate_mps3", "release_rate_mps3")  # keys of a vehicle type
+
+CAR_ROWS = {
+    "mass_t": MASS,
+    "speed_limit_mps": LIMIT,
+    "latency_s": LATENCY,
+    "braking_capacity_mps2": BRAKING,
+    "driving_capacity_mps2": DRIVING,
+    "brake_rate_mps3": BRAKE_RATE,
+    "release_rate_mps3": RELEASE_RATE,
+    "harm_weight": WEIGHT,
+}  # rows of `State.car`
+
+
+def table_columns(keys: tuple[str, ...], vehicles: int) -> dict[str, Entry]:
+    """Return the columns of a table with these quantities: ``{"gap_1_m": ("gaps_m", 0), ...}``."""
+    return {RULES[key].column_of(i): (key, i) for key in keys for i in range(RULES[key].count(vehicles))}

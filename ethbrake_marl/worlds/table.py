@@ -1,0 +1,199 @@
+"""Tables of measured values: every world takes one row, with the same row for all its columns."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from dataclasses import dataclass, field as data_field
+from operator import not_
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Discriminator, Field, Tag, model_validator
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.model import UNSHOWN, FileModel, require, suggestion
+from ethbrake_marl.files.plain import read_plain
+from ethbrake_marl.files.yaml import parse_numeral
+from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.worlds.quantity import Number, Numbers, pick
+from ethbrake_marl.worlds.rules import RECORDING
+
+SIZE_LIMIT = 64 << 20  # bytes of a CSV file
+MOST_NUMBERS = 100_000  # numbers of a table: every copy of the scenario holds it
+MOST_CHARACTERS = 200  # of a recording's name
+WEIGHT = "weight"  # column of ``rows_text``
+
+_NAME = f"recording must be a text of 1 to {MOST_CHARACTERS} printable characters, such as 'drive_1.csv: 2-3-4'"
+
+Column = Annotated[str, Field(pattern=r"^[a-z_]+(_[0-9]+)?[a-z0-9_]*$", max_length=64)]
+Cell = Annotated[
+    Annotated[Number, Tag("#number")] | Annotated[str, Tag("#text")],
+    Discriminator(lambda value: "#text" if isinstance(value, str) else "#number"),
+]
+Row = Annotated[tuple[Cell, ...], Field(strict=False, min_length=1)]
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class TableColumn:
+    """A column of a table, which is drawn like a distribution."""
+
+    name: str
+    rows: NDArray[Any] = data_field(compare=False)  # value of each row; texts in the column ``recording``
+    weights: Floats = data_field(compare=False)  # of each row
+
+    def __repr__(self) -> str:
+        return f"column {self.name} of the table"
+
+    @property
+    def support(self) -> tuple[float, float]:
+        return float(self.rows.min()), float(self.rows.max())
+
+    def value(self, u: Floats) -> NDArray[Any]:
+        return self.rows[pick(self.weights, u)]
+
+
+class Table(FileModel):
+    """The key ``table`` of a scenario. A scenario file may name a CSV file with the rows.
+
+    Rows with the same text in the column ``recording`` come from the same vehicles in the same recording, so they are
+    not independent of each other.
+    """
+
+    file: str = Field(
+        default="", exclude_if=not_, description="path of a CSV file with a header, relative to the scenario's folder"
+    )
+    columns: Annotated[tuple[Column, ...], Field(strict=False, min_length=1)] = Field(
+        description="names of the columns, or of the columns of the file that are used: gap_1_m, speed_2_mps, ...;"
+        " the column recording has texts that name the recording and the vehicles of a row"
+    )
+    weights: str | Annotated[Numbers, Field()] | None = Field(
+        default=None,
+        exclude_if=not_,
+        description="how likely each row is: a list with one number per row, or the name of a column of the file",
+    )
+    rows: Annotated[tuple[Row, ...], Field(strict=False, min_length=1)] | None = Field(
+        default=None, description="rows with one number per column (a text for recording); left out if file is given"
+    )
+
+    @model_validator(mode="after")
+    def _complete(self) -> Table:
+        both = "cannot be combined with rows; leave one of them out"
+        require(not (self.file and self.rows), ("file",), self.file, both)
+        read = "must be given as lists here; only load_scenario reads the rows from a file"
+        require(self.rows is not None and not isinstance(self.weights, str), ("rows",), UNSHOWN, read)
+        rows = self.rows or ()
+        for k, row in enumerate(rows):
+            right = f"has {len(row)} values; must have one for each of the {len(self.columns)} columns"
+            require(len(row) == len(self.columns), ("rows", k), UNSHOWN, right)
+            for c, (name, cell) in enumerate(zip(self.columns, row, strict=True)):
+                good = _names(cell) if name == RECORDING else not isinstance(cell, str)
+                require(good, ("rows", k, c), cell, _NAME if name == RECORDING else f"{name} must be a number")
+        numbers = len(rows) * sum(name != RECORDING for name in self.columns)
+        most = f"has {numbers:,} numbers; must have at most {MOST_NUMBERS:,}"
+        require(numbers <= MOST_NUMBERS, ("rows",), UNSHOWN, most)
+        twice = [name for name in self.columns if self.columns.count(name) > 1]
+        require(not twice, ("columns",), twice[:1], "must not list a column twice")
+        require(self.columns != (RECORDING,), ("columns",), self.columns, "must also have a column of numbers")
+        if isinstance(self.weights, tuple):
+            fits = f"must be {len(rows)} numbers, one per row, all above 0 and with a finite sum"
+            good = len(self.weights) == len(rows) and min(self.weights) > 0.0 and math.isfinite(sum(self.weights))
+            require(good, ("weights",), UNSHOWN, fits)
+        return self
+
+    def column_values(self) -> dict[str, TableColumn]:
+        """Return the columns by name, ``recording`` among them."""
+        rows = self.rows or ()
+        weights = np.asarray(self.weights if isinstance(self.weights, tuple) else (1.0,) * len(rows))
+        columns = zip(self.columns, zip(*rows, strict=True), strict=True)
+        return {name: TableColumn(name, np.array(column), weights) for name, column in columns}
+
+
+def _names(cell: float | str) -> bool:
+    return isinstance(cell, str) and 0 < len(cell) <= MOST_CHARACTERS and cell.isprintable() and cell == cell.strip()
+
+
+class CsvFile(NamedTuple):
+    """A CSV file with a header and at least one row; its cells are unchecked texts."""
+
+    path: Path
+    header: list[str]
+    rows: list[list[str]]
+    lines: list[int]  # line on which each row begins
+
+    @classmethod
+    def read(cls, path: Path) -> CsvFile:
+        """Read a file. Raises ``InvalidInput`` if it is no CSV file, or has no header or no row."""
+        rows, lines, begins = list[list[str]](), list[int](), 1
+        data = read_plain(path, SIZE_LIMIT)
+        try:
+            reader = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
+            for row in reader:
+                rows.append(row)
+                lines.append(begins)
+                begins = reader.line_num + 1
+        except (csv.Error, ValueError) as error:
+            raise InvalidInput(f"{path}: cannot be read as CSV: {error}") from None
+        while rows and not rows[-1]:
+            rows.pop()  # blank lines at the end
+        if not rows or not rows[0]:
+            raise InvalidInput(f"{path}, line 1: must name the columns, for instance gap_1_m,gap_2_m,speed_1_mps,...")
+        if len(rows) == 1:
+            raise InvalidInput(f"{path}: has a header but no rows; add one row per world")
+        return cls(path, [name.strip() for name in rows[0]], rows[1:], lines[1 : len(rows)])
+
+    def cells(self, columns: list[str]) -> list[list[float | str]]:
+        """Return the ``columns`` of each row: numbers, and texts in the column ``recording``."""
+        places = [self.header.index(name) for name in columns]
+        cells = []
+        for row, line in zip(self.rows, self.lines, strict=True):
+            if len(row) != len(self.header):
+                raise InvalidInput(
+                    f"{self.path}, line {line}: has {len(row)} values, but the header has {len(self.header)} columns"
+                )
+            cells.append([self._cell(row[c], line, name) for c, name in zip(places, columns, strict=True)])
+        return cells
+
+    def _cell(self, text: str, line: int, column: str) -> float | str:
+        if column == RECORDING:
+            return text.strip()
+        number = parse_numeral(text.strip())
+        if number is None:
+            raise InvalidInput(f"{self.path}, line {line}, column {column}: {text!r:.60} is not a number")
+        return number
+
+
+def read_rows(path: Path, columns: object, weights: object) -> dict[str, Any]:
+    """Return ``rows`` of a scenario's table, and ``weights`` unless they are None, from a CSV file.
+
+    ``columns`` and ``weights`` are names of columns as the scenario file has them; this function checks them.
+    """
+    file = CsvFile.read(path)
+    if not isinstance(columns, list | tuple):
+        raise InvalidInput(
+            f"{path}: columns = {columns!r:.60}: must be a list of columns of this file, which are"
+            f" {', '.join(file.header)}"
+        )
+    names = [*columns, *([] if weights is None else [weights])]
+    for name in names:
+        if file.header.count(name) != 1:
+            many = "occurs twice" if name in file.header else f"is missing; {suggestion(str(name), file.header)}"
+            raise InvalidInput(f"{path}, line 1: column {name!r:.60} {many.removesuffix('; ')}")
+    cells = file.cells(names)
+    rows = {"rows": [row[: len(columns)] for row in cells]}
+    return rows if weights is None else {**rows, "weights": [row[-1] for row in cells]}
+
+
+def rows_text(table: Table) -> str:
+    """Return the rows of a table as CSV text; weights of rows stand in the column ``weight``."""
+    rows = [list(row) for row in table.rows or ()]
+    header = list(table.columns)
+    if isinstance(table.weights, tuple):
+        header.append(WEIGHT)
+        rows = [[*row, weight] for row, weight in zip(rows, table.weights, strict=True)]
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([header, *rows])
+    return text.getvalue()
