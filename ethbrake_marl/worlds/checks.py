@@ -43,10 +43,7 @@ def _check_declared_once(scenario: Scenario) -> None:
     for key in set(OF_A_TYPE) - set(USUAL):
         silent = [name for name, kind in kinds.items() if getattr(kind, key) is None]
         is_set = getattr(scenario, key) is not None
-        right = (
-            f"vehicle type {''.join(silent[:1])} does not declare {key}; declare {key} in this type, or outside"
-            " vehicle_types for all types without it"
-        )
+        right = undeclared_by_type(key, "".join(silent[:1]))
         require(is_set or len(silent) in (0, len(kinds)), (key,), UNSHOWN, right)
         right = f"must be left out, because every vehicle type declares {key}"
         require(not (is_set and kinds) or len(silent) > 0, (key,), UNSHOWN, right)
@@ -166,3 +163,11 @@ def _path(scenario: Scenario, key: str, index: int, kind: int = 0) -> YamlPath:
     if line is not None and key in OF_A_TYPE and getattr(line.kinds[kind], key) is not None:
         return "vehicle_types", line.names[kind], key
     return (key, index) if isinstance(getattr(scenario, key), tuple) else (key,)
+
+
+def undeclared_by_type(key: str, kind: object) -> str:
+    """Return the error text for a quantity that a vehicle type does not declare."""
+    return (
+        f"vehicle type {kind} does not declare {key}; declare {key} in this type, or outside vehicle_types for all"
+        " types without it"
+    )

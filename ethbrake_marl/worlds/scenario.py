@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from functools import cached_property
 from operator import not_
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, Field, PrivateAttr, ValidationError, ValidationInfo, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
@@ -21,9 +22,10 @@ from ethbrake_marl.files.model import NAME_PATTERN, UNSHOWN, FileModel, explain,
 from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.motion.layout import Floats, Ints
 from ethbrake_marl.worlds.channel import HEARS, V2X, Equipage, Equipped
-from ethbrake_marl.worlds.checks import check_whole
+from ethbrake_marl.worlds.checks import check_whole, undeclared_by_type
 from ethbrake_marl.worlds.counters import Channel
 from ethbrake_marl.worlds.derived import on_road, world_values
+from ethbrake_marl.worlds.describe import columns_of
 from ethbrake_marl.worlds.mixture import WORDS, Member, build_members, changed_content
 from ethbrake_marl.worlds.quantity import LEAVE_OUT, PerVehicle, Quantity, support
 from ethbrake_marl.worlds.roles import LEARNER, Roles, check_role
@@ -296,6 +298,10 @@ class Scenario(FileModel):
         """Return the worlds of ``sample``, their types, members and recordings, and the number of rejected draws."""
         return draw(self, n, seed, first=first, channel=channel)
 
+    def describe(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> dict[str, NDArray[Any]]:
+        """Return the worlds of ``sample`` as columns [n]: ``world``, ``vehicle_1_type``, ``gap_1_m`` and so on."""
+        return columns_of(self.draw(n, seed, first=first, channel=channel))
+
     # ---- who is in the line
 
     @property
@@ -432,7 +438,7 @@ class Scenario(FileModel):
         """
         return Scenario(**changed_content(self.declared(), changes))
 
-    def with_learners(self, learners: Sequence[str | int]) -> Scenario:
+    def with_learners(self, learners: Iterable[str | int]) -> Scenario:
         """Return the scenario with exactly these learners, by name (``vehicle_2``) or number (0 = front).
 
         A learner that is not listed brakes fully. Raises ``InvalidInput`` for an unknown vehicle, or one listed twice.
@@ -456,14 +462,6 @@ class Scenario(FileModel):
                 f" index (0 ... {self.vehicles - 1})"
             )
         return self.vehicle_names[vehicle]
-
-
-def undeclared_by_type(key: str, kind: object) -> str:
-    """Return the error text for a quantity that a vehicle type does not declare."""
-    return (
-        f"vehicle type {kind} does not declare {key}; declare {key} in this type, or outside vehicle_types for all"
-        " types without it"
-    )
 
 
 def _is_tabled(data: Mapping[str, Any], key: str) -> bool:
