@@ -30,7 +30,7 @@ class Key(NamedTuple):
     about: str
 
 
-def keys() -> list[Key]:
+def listed_keys() -> list[Key]:
     """Return every key of a scenario file, in the order of the file."""
     listed = []
     for name, field in Scenario.model_fields.items():

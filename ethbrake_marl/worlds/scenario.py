@@ -10,11 +10,21 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, Field, PrivateAttr, ValidationError, ValidationInfo, field_validator, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic import (
+    BaseModel,
+    Field,
+    GetJsonSchemaHandler,
+    PrivateAttr,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, PydanticCustomError
 
-from ethbrake_marl.episode.features import listed_features
-from ethbrake_marl.episode.objectives import objectives_of
+from ethbrake_marl.episode.features import known_names, listed_features
+from ethbrake_marl.episode.objectives import OBJECTIVES, objectives_of
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, unknown_name
@@ -47,7 +57,30 @@ from ethbrake_marl.worlds.wording import ScenarioWording
 
 _LEFT_OUT: Any = object()  # default of a missing key, which a check then accepts or refuses
 
-Listed = Annotated[tuple[str, ...], Field(strict=False)]
+
+class _ObjectiveSchema:
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        kinds = OBJECTIVES.usable()
+        plain = [name for name, kind in kinds.items() if ":" not in kind.form]
+        with_argument = "|".join(name for name, kind in kinds.items() if ":" in kind.form)
+        return {"type": "string", "anyOf": [{"enum": plain}, {"pattern": f"^({with_argument}):"}]}
+
+
+class _FeaturesSchema:
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        further = {"type": "string", "pattern": r"^(front|rear)_[1-9][0-9]?(\.[a-z0-9_]+)?$"}
+        items = {"anyOf": [{"type": "string", "enum": known_names()}, further]}
+        return {"type": "array", "items": items, "minItems": 1, "uniqueItems": True}
+
+
+Objective = Annotated[str, _ObjectiveSchema]
+Listed = Annotated[tuple[str, ...], Field(strict=False), _FeaturesSchema]
+ListedByVehicle = Annotated[
+    dict[Annotated[str, Field(pattern=r"^vehicle_[1-9][0-9]?$")], Listed],
+    Field(min_length=1, json_schema_extra={"additionalProperties": False}),
+]
 
 
 def _meaning(key: str, **more: Any) -> Any:
@@ -127,11 +160,11 @@ class Scenario(FileModel):
     early_impacts: Literal["keep", "reject"] = Field(
         default="keep", description="keep or reject worlds with an impact at or before the first decision of a learner"
     )
-    objective: str | Annotated[tuple[str, ...], Field(strict=False)] = Field(
+    objective: Objective | Annotated[tuple[Objective, ...], Field(strict=False)] = Field(
         default="total",
         description="whose harm a reward counts: one objective for all vehicles, or a list with one per vehicle",
     )
-    observation: Listed | dict[str, Listed] | None = Field(
+    observation: Listed | ListedByVehicle | None = Field(
         default=None,
         exclude_if=not_,
         description="features and groups of features that a vehicle observes, in this order: one list for all"

@@ -1,0 +1,78 @@
+"""Worlds that the user gives."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.worlds.catalogue import load_scenario
+from ethbrake_marl.worlds.describe import quantities_of
+from ethbrake_marl.worlds.given import given_columns, read_worlds, worlds_from_state, worlds_from_table
+from tests.refused import refused
+from tests.worlds.test_scenario import bits, line
+
+PAPER = load_scenario("paper-random")
+HEADER = "gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps"
+COLUMNS = {name: [7, 8] for name in HEADER.split(",")}
+
+
+@pytest.mark.parametrize(
+    ("scenario", "state", "expected"),
+    [
+        (PAPER, {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}, {"gaps_m": [7.0, 7.0], "latency_s": [0.0, 0.5, 0.8]}),
+        (PAPER, {"gaps_m": 7, "speeds_mps": np.full(3, 20)}, {"speeds_mps": [20.0] * 3}),
+        (load_scenario("paper-scenario-1"), {}, {"gaps_m": [10.0, 8.0], "speeds_mps": [20.0, 18.0, 20.0]}),
+        (line().replace(time_gaps_s=[0.5, 1]), {"speeds_mps": [30, 20, 10]}, {"gaps_m": [10.0, 10.0]}),
+        (line(obstacle_margin_m=1.5), {"latency_s": 0, "braking_capacity_mps2": 4}, {"obstacle_gap_m": 51.5}),
+        (line(obstacle_gap_m=42), {}, {"obstacle_gap_m": 42.0}),
+        (line(friction=0.5), {}, {"braking_capacity_mps2": [0.5 * 9.81] * 3}),
+        (line(friction=0.5), {"friction": 0.25}, {"braking_capacity_mps2": [0.25 * 9.81] * 3}),
+    ],
+)
+def test_state__is_filled_in_with_what_is_fixed(scenario: Any, state: Any, expected: dict[str, Any]) -> None:
+    worlds = worlds_from_state(scenario, state)
+    assert {name: getattr(worlds, name)[0].tolist() for name in expected} == expected
+    assert worlds.clock[:, 5].tolist() == [-1.0]
+
+
+@pytest.mark.parametrize(
+    "name", ["paper-random", "realistic-mixed-buildup", "paper-random-obstacle", "paper-random-preference"]
+)
+def test_table_of_what_was_drawn__is_the_same_worlds(name: str) -> None:
+    scenario = load_scenario(name)
+    drawn = scenario.draw(50, 3)
+    given = worlds_from_table(scenario, quantities_of(drawn.worlds, drawn.friction))
+    for one, other in zip(given, drawn.worlds, strict=True):
+        if one is not given.clock and not isinstance(one, dict):
+            assert one.tobytes() == other.tobytes()
+
+
+def test_table__may_be_a_data_frame() -> None:
+    pandas, pyarrow = pytest.importorskip("pandas"), pytest.importorskip("pyarrow")
+    expected = bits(worlds_from_table(PAPER, COLUMNS))
+    frame = pandas.DataFrame(COLUMNS, index=[5, 3])
+    assert bits(worlds_from_table(PAPER, frame)) == expected
+    assert bits(worlds_from_table(PAPER, {name: frame[name] for name in COLUMNS})) == expected
+    assert bits(worlds_from_table(PAPER, pyarrow.table(COLUMNS))) == expected
+    other = {**COLUMNS, "gap_1_m": frame["gap_1_m"], "gap_2_m": frame["gap_2_m"].sort_index()}
+    with refused("initial states: columns 'gap_1_m' and 'gap_2_m' have different pandas indexes; give them the same"):
+        worlds_from_table(PAPER, other)
+    with refused("initial states = 3: must be a mapping from columns to lists of numbers, a data frame or a"):
+        worlds_from_table(PAPER, 3)
+
+
+def test_file__may_hold_any_quantity_in_any_order(empty_folder: Path) -> None:
+    columns = f"\ufefflatency_2_s,restitution,mass_3_t,speed_limit_1_mps,{HEADER}"
+    Path("worlds.csv").write_text(f"{columns}\n0.2,0.3,6,30,10,8,20,1.8e1, 20\n\n", "utf-8")
+    worlds = read_worlds(PAPER.replace(mass_t=[4.5, 5.5, {"uniform": [5, 6]}]), "worlds.csv")
+    assert worlds.latency_s.tolist() == [[0.0, 0.2, 0.8]]
+    assert worlds.mass_t.tolist() == [[4.5, 5.5, 6.0]]
+    assert worlds.speeds_mps.tolist() == [[20.0, 18.0, 20.0]]
+    assert [*given_columns(PAPER)][:6] == [*HEADER.split(","), "braking_capacity_1_mps2"]
+
+
+def test_weights__of_a_world_are_not_all_0() -> None:
+    weighted = line(harm_weight=[1, 4, 1])
+    with refused("initial_state: harm_weight[0] = 0: the weight of at least one vehicle must be 1e-06 or more"):
+        worlds_from_state(weighted, {"harm_weight": 0})

@@ -1,0 +1,306 @@
+"""What a scenario is, and the worlds that are drawn from it."""
+
+import copy
+import json
+import pickle
+from collections import UserDict, UserList, deque
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.episode.observe import View
+from ethbrake_marl.episode.state import NUMBER
+from ethbrake_marl.files.yaml import parse_yaml
+from ethbrake_marl.worlds import catalogue, explain
+from ethbrake_marl.worlds.catalogue import group_of_scenarios, list_scenarios, load_scenario
+from ethbrake_marl.worlds.counters import numbers_of
+from ethbrake_marl.worlds.describe import clusters_of, count_kinds, kinds_of
+from ethbrake_marl.worlds.scenario import Scenario
+from ethbrake_marl.worlds.table import rows_text
+from tests.refused import refused
+
+PAPER = load_scenario("paper-random")
+LINE: dict[str, Any] = {
+    "name": "line", "gaps_m": 7, "speeds_mps": 20, "braking_capacity_mps2": [6, 7, 6], "driving_capacity_mps2": 5,
+    "mass_t": [4.5, 5.5, 5.9], "latency_s": [0, 0.5, 0.8],
+}  # fmt: skip
+
+
+def line(**changes: Any) -> Scenario:
+    return Scenario(**{**LINE, **changes})
+
+
+def bits(state: Any) -> list[bytes]:
+    return [array.tobytes() for array in state[:5]]
+
+
+# ---------------------------------------------------------------- lists of worlds
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["paper-random", "engineering-loaded-lorries", "cooperation-4-congested", "mixture-trucks", "standards-r157"],
+)
+def test_world_k__is_the_same_alone_and_in_any_batch(name: str) -> None:
+    scenario = load_scenario(name)
+    batch = scenario.sample(40, 3, first=10)
+    assert batch.clock[:, NUMBER].tolist() == list(range(10, 50))
+    for k in (0, 17, 39):
+        assert bits(scenario.sample(1, 3, first=10 + k)) == bits(batch.take([k]))
+    assert bits(scenario.sample(40, 3, first=10, channel="training")) != bits(batch)
+
+
+def test_list__is_endless_and_takes_any_whole_seed() -> None:
+    far = PAPER.sample(3, 0, first=10**15)
+    assert bits(PAPER.sample(1, 0, first=10**15 + 2)) == bits(far.take([2]))
+    assert bits(PAPER.sample(2, np.uint64(5))) == bits(PAPER.sample(np.int64(2), 5))
+    assert PAPER.sample(1, 2**200).n == 1
+
+
+def test_rejected_draws__are_counted_and_drawn_again() -> None:
+    # Vehicle 1 brakes with 6 m/s2 and is 3 m closer to Vehicle 2 at 1 s, when this one may act: 2 m are too little.
+    close = line(vehicles=2, gaps_m={"choice": [2, 4]}, braking_capacity_mps2=6, mass_t=5, latency_s=[0, 1])
+    drawn = close.replace(early_impacts="reject").draw(200, 7)
+    assert drawn.worlds.gaps_m.ravel().tolist() == [4.0] * 200
+    rejected, pending = 0, np.arange(200)
+    for attempt in range(100):
+        pending = pending[numbers_of(7, "list", attempt, pending)(16, ())[:, 0] < 0.5] if len(pending) else pending
+        rejected += len(pending)
+    assert drawn.rejected == rejected > 100
+    kept = close.draw(200, 7)
+    assert (kept.rejected, set(kept.worlds.gaps_m.ravel())) == (0, {2.0, 4.0})
+    same = kept.worlds.gaps_m[:, 0] == 4.0
+    assert bits(kept.worlds.take(same)) == bits(drawn.worlds.take(same))
+
+
+@pytest.mark.parametrize(
+    ("gap_m", "roles", "rejected"),
+    [
+        (3.001, {"vehicle_1": "full_brake"}, False),
+        (2.999, {"vehicle_1": "full_brake"}, True),
+        (0.5, {"vehicle_1": "coast"}, False),  # nothing closes
+        (1.001, {"vehicle_1": "constant:2"}, False),  # 1 m closer within 1 s
+        (0.999, {"vehicle_1": "constant:2"}, True),
+    ],
+)
+def test_early_impact__follows_from_the_roles(gap_m: float, roles: dict[str, str], rejected: bool) -> None:
+    roles = {**roles, "vehicle_2": "learner"}
+    pair = line(vehicles=2, gaps_m=gap_m, braking_capacity_mps2=6, mass_t=5, latency_s=[0, 1], roles=roles)
+    pair = pair.replace(early_impacts="reject")
+    if rejected:
+        with refused("early_impacts: reject, but in all 1000 draws of world 0 an impact happens before vehicle_2"):
+            pair.sample(3, 0)
+    else:
+        assert pair.draw(1, 0).rejected == 0
+
+
+def test_roles__are_the_first_commands() -> None:
+    roles = {"vehicle_1": "constant:2", "vehicle_2": "learner", "vehicle_3": "my_agent:x"}
+    assert line(roles=roles).sample(1, 7).wanted.tolist() == [[0.0, -2.0, 0.0, 0.0]]
+    assert line(roles={"vehicle_1": "coast"}).sample(1, 7).wanted.tolist() == [[0.0, 0.0, -7.0, -6.0]]
+    assert line(roles=roles).roles["vehicle_3"] == "my_agent:x"
+
+
+# ---------------------------------------------------------------- quantities that follow from others
+
+
+@pytest.mark.parametrize(
+    ("given", "gaps", "speeds"),
+    [
+        ({"time_gaps_s": [0.5, 2], "speeds_mps": [30, 20, 10]}, [10.0, 20.0], [30.0, 20.0, 10.0]),
+        ({"line_speed_mps": 20, "speed_deviations_mps": [1, -2, 0.5]}, [7.0, 7.0], [21.0, 18.0, 20.5]),
+        (
+            {"time_gaps_s": 0.5, "line_speed_mps": 20, "speed_deviations_mps": [0, -2, 2]},
+            [9.0, 11.0],
+            [20.0, 18.0, 22.0],
+        ),
+    ],
+)
+def test_time_gaps_and_deviations__by_hand(given: dict[str, Any], gaps: list[float], speeds: list[float]) -> None:
+    worlds = line().replace(**given).sample(1, 7)
+    assert (worlds.gaps_m[0].tolist(), worlds.speeds_mps[0].tolist()) == (gaps, speeds)
+
+
+def test_friction_margin_and_alert__by_hand() -> None:
+    wet = line(friction=0.5).sample(1, 7)
+    assert wet.braking_capacity_mps2[0].tolist() == [0.5 * 9.81] * 3
+    assert line(friction=2).sample(1, 7).braking_capacity_mps2[0].tolist() == [6.0, 7.0, 6.0]
+    margin = line(obstacle_margin_m=1.5, braking_capacity_mps2=5, latency_s=0.5)
+    assert margin.sample(1, 7).obstacle_gap_m.tolist() == [51.5]  # 20 x 0.5 + 20^2 / (2 x 5) + 1.5
+    assert margin.replace(friction=4 / 9.81).sample(1, 7).obstacle_gap_m.tolist() == pytest.approx([61.5])
+    assert line(alert_s=1.5).sample(1, 7).latency_s[0].tolist() == [1.5, 2.0, 2.3]
+    assert line().sample(1, 7).obstacle_gap_m.tolist() == [np.inf]
+    assert [each.has_obstacle for each in (margin, line(obstacle_gap_m=42), line())] == [True, True, False]
+
+
+def test_bounds__hold_for_every_draw() -> None:
+    drawn = line().replace(
+        time_gaps_s={"uniform": [0.2, 2]},
+        line_speed_mps={"uniform": [10, 38]},
+        speed_deviations_mps={"uniform": [-2, 2]},
+    )
+    assert drawn.bounds("speeds_mps") == ((8.0, 40.0),) * 3
+    assert drawn.bounds("gaps_m") == ((1.6, 80.0),) * 2
+    worlds = drawn.sample(2000, 7)
+    assert 8.0 <= worlds.speeds_mps.min() < 10.0 < 38.0 < worlds.speeds_mps.max() <= 40.0
+    assert line(friction={"uniform": [0.1, 0.9]}).bounds("braking_capacity_mps2")[0] == (0.1 * 9.81, 6.0)
+    assert line(friction={"uniform": [0.1, 0.9]}).bounds("braking_capacity_mps2", dry=True)[0] == (6.0, 6.0)
+    assert load_scenario("mixture-delays").bounds("latency_s") == ((0.0, 0.0), (0.1, 0.8), (0.3, 1.2))
+
+
+# ---------------------------------------------------------------- types, tables, mixtures
+
+
+def test_types_and_loads__are_drawn_first() -> None:
+    kinds = {"car": {"weight": 3, "mass_t": 1.5}, "truck": {"mass_t": {"with_load": [14, 40]}}}
+    drawn = (
+        line(vehicle_types=kinds, mass_t=2)
+        if False
+        else Scenario(**{key: value for key, value in LINE.items() if key != "mass_t"}, vehicle_types=kinds).draw(
+            300, 7
+        )
+    )
+    u = numbers_of(7, "list", 0, np.arange(300))(12, (3,)).reshape(300, 3, 4)
+    assert (drawn.types == np.where(u[..., 0] < 0.75, "car", "truck")).all()
+    assert (drawn.worlds.mass_t == np.where(u[..., 0] < 0.75, 1.5, 14 + 26 * u[..., 1])).all()
+    assert "vehicle_1_type: car" in count_kinds(drawn)
+
+
+TABLE = {
+    "columns": ["gap_1_m", "speed_2_mps", "recording"],
+    "rows": [[5, 11, "a: 1"], [6, 12, "a: 2"], [7, 13, "b: 1"]],
+}
+
+
+def test_table__gives_whole_rows() -> None:
+    scenario = line(table={**TABLE, "weights": [1, 2, 1]})
+    drawn = scenario.draw(400, 7)
+    u = numbers_of(7, "list", 0, np.arange(400))(4, (6,))[:, 1]
+    row = np.where(u < 0.25, 0, np.where(u < 0.75, 1, 2))
+    assert drawn.worlds.gaps_m[:, 0].tolist() == (5.0 + row).tolist()
+    assert drawn.worlds.speeds_mps[:, 1].tolist() == (11.0 + row).tolist()
+    assert drawn.worlds.gaps_m[:, 1].tolist() == [7.0] * 400
+    assert sorted(set(clusters_of(drawn))) == ["a", "b"]
+    assert scenario.bounds("gaps_m") == ((5.0, 7.0), (7.0, 7.0))
+    assert (
+        rows_text(scenario.table)
+        == "gap_1_m,speed_2_mps,recording,weight\n5.0,11.0,a: 1,1.0\n6.0,12.0,a: 2,2.0\n7.0,13.0,b: 1,1.0\n"
+    )
+
+
+TABLES = {
+    "table.columns = gap_9_m: unknown column; did you mean": {"columns": ["gap_9_m"], "rows": [[1]]},
+    "table.rows[0][0] = -1: gap_1_m must be finite and in [0, 10000] m": {"columns": ["gap_1_m"], "rows": [[-1]]},
+    "table.rows[1]: has 2 values; must have one for each of the 1 columns": {
+        "columns": ["gap_1_m"], "rows": [[1], [1, 2]],
+    },
+    "table.weights: must be 2 numbers, one per row": {"columns": ["gap_1_m"], "rows": [[1], [2]], "weights": [1]},
+    "table.columns = [gap_1_m]: must not list a column twice": {"columns": ["gap_1_m"] * 2, "rows": [[1, 2]]},
+    "table.rows: must be given as lists here": {"columns": ["gap_1_m"], "file": "x.csv"},
+    "gaps_m = 7: must be left out, because the table has columns of gaps_m for all": {
+        "columns": ["gap_1_m", "gap_2_m"], "rows": [[1, 2]],
+    },
+    "must also have a column of numbers": {"columns": ["recording"], "rows": [["a"]]},
+    "recording must be a text of 1 to 200 printable characters": {
+        "columns": ["gap_1_m", "recording"], "rows": [[1, 2]],
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("message", TABLES)
+def test_table__is_refused(message: str) -> None:
+    with refused(message):
+        line(table=TABLES[message])
+
+
+def test_mixture__is_world_by_world_that_of_its_members(empty_folder: Path) -> None:
+    mixture = load_scenario("mixture-trucks")
+    drawn = mixture.draw(60, 7)
+    for k, member in enumerate(mixture.members):
+        rows = np.flatnonzero(drawn.scenarios == member.name)
+        assert len(rows), k
+        assert bits(member.sample(60, 7).take(rows)) == bits(drawn.worlds.take(rows))
+    delays = load_scenario("mixture-delays")
+    heavy = delays.replace(mass_t=[40, 1, 1])
+    assert np.unique(heavy.sample(20, 7).mass_t[:, 0]).tolist() == [40.0]
+    assert heavy.sample(20, 7).gaps_m.tolist() == delays.sample(20, 7).gaps_m.tolist()
+    assert [each.learners for each in delays.with_learners(["vehicle_3"]).members] == [(3,)] * 3
+    Path("own.yaml").write_text(json.dumps(PAPER.replace(name="own", title="").declared()))
+    Path("mine.yaml").write_text("name: mine\nmixture: [{scenario: own.yaml}, {scenario: paper-random-early}]\n")
+    assert [each.name for each in load_scenario("mine.yaml").members] == ["own", "paper-random-early"]
+
+
+# ---------------------------------------------------------------- the object
+
+
+@pytest.mark.parametrize("name", [entry.name for entry in list_scenarios()])
+def test_shipped_scenario__goes_round(name: str) -> None:
+    scenario = load_scenario(name)
+    assert Scenario(**scenario.declared()) == scenario
+    assert load_scenario(scenario.declared()) == scenario
+    assert pickle.loads(pickle.dumps(scenario)) == scenario == copy.deepcopy(scenario)
+    observed = scenario if scenario.observation is None else scenario.replace(observation=scenario.observation)
+    assert observed == scenario
+    assert next(explain.sentences(scenario)).startswith(f"{name}: ")
+    text = explain.new_scenario_text("mine", name)
+    again = Scenario.from_document(parse_yaml(text, "mine.yaml")) if not scenario.members else scenario
+    assert bits(again.sample(5, 7)) == bits(scenario.sample(5, 7))
+
+
+def test_what_users_hand_over__becomes_plain() -> None:
+    roles = UserDict({"vehicle_2": "learner"})
+    scenario = PAPER.replace(
+        observation=deque(["own", "front_1"]), roles=roles, mass_t=np.array([1.0, 2.0, 3.0]), gaps_m=UserList([7, 8]),
+        objective=("own", "own", "total"), v2x=UserDict({"preset": "nominal"}),
+        latency_s=UserDict({"choice": (0, 0.5)}),
+    )  # fmt: skip
+    assert scenario.observation == ("own", "front_1")
+    assert scenario.declared()["mass_t"] == [1.0, 2.0, 3.0]
+    assert PAPER.replace(observation=View(["own", "front_1.gap"])).observation[-1] == "front_1.gap"
+    assert load_scenario(UserDict(PAPER.declared())) == PAPER
+    each = PAPER.replace(observation={"vehicle_2": ["own"]})
+    assert each.replace(observation=each.observation) == each
+
+
+def test_new_way_to_declare__takes_the_place_of_the_old_one() -> None:
+    timed = line().replace(time_gaps_s=1, line_speed_mps=20, speed_deviations_mps=1)
+    assert (timed.gaps_m, timed.speeds_mps) == (None, None)
+    assert timed.replace(speeds_mps=20).declared().keys() & {"line_speed_mps", "speed_deviations_mps"} == set()
+    margin = line(obstacle_margin_m=1.5).replace(obstacle_gap_m=42)
+    assert margin.obstacle_margin_m is None
+
+
+def test_describe__has_a_column_for_all_that_was_drawn() -> None:
+    columns = load_scenario("mixture-universal").describe(3, 7, first=5)
+    assert [*columns][:5] == ["world", "scenario", "vehicle_1_type", "vehicle_2_type", "vehicle_3_type"]
+    assert columns["world"].tolist() == [5, 6, 7]
+    assert PAPER.describe(2, 7)["gap_1_m"].round(2).tolist() == [6.62, 5.33]
+    assert "obstacle_gap_m" not in PAPER.describe(2, 7)
+    wet = line(friction={"uniform": [0.2, 0.4]}).describe(2, 7)
+    assert (wet["braking_capacity_1_mps2"] == wet["friction"] * 9.81).all()
+    assert kinds_of(PAPER.draw(2, 7)) == {}
+
+
+def test_catalogue__has_groups_names_and_paths(empty_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert len(list_scenarios()) == 55
+    assert len(group_of_scenarios("benchmark")) == 10
+    assert group_of_scenarios("stress") == ["stress-wide", "stress-wide-obstacle"]
+    assert group_of_scenarios("nothing") == []
+    assert load_scenario("stress/wide").name == "stress-wide"
+    Path("mine.yaml").write_text(json.dumps(PAPER.replace(name="mine").declared()))
+    monkeypatch.setenv("HOME", str(empty_folder))
+    monkeypatch.setenv("USERPROFILE", str(empty_folder))
+    for path in ("mine.yaml", "mine", "./mine", "~/mine.yaml", "~/mine", empty_folder / "mine.yaml"):
+        assert load_scenario(path).name == "mine"
+    monkeypatch.setattr(catalogue, "FOLDERS", {})
+    catalogue.register_scenarios("~")
+    assert [entry.name for entry in list_scenarios() if not entry.shipped] == ["mine"]
+
+
+def test_keys__have_ranges_and_defaults() -> None:
+    keys = {key.name: key for key in explain.listed_keys()}
+    assert keys["mass_t"][1:] == ("", "finite and in (0, 1000] t (tonnes)", "mass of each vehicle")
+    assert keys["horizon_s"].default == "8"
+    assert keys["early_impacts"].default == "keep"
