@@ -196,7 +196,7 @@ def _worlds(scenario: Scenario, given: Mapping[Entry, Floats], where: str, name:
             " when; worlds of your own need a channel in which this is not random, for instance"
             " scenario.replace(v2x='paper')"
         )
-    links = np.zeros((n, PER_LINK * N * N))
+    links = np.zeros((n, PER_LINK * N * N)) if scenario.v2x.by_link else None
     return state_of(scenario, on_road(whole), links, scenario.equipped(), np.full(n, -1, np.int64))
 
 

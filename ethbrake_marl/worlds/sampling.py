@@ -69,11 +69,6 @@ class Drawn(NamedTuple):
     scenarios: Texts | None = None  # [n] member of the mixture
     recordings: Texts | None = None  # [n] cell of the table's column `recording`; "" without
 
-    def take(self, rows: Any) -> Drawn:
-        """Return the worlds ``rows`` (indices or a mask), with no rejected draws."""
-        texts = (None if each is None else each[rows] for each in self[2:])
-        return Drawn(self.worlds.take(rows), 0, *texts)
-
 
 def draw(scenario: Scenario, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Drawn:
     """Return worlds ``first`` to ``first + n - 1`` of the endless list of the seed.
@@ -108,7 +103,7 @@ def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> Drawn:
     gap = obstacle_gap(scenario, whole, declared)
     if gap is not None:
         whole["obstacle_gap_m"] = gap
-    links = numbers(PER_LINK * N * N, NEWS) if scenario.v2x.by_link else np.zeros((n, PER_LINK * N * N))
+    links = numbers(PER_LINK * N * N, NEWS) if scenario.v2x.by_link else None
     state = state_of(scenario, whole, links, scenario.equipped(kind), index)
     friction = dry["friction"][:, 0] if "friction" in dry else None
     types = None if line is None or kind is None else np.array(line.names)[kind]
@@ -149,8 +144,11 @@ def _declared_values(
     return declared
 
 
-def state_of(scenario: Scenario, whole: Values, links: Floats, equipped: Equipped, index: Ints) -> State:
-    """Return worlds at the alert from all their quantities, and the random numbers of their links."""
+def state_of(scenario: Scenario, whole: Values, links: Floats | None, equipped: Equipped, index: Ints) -> State:
+    """Return worlds at the alert from all their quantities, and the random numbers of their links.
+
+    Without ``links`` (the channel of the paper) a vehicle knows everything once its own latency is over.
+    """
     n, N = whole["speeds_mps"].shape
     line, car = np.zeros((n, LINE_ROWS, N + 1)), np.zeros((n, CAR_ROW_COUNT, N + 1))
     line[:, SPEED, 1:], line[:, GAP, 1:N], line[:, GAP, N] = whole["speeds_mps"], whole["gaps_m"], np.inf
@@ -162,7 +160,10 @@ def state_of(scenario: Scenario, whole: Values, links: Floats, equipped: Equippe
             car[:, row, 1:] = whole[key]
     know = np.zeros((n, N + 1, N + 1))
     car[:, OWN_LATENCY, 1:] = whole["latency_s"]
-    car[:, LATENCY, 1:], know[:, 1:, 1:] = scenario.v2x.channel.news(whole["latency_s"], links, equipped)
+    if links is None:
+        know[:, 1:, 1:] = whole["latency_s"][:, :, np.newaxis]
+    else:
+        car[:, LATENCY, 1:], know[:, 1:, 1:] = scenario.v2x.channel.news(whole["latency_s"], links, equipped)
     wanted = np.zeros((n, N + 1))
     for i, name in enumerate(scenario.vehicle_names):
         wanted[:, i + 1] = first_command(scenario.roles[name], car[:, BRAKING, i + 1])
@@ -171,23 +172,26 @@ def state_of(scenario: Scenario, whole: Values, links: Floats, equipped: Equippe
 
 def _accepted(scenario: Scenario, seed: int, channel: str, index: Ints) -> Drawn:
     """Return the worlds ``index``; draw those with an early impact again, if the scenario rejects them."""
-    pending, parts, rejected = index, list[Drawn](), 0
-    for attempt in range(MOST_ATTEMPTS):
-        drawn = draw_once(scenario, numbers_of(seed, channel, attempt, pending), pending)
-        if scenario.early_impacts == "keep" or not scenario.learners:
-            return drawn
-        early = has_early_impact(scenario, drawn.worlds)
-        rejected += int(early.sum())
-        parts.append(drawn.take(~early) if early.any() else drawn)
-        pending = pending[early]
+    drawn = draw_once(scenario, numbers_of(seed, channel, 0, index), index)
+    if scenario.early_impacts == "keep" or not scenario.learners:
+        return drawn
+    pending = np.flatnonzero(has_early_impact(scenario, drawn.worlds))
+    rejected = len(pending)
+    for attempt in range(1, MOST_ATTEMPTS):
         if not len(pending):
-            return _join(parts)._replace(rejected=rejected)
+            return drawn._replace(rejected=rejected)
         if attempt == _PATIENCE and len(pending) > 1:
-            _accepted(scenario, seed, channel, pending[:1])
+            _accepted(scenario, seed, channel, index[pending[:1]])
+        again = draw_once(scenario, numbers_of(seed, channel, attempt, index[pending]), index[pending])
+        for whole, part in zip((*drawn.worlds[:5], *drawn[2:]), (*again.worlds[:5], *again[2:]), strict=True):
+            if whole is not None:
+                whole[pending] = part
+        pending = pending[has_early_impact(scenario, again.worlds)]
+        rejected += len(pending)
     learners = ", ".join(scenario.vehicle_names[i - 1] for i in scenario.learners)
     gaps = "time_gaps_s" if scenario.gaps_m is None else "gaps_m"
     raise InvalidInput(
-        f"scenario {scenario.name!r}: early_impacts: reject, but in all {MOST_ATTEMPTS} draws of world {pending[0]} an"
+        f"scenario {scenario.name!r}: early_impacts: reject, but in all {MOST_ATTEMPTS} draws of world {index[pending[0]]} an"
         f" impact happens before {learners} can act; use larger {gaps}, a smaller latency_s, or early_impacts: keep"
     )
 
