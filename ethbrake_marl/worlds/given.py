@@ -33,6 +33,7 @@ def worlds_from_state(scenario: Scenario, initial_state: Mapping[str, Any]) -> S
     """
     if not isinstance(initial_state, Mapping):
         raise InvalidInput(f"initial_state = {initial_state!r}: must be a mapping such as {{'gaps_m': [7, 7]}}")
+    _refuse_mixture(scenario, "initial_state")
     columns, known = dict[Entry, Floats](), given_keys(scenario)
     for key, value in initial_state.items():
         if key not in known:
@@ -99,12 +100,18 @@ def read_worlds(scenario: Scenario, path: str | Path) -> State:
     return _worlds(scenario, columns, str(file.path), name)
 
 
+def _refuse_mixture(scenario: Scenario, where: str) -> None:
+    if scenario.members:
+        raise InvalidInput(
+            f"{where}: scenario {scenario.name!r} is a mixture, so it is unknown to which of its scenarios a"
+            f" world belongs; use one of these scenarios: {', '.join(member.name for member in scenario.members)}"
+        )
+
+
 def given_keys(scenario: Scenario) -> tuple[str, ...]:
     """Return the quantities that worlds of this scenario have: ``gaps_m`` and so on."""
-    more = [key for key in OPTIONAL if scenario.declares(key)]
-    obstacle = ["obstacle_gap_m"] if scenario.has_obstacle and "obstacle_gap_m" not in more else []
-    members = [key for key in OPTIONAL if any(member.declares(key) for member in scenario.members)]
-    return tuple(dict.fromkeys([*USUAL, *obstacle, *more, *members]))
+    there = {"obstacle_gap_m": scenario.has_obstacle}
+    return USUAL + tuple(key for key in OPTIONAL if there.get(key, scenario.declares(key)))
 
 
 def given_columns(scenario: Scenario) -> dict[str, Entry]:
@@ -140,6 +147,7 @@ def _as_mapping(columns: Any) -> Mapping[str, Any]:
 
 def _entries(header: Sequence[str], scenario: Scenario, where: str) -> list[Entry]:
     """Return what the columns of a header mean. Raises ``InvalidInput`` for unknown, repeated and missing columns."""
+    _refuse_mixture(scenario, where)
     known = given_columns(scenario)
     if twice := [name for name, times in Counter(header).items() if times > 1]:
         raise InvalidInput(f"{where}: column {twice[0]!r} occurs twice")
@@ -163,11 +171,6 @@ def _entries(header: Sequence[str], scenario: Scenario, where: str) -> list[Entr
 
 def _worlds(scenario: Scenario, given: Mapping[Entry, Floats], where: str, name: Naming) -> State:
     """Return worlds of the columns ``given``, each [n], filled in and checked."""
-    if scenario.members:
-        raise InvalidInput(
-            f"{where}: scenario {scenario.name!r} is a mixture, so it is unknown to which of its scenarios a"
-            f" world belongs; use one of these scenarios: {', '.join(member.name for member in scenario.members)}"
-        )
     n, N = len(next(iter(given.values()))) if given else 1, scenario.vehicles
     whole: dict[str, Floats] = {}
     last = ("gaps_m", "obstacle_gap_m")  # may follow from the others

@@ -520,9 +520,9 @@ def _build(scenario: Scenario, document: Document) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Return what a user gives as dict, list and Python numbers: any mapping or sequence, arrays, Scenario, View."""
-    if isinstance(value, Scenario):
-        return value.declared()
+    """Return what a user gives as dict, list and Python numbers: any mapping or sequence, arrays, models, a View."""
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json", exclude_unset=True, exclude_none=True)
     if isinstance(value, View):
         return list(value.names)
     if isinstance(value, np.ndarray | np.generic):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl.scenario as first
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import (
     BRAKE_RATE,
     BRAKING,
@@ -23,7 +24,10 @@ from ethbrake_marl.motion.layout import (
     SPEED,
     WEIGHT,
 )
+from ethbrake_marl.scenario.tables import worlds_from_table as first_from_table
+from ethbrake_marl.worlds import explain
 from ethbrake_marl.worlds.catalogue import list_scenarios, load_scenario
+from ethbrake_marl.worlds.given import worlds_from_table
 
 NAMES = [entry.name for entry in list_scenarios()]
 
@@ -75,3 +79,29 @@ def test_content__is_that_of_the_first_edition(name: str) -> None:
     assert new.declared() == old.declared()
     assert new.content() == old.content(())
     assert (new.has_obstacle, [i - 1 for i in new.learners]) == (old.has_obstacle, list(old.learners))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_given_worlds__are_those_of_the_first_edition_or_refused_in_its_words(name: str) -> None:
+    one, other = first.load_scenario(name), load_scenario(name)
+    columns = first.QUANTITY.columns(one.sample(200, 7).worlds)
+    columns.pop("obstacle_gap_m", None)
+    try:
+        old = as_state(first_from_table(one, columns))
+    except InvalidInput as error:
+        with pytest.raises(InvalidInput) as refusal:
+            worlds_from_table(other, columns)
+        assert str(refusal.value) == str(error) or other.members  # the second edition says first that it is a mixture
+        return
+    new = worlds_from_table(other, columns)
+    for expected, array in zip(old, (new.line, new.car, new.know), strict=True):
+        assert expected.tobytes() == array.tobytes()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_words__are_those_of_the_first_edition(name: str) -> None:
+    follower = "\n# additional vehicle behind the last vehicle of the line, at the same speed\n# follower: null\n"
+    old = first.new_scenario_text("mine", name)
+    assert explain.new_scenario_text("mine", name) == old.replace(follower, "")
+    for key in first.QUANTITY.usual:
+        assert load_scenario(name).bounds(key) == first.load_scenario(name).bounds(key)

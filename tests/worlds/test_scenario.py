@@ -235,8 +235,8 @@ def test_shipped_scenario__goes_round(name: str, empty_folder: Path) -> None:
     assert Scenario(**scenario.declared()) == scenario
     assert load_scenario(scenario.declared()) == scenario
     assert pickle.loads(pickle.dumps(scenario)) == scenario == copy.deepcopy(scenario)
-    observed = scenario if scenario.observation is None else scenario.replace(observation=scenario.observation)
-    assert observed == scenario
+    for key in scenario.model_fields_set - {"vehicles"}:
+        assert scenario.replace(**{key: getattr(scenario, key)}) == scenario, key
     assert next(explain.sentences(scenario)).startswith(f"{name}: ")
     Path("mine.yaml").write_text(explain.new_scenario_text("mine", name, rows_file="rows.csv"))
     if scenario.table is not None:
