@@ -51,7 +51,9 @@ def numbers_of(seed: int, channel: str, attempt: int, index: Ints) -> Numbers:
         integers = np.asarray(philox.random_raw(count * width)).reshape(count, width)
         if count > len(index):
             integers = integers[index - first]
-        u: Floats = (integers >> np.uint64(11)).astype(np.float64)
-        return u * 2.0**-53
+        integers >>= np.uint64(11)
+        u: Floats = integers.astype(np.float64)
+        u *= 2.0**-53
+        return u
 
     return numbers

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from operator import not_
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import Discriminator, Field, Tag, field_validator, model_validator
@@ -33,7 +33,17 @@ def pick(weights: Sequence[float] | Floats, u: Floats) -> Ints:
     return np.searchsorted(cumulative / cumulative[-1], u, side="right")
 
 
-class Uniform(FileModel):
+class Distribution(FileModel):
+    """Base class of the distributions. The first field, of the distribution's name, has its shape."""
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """Smallest and largest value."""
+        shape = getattr(self, next(iter(type(self).model_fields)))
+        return (min(shape), max(shape)) if isinstance(shape, tuple) else (shape.low, shape.high)
+
+
+class Uniform(Distribution):
     """``{uniform: [low, high]}``: ``low + (high - low) u``."""
 
     uniform: Pair = Field(description="[low, high]")
@@ -43,17 +53,13 @@ class Uniform(FileModel):
         require(self.uniform[0] <= self.uniform[1], ("uniform",), self.uniform, "low must not be above high")
         return self
 
-    @property
-    def support(self) -> tuple[float, float]:
-        return self.uniform
-
     def value(self, u: Floats) -> Floats:
         """Return the values; none is above high, because u is at most 1 - 2^-53."""
         low, high = self.uniform
         return low + (high - low) * u
 
 
-class LogUniform(FileModel):
+class LogUniform(Distribution):
     """``{loguniform: [low, high]}``: ``low (high / low)^u``, so 1 to 2 is as likely as 2 to 4."""
 
     loguniform: Pair = Field(description="[low, high], both above 0")
@@ -65,30 +71,31 @@ class LogUniform(FileModel):
         require(low <= high, ("loguniform",), self.loguniform, "low must not be above high")
         return self
 
-    @property
-    def support(self) -> tuple[float, float]:
-        return self.loguniform
-
     def value(self, u: Floats) -> Floats:
         low, high = self.loguniform
         return np.clip(low * exp_each(u * log(high / low)), low, high)
 
 
-def _shares(mean: float, sd: float, low: float, high: float) -> tuple[float, float]:
-    """Return the probabilities of a normal value below ``low`` and below ``high``."""
-    return normal_probability((low - mean) / sd), normal_probability((high - mean) / sd)
+class _TruncatedNormal(NamedTuple):
+    mean: float  # before truncation
+    sd: float
+    low: float
+    high: float
 
+    def shares(self) -> tuple[float, float]:
+        """Return the probabilities of a value below ``low`` and below ``high`` before truncation."""
+        low, high = (normal_probability((end - self.mean) / self.sd) for end in (self.low, self.high))
+        return low, high
 
-def _truncated_normal(mean: float, sd: float, low: float, high: float, u: Floats) -> Floats:
-    """Return ``mean + sd Q(p_low + (p_high - p_low) u)`` with the standard normal quantile function Q."""
-    below, above = _shares(mean, sd, low, high)
-    return np.clip(mean + sd * normal_quantile_each(below + (above - below) * u), low, high)
+    def check(self, at: str, shape: FileModel) -> None:
+        right = f"the untruncated distribution must have a probability of at least {LEAST_MASS:g} in [low, high]"
+        below, above = self.shares()
+        require(above - below >= LEAST_MASS, (at,), shape, right)
 
-
-def _check_normal(at: str, shape: FileModel, mean: float, sd: float, low: float, high: float) -> None:
-    right = f"the untruncated distribution must have a probability of at least {LEAST_MASS:g} in [low, high]"
-    below, above = _shares(mean, sd, low, high)
-    require(above - below >= LEAST_MASS, (at,), shape, right)
+    def value(self, u: Floats) -> Floats:
+        """Return ``mean + sd Q(p_low + (p_high - p_low) u)`` with the standard normal quantile function Q."""
+        below, above = self.shares()
+        return np.clip(self.mean + self.sd * normal_quantile_each(below + (above - below) * u), self.low, self.high)
 
 
 class NormalShape(FileModel):
@@ -100,7 +107,7 @@ class NormalShape(FileModel):
     high: Number
 
 
-class Normal(FileModel):
+class Normal(Distribution):
     """``{normal: {mean, sd, low, high}}``: a normal distribution truncated to [low, high]."""
 
     normal: NormalShape
@@ -110,16 +117,16 @@ class Normal(FileModel):
         shape = self.normal
         require(shape.sd > 0.0, ("normal",), shape, "sd must be above 0")
         require(shape.low < shape.high, ("normal",), shape, "low must be below high")
-        _check_normal("normal", shape, shape.mean, shape.sd, shape.low, shape.high)
+        self._truncated.check("normal", shape)
         return self
 
-    @property
-    def support(self) -> tuple[float, float]:
-        return self.normal.low, self.normal.high
-
     def value(self, u: Floats) -> Floats:
+        return self._truncated.value(u)
+
+    @property
+    def _truncated(self) -> _TruncatedNormal:
         shape = self.normal
-        return _truncated_normal(shape.mean, shape.sd, shape.low, shape.high, u)
+        return _TruncatedNormal(shape.mean, shape.sd, shape.low, shape.high)
 
 
 class LogNormalShape(FileModel):
@@ -131,7 +138,7 @@ class LogNormalShape(FileModel):
     high: Number
 
 
-class LogNormal(FileModel):
+class LogNormal(Distribution):
     """``{lognormal: {median, sigma, low, high}}``: a lognormal distribution truncated to [low, high]."""
 
     lognormal: LogNormalShape
@@ -142,21 +149,20 @@ class LogNormal(FileModel):
         require(min(shape.median, shape.low) > 0.0, at, shape, "median and low must be above 0")
         require(shape.sigma > 0.0, at, shape, "sigma must be above 0")
         require(shape.low < shape.high, at, shape, "low must be below high")
-        _check_normal("lognormal", shape, log(shape.median), shape.sigma, log(shape.low), log(shape.high))
+        self._of_logarithm.check("lognormal", shape)
         return self
-
-    @property
-    def support(self) -> tuple[float, float]:
-        return self.lognormal.low, self.lognormal.high
 
     def value(self, u: Floats) -> Floats:
         """Return ``exp(x)`` with x from a normal distribution truncated to [log(low), log(high)]."""
+        return np.clip(exp_each(self._of_logarithm.value(u)), *self.support)
+
+    @property
+    def _of_logarithm(self) -> _TruncatedNormal:
         shape = self.lognormal
-        x = _truncated_normal(log(shape.median), shape.sigma, log(shape.low), log(shape.high), u)
-        return np.clip(exp_each(x), shape.low, shape.high)
+        return _TruncatedNormal(log(shape.median), shape.sigma, log(shape.low), log(shape.high))
 
 
-class Choice(FileModel):
+class Choice(Distribution):
     """``{choice: [a, b, ...]}``: one of the values, equally likely or in proportion to ``weights: [...]``."""
 
     choice: Numbers
@@ -171,16 +177,11 @@ class Choice(FileModel):
             require(positive, ("weights",), self.weights, "every weight must be above 0, and their sum finite")
         return self
 
-    @property
-    def support(self) -> tuple[float, float]:
-        return min(self.choice), max(self.choice)
-
     def value(self, u: Floats) -> Floats:
         values: Floats = np.asarray(self.choice)[pick(self.weights or (1.0,) * len(self.choice), u)]
         return values
 
 
-Distribution = Uniform | LogUniform | Normal | LogNormal | Choice
 DISTRIBUTIONS = ("uniform", "loguniform", "normal", "lognormal", "choice")
 
 

@@ -61,6 +61,8 @@ class ScenarioWording(Wording):
             return f"must be a number, {_DISTRIBUTION}{_misspelt(detail['input'])}"
         if detail["type"] == "float_type" and detail["loc"][-1] == "#number":
             return f"must be a number or a distribution, {_DISTRIBUTION}"
+        if detail["type"] == "string_type" and detail["loc"][0] == "roles" and isinstance(detail["input"], dict):
+            return "must be learner or the name of a script, such as full_brake, coast or constant:3"
         if detail["loc"][:1] == ("mixture",) and detail["loc"][-1] == "scenario":
             return "must be the content of a scenario as a mapping; a scenario's name works only with load_scenario"
         return ""

@@ -212,7 +212,7 @@ GONE: dict[str, Callable[[], object]] = {
     "line 15: v2x.persistence: unknown key; periodic messages belong to the extension messages": lambda: given(
         v2x="{preset: nominal, persistence: periodic}"
     ),
-    "line 13: roles.vehicle_1 = {profile: [[0, 3]]}: must be text": lambda: given(
+    "line 13: roles.vehicle_1 = {profile: [[0, 3]]}: must be learner or the name of a script, such as": lambda: given(
         roles="{vehicle_1: {profile: [[0, 3]]}, vehicle_2: learner}"
     ),
 }
