@@ -22,7 +22,7 @@ def test_knowledge__every_agent_of_the_registry_stands_in_a_table():
 
 
 def test_agent_names__are_those_that_ship_and_are_listed(capsys):
-    scripts = ("coast", "constant", "e_v2x_bm", "full_brake", "planner")
+    scripts = ("coast", "constant", "e_v2x_bm", "full_brake")
     learned = ("ppo", "sac", "vine", "rollout-classification", "policy", "universal", "team")
     names = (*scripts, *FIELD, "best_harm", *learned)
     names = (*names, *(name for name in shipped_policies() if name not in names))
@@ -47,4 +47,4 @@ def test_validate__tells_which_agents_and_shields_refuse_a_script(ethbrake: Comm
         return set(told_json(ethbrake("scenario", "validate", path, "--json"))["refused_by"])
 
     assert {"e_v2x_bm", "best_harm", "+step"} < refused_by("own_calm")
-    assert refused_by("own_fixed") == {"+robust:interior", "early_impacts: reject"}
+    assert refused_by("own_fixed") == {"early_impacts: reject"}

@@ -15,7 +15,7 @@ from ethbrake_marl.engine.memory import Memory
 from ethbrake_marl.engine.profiles import TIME_STEP_S, ProfileProblem, Profiles
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, renumbered
-from ethbrake_marl.extensions.search.planner import MOST_CANDIDATES, Outlook, budget_of
+from ethbrake_marl.extensions.search.outlook import MOST_CANDIDATES, Outlook, budget_of
 from ethbrake_marl.extensions.search.problem import search_profiles
 from ethbrake_marl.extensions.search.refine import refine
 from ethbrake_marl.game.harm import HarmCount, check_harm_count

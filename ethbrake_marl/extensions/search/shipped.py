@@ -75,4 +75,4 @@ BEST_HARM = Part(  # target of the entry point in pyproject.toml
     knows=Source.MODEL,
 )
 
-RUNGS = ("planner", "best_harm")  # agents that ``--agents ladder`` adds above the core's
+RUNGS = ("best_harm",)  # agents that ``--agents ladder`` adds above the core's

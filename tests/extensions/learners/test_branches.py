@@ -89,7 +89,7 @@ def test_branch__difference_is_the_gradient_of_the_harm() -> None:
     assert (gained[0] - gained[1]) / (moved[0] - moved[1]) == pytest.approx(-12.0, rel=1e-6)
 
 
-SCRIPTS = ("planner:8", "e_v2x_bm", "ppo")
+SCRIPTS = ("best_harm:8", "e_v2x_bm", "ppo")
 
 
 def scripted(script: str) -> tuple[Engine, Any]:
