@@ -217,10 +217,9 @@ def with_channels(honest):
     What goes around an agent, or estimates, sees what it is told; the fast ones are three kinds of telling.
     """
     return [
-        pytest.param(*spec.values, channel, marks=[*spec.marks, *slow])
+        pytest.param(spec, channel, marks=pytest.mark.slow if k % 3 and (":" in spec or "+" in spec) else ())
         for spec in honest
         for k, channel in enumerate(HIDING)
-        for slow in [(pytest.mark.slow,) if k % 3 and (":" in spec.values[0] or "+" in spec.values[0]) else ()]
     ]
 
 

@@ -22,9 +22,9 @@ from ethbrake_marl.shields.step import StepShield
 class RobustShield(StepShield):
     """``StepShield`` whose bound on harm holds in the reported world and in every corner of its box.
 
-    The bound does not cover the worlds between the corners: there, more harm is possible. In a test with gaps known to
-    +- 0.5 m, 0.29 % of a million worlds between the corners did more harm than the bound
-    (``docs/results/shield.json``, table ``between-corners``).
+    The bound does not cover the worlds between the corners: there, more harm is possible. With gaps known to +- 0.5 m,
+    0.29 % of a million worlds between the corners did more harm than the bound. With other intervals the share was 0 to
+    5.8 % (docs/extensions/certified.md).
 
     Args:
         scenario: the scenario of all worlds.
