@@ -25,7 +25,7 @@ PAPER = eb.load_scenario("paper-random")
     ("spec", "parts"),
     [
         ("ppo+search+step", AgentSpec("ppo", None, None, ("search", "step"))),
-        ("mine:x@path+robust", AgentSpec("mine", "x", "path", ("robust",))),
+        ("mine:x@path+step", AgentSpec("mine", "x", "path", ("step",))),
     ],
 )
 def test_spec__is_taken_apart_and_written_again(spec, parts):
