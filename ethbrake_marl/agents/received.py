@@ -1,4 +1,4 @@
-"""What one vehicle has received about the other vehicles: who is known, and the newest state of each."""
+"""Information that one vehicle has received about the other vehicles: who is known, and the newest state of each."""
 
 from __future__ import annotations
 
