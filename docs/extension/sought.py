@@ -26,7 +26,7 @@ SOUGHT = {
     "extensions/recorded": "highd ngsim openacc traffic trajectories",
     "extensions/report": "html figures film picture",
     "extensions/reproduction": "reproduce replicate paper results",
-    "extensions/search": "best known optimum optimal planner",
+    "extensions/search": "best known optimum optimal",
     "extensions/studies": "hyperparameters optuna tuning sweep parallel seeds ray slurm cluster falsify worst",
     "internals/model": "physics collision restitution friction units",
     "internals/paper": "equations differences",

@@ -144,10 +144,10 @@ OWN: dict[str, Callable[[], object]] = {
     "agent 'mine' of vehicle_2: memory: contains an array of objects; arrays must contain numbers": lambda: evaluated(
         Remembers(lambda n: np.array([[]] * n + [[1]], object)[:n], lambda m, n: m)
     ),
-    "the closed form of E-V2X-BM and planner: the result would not be exact, because brakes in world 0": lambda: (
-        evaluated(make_agent("e_v2x_bm:pairwise"), SLOW)
+    "the closed form of E-V2X-BM: the result would not be exact, because brakes in world 0": lambda: evaluated(
+        make_agent("e_v2x_bm:pairwise"), SLOW
     ),
-    "the closed form of E-V2X-BM and planner: a vehicle of world 0 follows a braking profile": lambda: evaluated(
+    "the closed form of E-V2X-BM: a vehicle of world 0 follows a braking profile": lambda: evaluated(
         make_agent("e_v2x_bm:pairwise"), PIECES
     ),
 }

@@ -85,7 +85,7 @@ def test_price__is_paired_by_world_and_told_of_both_counts():
         assert told.value == pytest.approx(difference.mean(), abs=1e-9)
     heads = [line for line in price.tables(found).splitlines() if line.startswith("| channel")]
     tables = [table for table in BASELINES if table.columns[0] == "channel"]
-    assert heads == [f"| {' | '.join(table.columns)} |" for table in tables] and len(heads) == 5
+    assert heads == [f"| {' | '.join(table.columns)} |" for table in tables] and len(heads) == 4
     assert all([row[0] for row in table.rows] == list(price.channels()) for table in tables)
     assert picture_bytes(price.draw(found), "price.png").startswith(PNG)
 

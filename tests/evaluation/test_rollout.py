@@ -513,7 +513,7 @@ def test_a_list_of_which_every_world_fails__is_refused(failing, paper_random: Sc
 
 
 def test_aftermath__has_no_meaning_where_vehicle_1_reacts_or_another_than_vehicle_2_is_driven() -> None:
-    reacts = PUSH.replace(roles={"vehicle_1": "planner", "vehicle_2": "learner"})
+    reacts = PUSH.replace(roles={"vehicle_1": "ppo", "vehicle_2": "learner"})
     assert ShovedFront.of(reacts.sample(1, 7).worlds, Task(reacts, (1,))) is None
     third = PAPER.with_learners(["vehicle_3"])
     assert evaluate(third.sample(1, 7), BRAKE, scenario=third).outcome("full_brake").sampled_harm is None

@@ -118,8 +118,8 @@ TAGS = (
     "!!null ''",
 )  # fmt: skip
 SPECS = (
-    "planner:99999999999", "best_harm:99999999999", "planner:1e99", "planner:" + "9" * 4000, "planner:999999999ms",
-    "planner:0", "planner:0.5", "planner:-1", "planner:\u0663", "best_harm:0", "best_harm:x", "best_harm:\u00b2",
+    "best_harm:99999999999", "best_harm:1e99", "best_harm:0", "best_harm:0.5", "best_harm:-1", "best_harm:x",
+    "best_harm:\u00b2", "best_harm:\u0663",
     "best_harm:" + "9" * 5000, "constant:.inf", "constant:1e400", "constant:nan", "constant:" + "9" * 3000,
     "constant:-7", "e_v2x_bm:eval", "coast:1", "__import__('os').system('touch pwned')", "ppo@/dev/zero", "ppo",
     "hybrid@shipped", "team@.", "learner:1", "Learner", "replay", "a" * 5000, "constant:3;touch pwned",
@@ -301,7 +301,7 @@ UNCERTAIN: dict[str, Change] = {
     "nasty text": lambda r, t: t.replace("title: ", f"title: {quoted(r)} # "),
     "damaged": lambda r, t: damaged(r, t.encode()),
 }
-SEARCHING = ("planner", "best_harm", "planner:1000000", "best_harm:1000000", "planner:60000ms", "e_v2x_bm")
+SEARCHING = ("best_harm", "best_harm:1000000", "e_v2x_bm")
 SLOW: dict[str, Change] = {
     "other spelling of a number": number("+7", "0x7", "0o7", ".7", "7.", "7e0", "007", "-0", "7.0"),
     "role": lambda r, t: t.replace("vehicle_3: full_brake", f"vehicle_3: {json.dumps(r.choice(SPECS))}"),

@@ -127,12 +127,6 @@ def test_file__is_no_table(empty_folder: Path) -> None:
         BestHarmTable.load(Path("t.npz"))
 
 
-def test_table__is_improved_by_a_harm_of_each_world() -> None:
-    table = BestHarmTable.load(TABLES / "paper-random.npz")
-    with refused("harm has the shape (3,); give one number for each world, shape (2,)"):
-        table.improved(table.identity[:2], "first", np.zeros(3))
-
-
 def test_table__of_other_worlds_is_refused() -> None:
     table = BestHarmTable.load(TABLES / "paper-delay-low.npz")
     with refused("table of best known harm (scenario paper-delay-low, list_seed 7, episodes 2000"):

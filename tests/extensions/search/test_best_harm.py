@@ -30,7 +30,7 @@ from ethbrake_marl.extensions.proofs.team_bound import team_bound
 from ethbrake_marl.extensions.report.harm_figures import harm_in_parts
 from ethbrake_marl.extensions.report.report import avoidable_section, worst_section
 from ethbrake_marl.extensions.report.three_tests import TESTS
-from ethbrake_marl.extensions.search import limits, regret
+from ethbrake_marl.extensions.search import limits, regret, shipped
 from ethbrake_marl.extensions.search.best_harm import best_harm, fold_episodes, search_list, task_problem
 from ethbrake_marl.extensions.search.extreme_profiles import KEPT, extreme_profiles
 from ethbrake_marl.extensions.search.limit_measures import LIMITS
@@ -129,14 +129,13 @@ def test_best_harm__joint_optimum_of_two_cars_by_hand(vehicles: tuple[int, ...],
 
 
 def test_stored_profile__driven_in_the_engine_does_the_stored_harm_bit_for_bit(
-    table: BestHarmTable, tmp_path: Path
+    table: BestHarmTable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     table.save(tmp_path / "t.npz")
     kept, shuffled = BestHarmTable.load(tmp_path / "t.npz"), np.random.default_rng(0).permutation(WORLDS.n)
+    monkeypatch.setattr(shipped, "shipped_tables", lambda: (kept,))
     for harm_count in HARM_COUNTS:
-        agent = BestHarm(
-            lambda problem, c: kept.profiles(problem.identity, c, problem.last_step), harm_count=harm_count
-        )
+        agent = BestHarm(harm_count=harm_count)
         episodes = drive(WORLDS.take(shuffled), agent, SCENARIO, 1)
         told, harm = episodes.memories[1], table.best[harm_count].harm[shuffled]
         assert np.array_equal(episodes.ledger.world_harm(harm_count), harm)
@@ -187,11 +186,12 @@ def test_improved__takes_only_what_undercuts_by_more_than_the_tolerance(table: B
     lower, hardly = np.flatnonzero(before > 1.0)[:2]
     harm = before.copy()
     harm[[lower, hardly]] -= 0.5, 5e-7
-    better, where = table.improved(table.identity, "first", harm)
+    coasting = Profiles(np.full((len(harm), 1), 75), np.zeros((len(harm), 1, 1)))
+    better, where = table.improved(table.identity, "first", harm, coasting)
     assert np.flatnonzero(where).tolist() == [lower]
     assert better.best["first"].harm.tolist() == np.where(where, harm, before).tolist()
-    _, known = better.profiles(table.identity, "first", np.full(len(harm), 75))
-    assert np.flatnonzero(~known).tolist() == [lower]
+    stored, _ = better.profiles(table.identity, "first", np.full(len(harm), 75))
+    assert not stored.commands_mps2[lower].any() and stored.commands_mps2[hardly].any()
 
 
 def test_search_list__goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -282,10 +282,9 @@ def test_even_grid__ends_at_the_capacities_to_the_bit() -> None:
     assert grid[0, :, 0] == pytest.approx([-4.0, -2.7, -1.4, -0.1, 1.2])
 
 
-def test_search_and_planner__start_from_capacities_that_differ_by_an_ulp_too_much() -> None:
+def test_search__starts_from_capacities_that_differ_by_an_ulp_too_much() -> None:
     harms = [first_harm(rounded(WORLDS), vehicles=vehicles, budget=100) for vehicles in ((1,), (0, 1))]
-    planned = drive(rounded(WORLDS), make_agent("planner:8"), SCENARIO, 1).ledger.world_harm("first")
-    assert np.isfinite([*harms, planned]).all()
+    assert np.isfinite(harms).all()
 
 
 # Profiles of full drive and full braking: a search that starts from them is near the proven bound at once.
@@ -376,20 +375,20 @@ def test_best_harm_programme__one_count_from_an_earlier_table(
 
 def test_best_harm_programme__takes_what_agents_do_better(tmp_path: Path) -> None:
     before = searched(tmp_path / "t.npz", "--episodes", "15")
-    after = searched(tmp_path / "u.npz", "--episodes", "15", "--agents", "planner:60,full_brake")
-    assert list(after.header["lowered_by"]) == ["planner:60", "full_brake"]
-    assert "--agents planner:60,full_brake" in after.header["command"]
+    after = searched(tmp_path / "u.npz", "--episodes", "15", "--agents", "constant:5+search,full_brake")
+    assert list(after.header["lowered_by"]) == ["constant:5+search", "full_brake"]
+    assert "--agents constant:5+search,full_brake" in after.header["command"]
     problem = task_problem(SCENARIO.sample(15, 7).worlds, Task(SCENARIO, (1,)))
     for k, count in enumerate(HARM_COUNTS):
         harm = after.best[count].harm
         changed = harm != before.best[count].harm
         assert (harm <= before.best[count].harm).all()
         # In some worlds by the agents of both counts.
-        assert after.header["lowered_by"]["planner:60"][count] >= changed.sum()
+        assert after.header["lowered_by"]["constant:5+search"][count] >= changed.sum()
         assert count == "first" or changed.sum() >= 1
         assert problem.follow(after.best[count].profiles)[k].tolist() == harm.tolist()
     again = fold_episodes(
-        after, SCENARIO, SCENARIO.sample(15, 7).worlds, "planner:60", {"first": make_agent("full_brake")}
+        after, SCENARIO, SCENARIO.sample(15, 7).worlds, "constant:5+search", {"first": make_agent("full_brake")}
     )
     assert again.header["lowered_by"] == after.header["lowered_by"]  # what it lowered before stays counted
 

@@ -209,8 +209,8 @@ def test_best_known__is_the_witness_the_table_or_an_agent(four: Evaluation, tmp_
 
 
 @SILENT
-def test_best_known__rounding_below_the_table_is_not_below_it(four: Evaluation) -> None:
-    close = first_worlds(four, 4, a=([1.0, 2.0 - 9e-7, 4.0 - 2e-6, 6.0], [1.0, 4.0, 6.0, 7.0]))
+def test_best_known__equal_to_the_table_and_rounding_below_it_are_not_below_it(four: Evaluation) -> None:
+    close = first_worlds(four, 4, a=([1.0, 2.0 - 9e-7, 4.0 - 2e-6, 6.0], [1.0, 3.0, 6.0, 7.0]))
     found = regrets_of(close)
     assert found.below(close.outcome("a")).tolist() == [False, False, True, False]
     assert found.source.tolist() == ["witness", "table", "below_table", "agents"]
