@@ -24,6 +24,5 @@ driving capacity (m/s2). Time 0 is the moment at which the controlled vehicle ma
   proves for some first contact is not above ``enough``.
 - ``plan``, ``other``: working memory for the motions of two vehicles, arrays from ``plans.empty_plan``; overwritten.
 - ``heap``: working memory for the search of ``branch_and_bound``, [CELLS, HEAP_WIDTH]: one row for each cell, which
-here is a
-  set of first contacts; overwritten.
+  here is a set of first contacts; overwritten.
 """
