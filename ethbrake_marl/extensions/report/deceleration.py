@@ -204,7 +204,7 @@ def deceleration_figure(curve: DecelerationCurve, *, title: str = "") -> Figure:
         for (_, _, colour, dashes), harm in zip(_COUNTS, (first, total), strict=True):
             axes.axhline(harm, color=colour, linewidth=0.9, linestyle=dashes, alpha=0.7)
         proof = limits.proof
-        least = f"; proven lower bound {proof.harm[0]:.2f}"
+        least = "" if proof.harm is None else f"; proven lower bound {proof.harm[0]:.2f}"
         text = " (avoidable)" if proof.avoidable is not None and proof.avoidable[0] else least
         axes.annotate(
             f"best known harm: {first:.2f} first-impact, {total:.2f} total{text}", (0.0, max(first, total)),

@@ -25,8 +25,7 @@ from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.extensions.proofs import lower_bound as bounding
 from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
-from ethbrake_marl.extensions.proofs.ramped_meetings import onset_states
-from ethbrake_marl.extensions.proofs.team_bound import team_bound
+from ethbrake_marl.extensions.proofs.onset import onset_states
 from ethbrake_marl.extensions.report.harm_figures import harm_in_parts
 from ethbrake_marl.extensions.report.report import avoidable_section, worst_section
 from ethbrake_marl.extensions.report.three_tests import TESTS
@@ -34,7 +33,7 @@ from ethbrake_marl.extensions.search import limits, regret, shipped
 from ethbrake_marl.extensions.search.best_harm import best_harm, fold_episodes, search_list, task_problem
 from ethbrake_marl.extensions.search.extreme_profiles import KEPT, extreme_profiles
 from ethbrake_marl.extensions.search.limit_measures import LIMITS
-from ethbrake_marl.extensions.search.limits import Unproven, known_limits, prove
+from ethbrake_marl.extensions.search.limits import Proof, Unproven, known_limits, prove
 from ethbrake_marl.extensions.search.problem import search_profiles
 from ethbrake_marl.extensions.search.recall import BestHarm
 from ethbrake_marl.extensions.search.regret import limits_of, regrets_of
@@ -439,50 +438,54 @@ def test_known_limits__say_why_nothing_is_proven() -> None:
     coasts = load_scenario("cooperation-3-pair").replace(roles={"vehicle_1": "coast", "vehicle_2": "learner"})
     for task, why in (
         (Task(SCENARIO, ()), "the controlled vehicles are none; avoidability is proven for one controlled vehicle"),
-        (Task(coasts, (1, 2)), "vehicle_1 follows the script coast; harm is bounded where it follows full_brake"),
+        (
+            Task(coasts, (1, 2)),
+            "vehicle_1 follows the script coast; the best known harm holds where it follows full_brake",
+        ),
     ):
         assert known_limits(LISTED, task) == Unproven(why)
 
 
-def test_prove__decides_contact_of_vehicles_2_and_3_as_of_vehicle_2_alone() -> None:
+def test_prove__decides_contact_of_vehicles_2_and_3_as_of_vehicle_2_alone_and_bounds_one_vehicle_only() -> None:
     scenario = load_scenario("cooperation-3-pair")
     alone, both = prove(LISTED, Task(scenario, (1,))), prove(LISTED, Task(scenario, (2, 1)))
     assert np.array_equal(alone.avoidable, both.avoidable) and np.array_equal(alone.reason, both.reason)
-    assert 0.99 * alone.harm.mean() < both.harm.mean() <= alone.harm.mean()
+    assert alone.harm.mean() > 0.0 and both.harm is None and both.impact is None
+
+
+def test_prove__with_an_obstacle_decides_contact_and_bounds_no_harm() -> None:
+    scenario = load_scenario("paper-random-obstacle")
+    found = prove(scenario.sample(50, 7).worlds, Task(scenario, (1,)))
+    assert 0 < found.avoidable.sum() < 50 and found.harm is None
 
 
 @pytest.mark.parametrize(
     ("name", "vehicles"),
-    [("cooperation-4-all", (0, 1, 2)), ("cooperation-3-five", (1, 2, 3, 4)), ("cooperation-2-five", (1,))],
-)
-def test_prove__bounds_the_harm_of_other_teams_without_a_verdict_on_contact(name: str, vehicles: tuple[int]) -> None:
+    [
+        ("cooperation-4-all", (0, 1, 2)), ("cooperation-3-five", (1, 2, 3, 4)), ("cooperation-2-five", (1,)),
+        ("paper-random-buildup", (1,)),
+    ],
+)  # fmt: skip
+def test_known_limits__without_a_proof_are_the_best_known_harm(name: str, vehicles: tuple[int, ...]) -> None:
     scenario = load_scenario(name)
-    sample = scenario.sample(30, 7)
-    found = known_limits(sample.worlds, Task(scenario, vehicles))
-    assert found.proof.avoidable is None and found.proof.contact is None
-    assert np.array_equal(found.proof.harm, team_bound(sample.worlds, vehicles, horizon_s=8.0, time_step_s=0.1).harm)
+    found = known_limits(scenario.sample(30, 7).worlds, Task(scenario, vehicles))
+    assert found.proof == Proof(None, None, None) and found.proof.contact is None
     assert found.known.any() == found.known.all() == (name == "cooperation-2-five")  # for which a table ships
-    assert (found.proof.harm > 0).any() == (name != "cooperation-4-all")
 
 
-def test_evaluation__of_a_team_tells_the_proven_harm_where_contact_is_not_decided(tmp_path: Path) -> None:
+def test_evaluation__without_a_proof_shows_best_known_harm_alone(tmp_path: Path) -> None:
     scenario = load_scenario("cooperation-3-five")
     agents = {name: make_agent(name) for name in ("full_brake", "coast")}
     found = evaluate(scenario.sample(20, 7), agents, scenario=scenario)
     rows = summarise(found)
     told, text = rows[0], " ".join(LIMITS.notes(rows))
-    assert (told["unavoidable_rate"], told.more["limits"]["impact_unproven"], told["avoidable_collision_rate"]) == (
-        None,
-        None,
-        None,
-    )
-    assert 0 < told["proven_harm"].value < told["best_known_first_impact_harm"].value
-    assert told["impact_proven_rate"] is not None and told.more["limits"]["known_best_share"] == 0.0
-    assert "no joint command avoids an impact (proven)" in text and "avoids contact" not in text
+    nothing = ("unavoidable_rate", "impact_proven_rate", "avoidable_collision_rate", "proven_harm")
+    assert [told[name] for name in nothing] == [None] * 4 and told.more["limits"]["impact_unproven"] is None
+    assert told["best_known_first_impact_harm"].value > 0.0 and "proven" not in text.lower()
     write_per_world(tmp_path / "out.csv", found)
     with (tmp_path / "out.csv").open(newline="") as lines:
         cells = next(csv.DictReader(lines))
-    assert cells["avoidable"] == cells["unavoidable_reason"] == "" and float(cells["proven_harm"]) >= 0
+    assert cells["avoidable"] == cells["unavoidable_reason"] == cells["proven_harm"] == ""
     assert avoidable_section(found).title and worst_section(found, "coast", ()).title
     with pytest.raises(InvalidInput, match="the figure needs, for each world, a proof whether contact is avoidable"):
         harm_in_parts(found)
