@@ -138,7 +138,7 @@ _EXTRA_OF = {
     **dict.fromkeys(("torch", "stable_baselines3", "supersuit", "tensorboard"), "train"),
     **dict.fromkeys(("benchmarl", "torchrl", "tensordict", "hydra"), "marl"),
     **dict.fromkeys(("onnx", "onnxruntime"), "export"),
-    **dict.fromkeys(("pandas", "pyarrow", "minari", "h5py"), "data"),
+    **dict.fromkeys(("pandas", "pyarrow"), "data"),
     **dict.fromkeys(("pygame", "imageio_ffmpeg"), "render"),
     **dict.fromkeys(("ray", "optuna", "joblib"), "cluster"),
     "libsumo": "sumo",
