@@ -2,6 +2,7 @@
 
 import re
 
+import matplotlib
 import numpy as np
 import pytest
 from matplotlib.collections import PathCollection
@@ -22,7 +23,7 @@ from ethbrake_marl.extensions.report.harm_figures import harm_by_agent, harm_in_
 from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap, learning_curve
 from ethbrake_marl.extensions.report.scenario_figures import worlds_figure
 from ethbrake_marl.extensions.report.seed_curves import SeedCurve, seed_curves
-from ethbrake_marl.extensions.report.style import ShownFigure, label_text, new_figure, picture_bytes, series_style
+from ethbrake_marl.extensions.report.style import label_text, new_figure, picture_bytes, series_style
 from ethbrake_marl.extensions.search.limits import Limits, Proof
 from ethbrake_marl.extensions.search.regret import regrets_of
 from ethbrake_marl.scenario.catalogue import load_scenario
@@ -94,13 +95,19 @@ def test_figure__travels_with_its_fonts() -> None:
     assert b"/FontFile2" in pdf and b"/Type3" not in pdf
 
 
-@pytest.mark.parametrize("name", ["a.png", "a.svg"])
-def test_picture_bytes__laid_out_without_being_drawn_is_what_matplotlib_makes(
-    name: str, evaluation: Evaluation, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    "style", [{"text.color": "red", "font.size": 20}, {"axes.facecolor": "black", "axes.grid": True}]
+)
+def test_figure__is_the_same_under_any_style_of_the_user(
+    style: dict[str, object], evaluation: Evaluation, record: EpisodeRecord
 ) -> None:
-    ours = picture_bytes(learning_curve(POINTS, references=summarise(evaluation), caption="seed 3"), name)
-    monkeypatch.setattr(ShownFigure, "draw", Figure.draw)
-    assert ours == picture_bytes(learning_curve(POINTS, references=summarise(evaluation), caption="seed 3"), name)
+    def drawn() -> list[bytes]:
+        figures = trajectories({"a": record}), regret_distribution(evaluation), harm_by_agent(summarise(evaluation))
+        return [picture_bytes(figure, "a.png") for figure in figures]
+
+    ours = drawn()
+    with matplotlib.rc_context(style):
+        assert drawn() == ours
 
 
 @pytest.mark.parametrize("text", ["$x^2$", "a_b$", "\u202eabc", "测试🚗", "x" * 500, "</text><script>"])
