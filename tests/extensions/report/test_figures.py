@@ -15,7 +15,6 @@ from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.evaluation.summary import summarise
-from ethbrake_marl.extensions.cooperation.figures import signed_ticks
 from ethbrake_marl.extensions.report import deceleration as module
 from ethbrake_marl.extensions.report.deceleration import deceleration_curve, deceleration_figure
 from ethbrake_marl.extensions.report.episode_figure import trajectories
@@ -298,20 +297,6 @@ def test_curve_of_scenario_1__changes_its_regimes_at_the_known_decelerations() -
     assert spared.any()
     assert not curve.predicted[spared].any()
     assert round(float(curve.predicted[-1]), 9) == 28.98
-
-
-@pytest.mark.parametrize(
-    ("ends", "expected"),
-    [
-        ((-0.47, 0.05), [-0.2, -0.1, 0.0]),
-        ((-0.6, 0.3), [-0.3, -0.1, 0.0, 0.1, 0.3]),
-        ((-30.0, 12.0), [-10.0, -1.0, -0.1, 0.0, 0.1, 1.0, 10.0]),
-        ((-0.02, 0.0), [-0.01, -0.003, -0.001, 0.0]),
-        ((0.0, 0.0), [0.0]),
-    ],
-)
-def test_ticks__are_a_few_round_numbers(ends, expected) -> None:
-    assert signed_ticks(*ends) == expected
 
 
 @pytest.mark.parametrize(
