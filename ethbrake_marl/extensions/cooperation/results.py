@@ -116,48 +116,42 @@ def _seed_row(one: Measured, seed: int, searched: int) -> Json:
 
 
 def tables(results: Json) -> list[Sheet]:
-    """Return the tables of an ablation for the terminal; a table without rows is left out."""
-    swept = swept_axis(results)
-    number = [] if swept is None else [(Column(swept), "swept_number")]
-    about: _Columns = [(Column("Level", text=True), "level"), *number, (Column("Algorithm", text=True), "algorithm")]
-    changed: _Columns = [(Column(name, text=True), name.lower()) for name in ("From", "To", "Algorithm")]
-    levels, searched, changes, shields = (
-        [*about, (_share("Collisions"), "collision_rate")],
-        [*about],
-        [*changed],
-        [*about],
-    )
+    """Return the tables of an ablation for the terminal, for each count of harm; a table without rows is left out."""
+    swept, levels = swept_axis(results), results["levels"]
+    several = len({level["algorithm"] for level in levels} - {None}) > 1
+    algorithm: _Columns = [(Column("Algorithm", text=True), "algorithm")] if several else []
+    about: _Columns = [(Column("Level", text=True), "level") if swept is None else (Column(swept), "swept_number")]
+    from_to: _Columns = [(Column(name, text=True), name.lower()) for name in ("From", "To")]
+    if swept is not None:
+        from_to = [(Column(f"{swept}, from"), "from_number"), (Column("To"), "to_number")]
+    worlds = count_of(levels[0]["first"]["searched"]["worlds"], "world")
+    known = [level for level in levels if level["first"]["searched"]["best_known"] is not None]
+    sheets = []
     for count in HARM_COUNTS:
         harm = HARM[count]
-        levels += [
-            (Column(f"All brake fully, {harm}"), f"{count} full_brake value"),
-            (Column(f"Reached, {harm}"), f"{count} harm"),
-        ]
-        searched += [
-            (Column(f"Reached, {harm}"), f"{count} searched harm value"),
-            (Column(f"Joint optimum, {harm}"), f"{count} searched best_known value"),
-            (_share("Share of its reduction"), f"{count} searched share_of_possible_reduction"),
-        ]
-        changes += [
-            (Column(f"Change of {harm}", sign="+"), f"{count} difference"),
+        changes = [
+            *from_to, *algorithm, (Column("Change", sign="+"), f"{count} difference"),
             (_share("Somebody worse off"), f"{count} worse_off"),
-        ]
-        shields += [
-            (Column(f"Without, {harm}"), f"{count} harm value"),
-            (Column(f"With, {harm}"), f"{count} shielded harm value"),
-            (Column("Bound"), f"{count} shielded bound value"),
-            (_share("Replaced"), f"{count} shielded replaced"),
-        ]
-    every = results["levels"]
-    worlds = count_of(every[0]["first"]["searched"]["worlds"], "world")
-    known = [level for level in every if level["first"]["searched"]["best_known"] is not None]
-    sheets = [
-        _sheet("Levels", every, levels),
-        _sheet(f"How near the joint optimum, in the first {worlds}", known, searched),
-        _sheet("What each step is worth", results["steps"], changes),
-        _sheet("Price of messages that are lost or tell less", results["channels"], changes),
-        _sheet("Behind the step shield", [level for level in every if level["first"]["shielded"]], shields),
-    ]
+        ]  # fmt: skip
+        sheets += [
+            _sheet(f"Levels, {harm}", levels, [
+                *about, *algorithm, (_share("Collisions"), "collision_rate"),
+                (Column("All brake fully"), f"{count} full_brake value"), (Column("Reached"), f"{count} harm"),
+            ]),
+            _sheet(f"How near the joint optimum, {harm} in the first {worlds}", known, [
+                *about, *algorithm, (Column("All brake fully"), f"{count} searched full_brake value"),
+                (Column("Reached"), f"{count} searched harm value"),
+                (Column("Joint optimum"), f"{count} searched best_known value"),
+                (_share("Share of its reduction"), f"{count} searched share_of_possible_reduction"),
+            ]),
+            _sheet(f"What each step is worth, {harm}", results["steps"], changes),
+            _sheet(f"Price of messages that are lost or tell less, {harm}", results["channels"], changes),
+            _sheet(f"Behind the step shield, {harm}", [level for level in levels if level["first"]["shielded"]], [
+                *about, *algorithm, (Column("Without"), f"{count} harm value"),
+                (Column("With"), f"{count} shielded harm value"), (Column("Bound"), f"{count} shielded bound value"),
+                (_share("Replaced"), f"{count} shielded replaced"),
+            ]),
+        ]  # fmt: skip
     return [sheet for sheet in sheets if sheet.rows]
 
 
