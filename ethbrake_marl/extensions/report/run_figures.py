@@ -70,15 +70,14 @@ def learning_curve(
 
 
 @in_our_style
-def harm_against_total_gap(evaluation: Evaluation, *, agents: Sequence[str] | None = None, bins: int = 12) -> Figure:
+def harm_against_total_gap(evaluation: Evaluation, *, bins: int = 12) -> Figure:
     """Draw mean first-impact harm and mean total harm against the sum of the gaps at the alert.
 
     The figure has a line for each agent, with a band that shows the 95 % interval of the mean. Raises ``InvalidInput``
-    if an agent is unknown or ``bins`` is below 1.
+    if ``bins`` is below 1.
 
     Args:
         evaluation: evaluation of the agents.
-        agents: names of the agents to draw; None: all agents.
         bins: number of intervals of equal width into which the sum of the gaps is divided.
 
     """
@@ -91,7 +90,7 @@ def harm_against_total_gap(evaluation: Evaluation, *, agents: Sequence[str] | No
     sum_of_gaps = " + ".join(gaps) if len(gaps) <= 3 else f"d1 + … + {gaps[-1]}"
     figure, panels = new_panels((10.0, 4.6), columns=2, sharey=True)
     for axes, (name, label) in zip(panels, _PANELS[:2], strict=True):
-        for number, agent in enumerate(evaluation.outcomes if agents is None else agents):
+        for number, agent in enumerate(evaluation.outcomes):
             harm, style = getattr(evaluation.outcome(agent), name), series_style(number)
             estimates = [mean(harm[group], None if by is None else by[group]) for group in groups]
             at = [float(gap[group].mean()) for group in groups]

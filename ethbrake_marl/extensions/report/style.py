@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import matplotlib
 import matplotlib.style
@@ -114,21 +114,15 @@ def name_axes(axes: Axes, title: str = "", x: str = "", y: str = "") -> None:
 
 
 def finish(
-    figure: Figure,
-    caption: str,
-    legend: Axes | None = None,
-    *,
-    columns: int = 6,
-    fontsize: float = 9,
-    loc: Literal["outside upper left", "outside upper right"] = "outside upper left",
+    figure: Figure, caption: str, legend: Axes | None = None, *, columns: int = 6, fontsize: float = 9
 ) -> Figure:
     """Add a caption and the legend of one panel (None: no legend) to a figure, and return the figure.
 
-    ``columns``, ``fontsize`` and ``loc`` are for the legend.
+    ``columns`` and ``fontsize`` are for the legend.
     """
     if legend is not None:
         named = legend.get_legend_handles_labels()
-        figure.legend(*named, loc=loc, ncols=columns, frameon=False, fontsize=fontsize)
+        figure.legend(*named, loc="outside upper left", ncols=columns, frameon=False, fontsize=fontsize)
     add_caption(figure, caption)
     return figure
 

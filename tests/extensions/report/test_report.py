@@ -13,7 +13,7 @@ from ethbrake_marl.errors import AlreadyExists, plain_text
 from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.report import page as page_module
 from ethbrake_marl.extensions.report.page import Page as Sections, Part, Section, read_file
-from ethbrake_marl.extensions.report.paper_rows import summarise_beside_paper
+from ethbrake_marl.extensions.report.paper_rows import with_paper_rows
 from ethbrake_marl.extensions.report.report import Report, shield_section
 from ethbrake_marl.extensions.report.shown_worlds import choose_shown, worst_rows
 from ethbrake_marl.extensions.report.style import add_caption, new_figure
@@ -23,7 +23,6 @@ from ethbrake_marl.game.harm import HarmCount
 from tests.evaluation.test_rollout import left_out_by
 from tests.evaluation.test_shield_modes import pair_modes
 from tests.fixtures.page import HOSTILE, UNSEEN, Page
-from tests.fixtures.pictures import draw_nothing
 
 
 def whole_page(text: str) -> str:
@@ -104,7 +103,7 @@ def report(evaluation: eb.Evaluation) -> Report:
     part = replace(evaluation, outcomes={name: evaluation.outcome(name) for name in agents})
     return Report(
         title="PPO on paper-random",
-        rows=summarise_beside_paper(part),
+        rows=with_paper_rows(eb.summarise(part)),
         evaluation=part,
         figures=[Part.drawing(new_figure(4.0, 3.0), "Learning curve", "Harm over steps.")],
         tests=[("paper-other", "Another test.", eb.summarise(evaluation))],
@@ -279,15 +278,8 @@ def test_chosen__begin_with_those_of_the_largest_regret_and_say_whose_harm_it_is
     assert harm[worst_rows(result, "coast")].tolist() == sorted(harm, reverse=True)[:10]
 
 
-@pytest.mark.parametrize(
-    "first", [pytest.param(k, marks=pytest.mark.slow if k else ()) for k in range(0, len(HOSTILE), 24)]
-)
-def test_report__hostile_names_are_text_everywhere(
-    pair: eb.Scenario, first: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if first:  # one page with its figures is enough: these hold names as outlines only
-        draw_nothing(monkeypatch)
-    names = [text[:200] for text in HOSTILE[first : first + 24]]
+def test_report__hostile_names_are_text_everywhere(pair: eb.Scenario) -> None:
+    names = [text[:200] for text in HOSTILE]
     agents = {name: eb.make_agent("constant:4") for name in names}
     result = eb.evaluate(pair.sample(3, 0), agents, scenario=pair)
     words, told = " ".join(names), {name: name for name in names}
