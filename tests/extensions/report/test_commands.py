@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from ethbrake_marl.errors import _EXTRA_OF
-from ethbrake_marl.evaluation.identity import LIST_SEED
 from tests.cli.test_watch import check_extra
 from tests.files.test_files import check_target
 from tests.fixtures.commands import Command, Refuse, check_refused, told_json
@@ -71,10 +70,6 @@ def test_target__that_cannot_be_replaced_is_refused_before_any_work(
 def test_report__is_imported_where_no_package_of_an_extra_can_be() -> None:
     absent = "".join(f"sys.modules[{name!r}] = None\n" for name in sorted(_EXTRA_OF))
     assert ended(f"import sys\n{absent}from ethbrake_marl.extensions import report") == (0, "", "")
-
-
-def test_help__of_watch_says_the_list_that_the_package_has(ethbrake: Command) -> None:
-    assert f"[default: {LIST_SEED}]" in ethbrake("watch", "--help").out
 
 
 def test_film__of_an_extra_that_is_missing_says_the_line_that_installs_it(ethbrake: Command, monkeypatch) -> None:

@@ -235,11 +235,6 @@ def test_report__says_below_its_first_sentence_what_must_not_be_overlooked(
     assert 'class="remarks"' not in summed_up(paper_random, "full_brake").html
 
 
-def test_report__says_once_what_contact_impact_and_collision_are(html: str) -> None:
-    (box,) = re.findall(r'<aside class="box">(.*?)</aside>', html, re.DOTALL)
-    assert re.findall(r"<dt>(.*?)</dt>", box) == ["Contact", "Impact", "Collision"]
-
-
 def episode_data(html: str) -> dict:
     """The numbers that the player shows."""
     (text,) = re.findall(r'<script type="application/json" id="episode_data">(.*?)</script>', html)
