@@ -27,7 +27,6 @@ from ethbrake_marl.extensions.proofs import lower_bound as bounding
 from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
 from ethbrake_marl.extensions.proofs.ramped_meetings import onset_states
 from ethbrake_marl.extensions.proofs.team_bound import team_bound
-from ethbrake_marl.extensions.report.harm_figures import harm_in_parts
 from ethbrake_marl.extensions.report.report import avoidable_section, worst_section
 from ethbrake_marl.extensions.report.three_tests import TESTS
 from ethbrake_marl.extensions.search import limits, regret
@@ -485,5 +484,3 @@ def test_evaluation__of_a_team_tells_the_proven_harm_where_contact_is_not_decide
         cells = next(csv.DictReader(lines))
     assert cells["avoidable"] == cells["unavoidable_reason"] == "" and float(cells["proven_harm"]) >= 0
     assert avoidable_section(found).title and worst_section(found, "coast", ()).title
-    with pytest.raises(InvalidInput, match="the figure needs, for each world, a proof whether contact is avoidable"):
-        harm_in_parts(found)
