@@ -139,7 +139,7 @@ _EXTRA_OF = {
     **dict.fromkeys(("matplotlib", "jinja2", "markupsafe"), "report"),
     **dict.fromkeys(("benchmarl", "torchrl", "tensordict", "hydra"), "marl"),
     **dict.fromkeys(("onnx", "onnxruntime"), "export"),
-    **dict.fromkeys(("pandas", "pyarrow", "minari", "h5py"), "data"),
+    **dict.fromkeys(("pandas", "pyarrow"), "data"),
     **dict.fromkeys(("pygame", "imageio_ffmpeg"), "render"),
     **dict.fromkeys(("ray", "joblib"), "cluster"),
     "optuna": "tune",

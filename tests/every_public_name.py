@@ -14,7 +14,7 @@ from ethbrake_marl.extensions.cooperation import (
     find_equilibria,
     price_of_anarchy,
 )
-from ethbrake_marl.extensions.datasets.minari import write_dataset
+from ethbrake_marl.extensions.datasets import to_parquet
 from ethbrake_marl.extensions.hosts.protocol import Host, HostCommand, HostFailed, HostState, drive_host
 from ethbrake_marl.extensions.report.deceleration import deceleration_curve, deceleration_figure
 from ethbrake_marl.extensions.report.episode_figure import trajectories
@@ -104,7 +104,7 @@ def measure(folder: Path) -> list[eb.SummaryRow]:
     outcome: eb.Outcome = found.outcome("learned")
     record: eb.EpisodeRecord = eb.record_episode(found.worlds.take([0]), Cautious(), scenario=scenario)
     assert record.ledger.world_harm("first").shape == outcome.first_impact_harm[:1].shape
-    write_dataset(folder / "brakes.parquet", agents, scenario=scenario, episodes=10, format="parquet")
+    to_parquet(folder / "brakes.parquet", agents, scenario=scenario, episodes=10)
     return eb.summarise(found)
 
 

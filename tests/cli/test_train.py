@@ -14,8 +14,6 @@ import onnx
 import pytest
 
 from ethbrake_marl.cli.command import Out
-from ethbrake_marl.progress import OnProgress
-from ethbrake_marl.training.experiment import Experiment, RunReport
 from tests.fixtures.commands import Command, check_refused, rows_of, told_json
 
 AGENTS = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "trained policy", "hybrid"]
@@ -228,19 +226,6 @@ def test_resume__deletes_the_results_of_the_policy_before_and_nothing_else(
     there = {path.name for path in folder.iterdir()}
     assert not there & written and {"notes.txt", "policy", "config.json"} <= there
     assert (tmp_path / "precious.txt").exists()
-
-
-def test_run__whose_further_training_was_interrupted_ends_with_130(
-    ethbrake, tiny_recipe, tmp_path, monkeypatch
-) -> None:
-    def make(experiment: Experiment, tell: OnProgress) -> RunReport:
-        return RunReport(("a table",), "report: here", "the training alone/vehicle_3")
-
-    monkeypatch.setattr("ethbrake_marl.training.experiment.RUN_REPORTS", {"mine": make})
-    answer = ethbrake("run", "--recipe", tiny_recipe, "--episodes", "20", "--output", tmp_path / "run")
-    assert answer.status == 130 and "a table" in answer.out
-    told = "interrupted: the training alone/vehicle_3; the report does not include it: "
-    assert answer.err.splitlines()[-1].startswith(told)
 
 
 # Learning curves

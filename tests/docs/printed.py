@@ -188,7 +188,7 @@ TABLES: dict[str, How] = {
 }
 
 PICTURES: dict[str, How] = {
-    "emergency.svg": _by(NIGHTLY, "ethbrake watch --agents full_brake,universal --output emergency.svg"),
+    "emergency.png": _by(NIGHTLY, "ethbrake watch --agents full_brake,universal --output emergency.png"),
     "game-loop.svg": _by(BY_HAND),
     "front": _by(SEARCH),
     "model-": _by(SUITE, "tests/docs/test_studies.py"),

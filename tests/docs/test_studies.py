@@ -393,4 +393,4 @@ def test_ablate_cooperation__its_file_and_commands_make_what_it_says(tmp_path: P
         )
         assert done.returncode == 0, command
     made = {path.name for path in (tmp_path / "runs" / "mine").iterdir()}
-    assert {"ablation.html", "ablation.md", "ablation.csv", "settings.json", "trainings", "optimum"} <= made
+    assert {"ablation.json", "ablation.csv", "ablation.png", "settings.json", "trainings", "optimum"} <= made

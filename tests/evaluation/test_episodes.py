@@ -1,4 +1,4 @@
-"""Single episodes: recorded, as exact motion, as a film; and datasets of them, Parquet and Minari."""
+"""Single episodes: recorded, and as exact motion."""
 
 from typing import Any
 
@@ -141,24 +141,6 @@ def test_motion__cascade_of_bounces_stays_small_and_ends_right(pair: eb.Scenario
     (motion,) = follow_episodes(bouncy.sample(1, 0).worlds, make_agent("coast"), bouncy)
     assert len(motion.impacts.time_s) > 10 and (np.diff(motion.pieces[:, 0]) > 0.0).all()
     np.testing.assert_allclose(at(motion, motion.end_s)[1], motion.final.gaps_m[0, 0], atol=1e-6)
-
-
-# ---------------------------------------------------------------- films
-
-
-# ---------------------------------------------------------------- datasets
-
-
-# ---------------------------------------------------------------- recording
-
-
-# ---------------------------------------------------------------- Parquet
-
-
-# ---------------------------------------------------------------- Minari
-
-
-# ---------------------------------------------------------------- writing
 
 
 def test_record__a_vehicle_pushed_above_its_speed_limit_goes_on() -> None:

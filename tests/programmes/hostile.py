@@ -198,7 +198,7 @@ VARIABLES = (
 LINES = (
     "scenario show @", "scenario new @", "compare @ @", "train --resume @", "@",
     "evaluate --episodes 3 --set @", "evaluate --episodes 3 --set mass_t=@", "evaluate --episodes 3 --set harm_count=@",
-    "evaluate --no@", "train --recipe @", "watch --agents coast --output @.svg",
+    "evaluate --no@", "train --recipe @", "watch --agents coast --output @.png",
     "shield --episodes 3 --agents @", "agent export @ --onnx x.onnx", "study falsify --budget 10 --scenario @",
     "study ablate --levels @ --output o",
 )  # fmt: skip

@@ -16,7 +16,7 @@ from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_h
 from ethbrake_marl.envs.rendering import COLOURS
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.conditions import Conditions
-from ethbrake_marl.extensions.report.style import GREY, finish, name_axes, new_figure, style_axes
+from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, name_axes, new_figure, style_axes
 from ethbrake_marl.extensions.search.best_harm import scripted_commands
 from ethbrake_marl.extensions.search.limits import Limits, Unproven, known_limits
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
@@ -156,6 +156,7 @@ _REGIMES = {  # colour and meaning of each regime
 }
 
 
+@in_our_style
 def deceleration_figure(curve: DecelerationCurve, *, title: str = "") -> Figure:
     """Draw predicted and simulated harm of one world against the constant deceleration of one vehicle.
 

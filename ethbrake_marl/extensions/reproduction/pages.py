@@ -55,7 +55,7 @@ def _account(results: Sequence[Result]) -> tuple[str, str, str, list[str]]:
 def render_page(folder: Path, results: Sequence[Result]) -> str:
     """Return the page with all results as HTML text. ``folder`` contains their figures.
 
-    Raises ``InvalidInput`` if a figure is missing, or if its file is not an SVG figure of this package.
+    Raises ``InvalidInput`` if a figure is missing.
     """
     lead, command, count, few = _account(results)
     _, *names = Page.anchors(["Overview", *(result.title for result in results)])
@@ -86,8 +86,8 @@ def _section(folder: Path, result: Result) -> Section:
     facts = Part.facts({name: value for name, value in account.items() if value})
     body: list[str | Part] = [result.what, facts, *result.notes]
     for drawn in result.figures:
-        file = folder / result.name / f"{drawn.stem}.svg"
-        body.append(Part.drawing(read_plain(file, LIMIT_BYTES), drawn.title, drawn.text, where=file))
+        picture = read_plain(folder / result.name / f"{drawn.stem}.svg", LIMIT_BYTES)
+        body.append(Part.drawing(picture, drawn.title, drawn.text))
     for item in ITEMS:
         if item.name == result.name and item.play is not None:
             body += [Part.heading("Episodes"), item.play()]

@@ -11,9 +11,7 @@ from ethbrake_marl.extensions.reproduction.folder import Reproduction
 from ethbrake_marl.extensions.reproduction.items import read_results
 from ethbrake_marl.extensions.reproduction.learning_curves import LearningCurves
 from ethbrake_marl.extensions.reproduction.making import make_items, open_folder
-from ethbrake_marl.extensions.reproduction.pages import render_page
-from tests.extensions.reproduction.test_reproduction import drawn, made, planted
-from tests.fixtures.pictures import draw_nothing
+from tests.extensions.reproduction.test_reproduction import made, planted
 from tests.refused import refused
 
 
@@ -65,34 +63,6 @@ def test_result__that_was_changed_is_made_again(where: str, changes: dict[str, A
             Reproduction("quick", Path("out"), 24, machine="a machine"),
             [planted("harm-delays", lambda settings: made())],
         )
-
-
-@pytest.mark.parametrize(
-    "svg",
-    [
-        "<script>alert(1)</script>",
-        '<g onload="alert(1)"/>',
-        '<g style="onload: alert(1)"/>',
-        '<use href="#x"/>',
-        '<use xmlns:l="http://www.w3.org/1999/xlink" l:href="https://example.org/x.svg#x"/>',
-        '<path fill="url(https://example.org/x)"/>',
-        '<path style="fill: URL(https://example.org/x)"/>',
-        "<foreignObject/>",
-        '<g xmlns="http://www.w3.org/1999/xhtml"/>',
-        "<g>",
-        "<g>" * 20_000 + "</g>" * 20_000,
-    ],
-    ids=lambda svg: svg[:40],
-)
-def test_figure__that_is_more_than_lines_is_not_shown(
-    svg: str, empty_folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with monkeypatch.context() as patch:
-        draw_nothing(patch)
-        results = reproduced(drawn(), {})
-    Path("out/gaps/a-figure.svg").write_text(f'<svg xmlns="http://www.w3.org/2000/svg">{svg}</svg>')
-    with refused("out/gaps/a-figure.svg: the file is not an SVG figure of this package; draw the figure"):
-        render_page(Path("out"), results)
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,6 @@ from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.extensions.proofs import lower_bound as bounding
 from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
 from ethbrake_marl.extensions.proofs.onset import onset_states
-from ethbrake_marl.extensions.report.harm_figures import harm_in_parts
 from ethbrake_marl.extensions.report.report import avoidable_section, worst_section
 from ethbrake_marl.extensions.report.three_tests import TESTS
 from ethbrake_marl.extensions.search import limits, regret, shipped
@@ -487,5 +486,3 @@ def test_evaluation__without_a_proof_shows_best_known_harm_alone(tmp_path: Path)
         cells = next(csv.DictReader(lines))
     assert cells["avoidable"] == cells["unavoidable_reason"] == cells["proven_harm"] == ""
     assert avoidable_section(found).title and worst_section(found, "coast", ()).title
-    with pytest.raises(InvalidInput, match="the figure needs, for each world, a proof whether contact is avoidable"):
-        harm_in_parts(found)
