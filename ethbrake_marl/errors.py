@@ -141,7 +141,6 @@ _EXTRA_OF = {
     **dict.fromkeys(("pandas", "pyarrow", "minari", "h5py"), "data"),
     **dict.fromkeys(("pygame", "imageio_ffmpeg"), "render"),
     **dict.fromkeys(("ray", "optuna", "joblib"), "cluster"),
-    "libsumo": "sumo",
 }
 
 

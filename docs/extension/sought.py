@@ -12,7 +12,8 @@ SOUGHT = {
     "evaluate": "evaluation compare agents statistics confidence interval baselines e-v2x-bm e v2x bm",
     "shield": "shield my own policy safety wrap guarantee",
     "cooperation": "cooperation levels level v2x latency delay messages communication channel loss knows",
-    "extend": "extending plugin package entry point custom agent algorithm register own policy onnx torch load",
+    "extend": "extending plugin package entry point custom agent algorithm register own policy onnx torch load"
+    " carla sumo highway-env another simulator",
     "findings": "results figures related work paper",
     "extensions/benchmarl": "train benchmarl",
     "extensions/certified": "robust uncertainty intervals estimated",
@@ -20,7 +21,6 @@ SOUGHT = {
     "extensions/datasets": "offline parquet minari imitation",
     "extensions/field": "idm acc cacc rss r157 aeb",
     "extensions/fronts": "whose harm pareto trade-off",
-    "extensions/hosts": "carla sumo hardware bench simulator",
     "extensions/learners": "vine rollout classification mixture experts",
     "extensions/proofs": "regret avoidability unavoidable lower bound",
     "extensions/recorded": "highd ngsim openacc traffic trajectories",
