@@ -27,7 +27,7 @@ SOUGHT = {
     "extensions/report": "html figures film picture",
     "extensions/reproduction": "reproduce replicate paper results",
     "extensions/search": "best known optimum optimal planner",
-    "extensions/studies": "hyperparameters optuna tuning sweep parallel seeds ray slurm cluster falsify worst",
+    "extensions/studies": "hyperparameters optuna tuning sweep parallel seeds ray cluster falsify worst",
     "internals/model": "physics collision restitution friction units",
     "internals/paper": "equations differences",
     "reference/cli": "commands options",

@@ -349,8 +349,6 @@ def test_version__is_the_same_wherever_it_stands() -> None:
     [
         ("scenario schema", "scenarios/scenario"),
         ("train --schema", "train/recipe"),
-        ("study sweep --schema", "docs/sweep"),
-        ("study tune --schema", "docs/tuning"),
     ],
 )
 def test_schema__that_ships_is_printed_by_the_command_and_named_by_templates_and_examples(
