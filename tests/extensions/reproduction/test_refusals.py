@@ -9,7 +9,6 @@ import pytest
 from ethbrake_marl.errors import AlreadyExists
 from ethbrake_marl.extensions.reproduction.folder import Reproduction
 from ethbrake_marl.extensions.reproduction.items import read_results
-from ethbrake_marl.extensions.reproduction.learning_curves import LearningCurves
 from ethbrake_marl.extensions.reproduction.making import make_items, open_folder
 from ethbrake_marl.extensions.reproduction.pages import render_page
 from tests.extensions.reproduction.test_reproduction import drawn, made, planted
@@ -93,19 +92,6 @@ def test_figure__that_is_more_than_lines_is_not_shown(
     Path("out/gaps/a-figure.svg").write_text(f'<svg xmlns="http://www.w3.org/2000/svg">{svg}</svg>')
     with refused("out/gaps/a-figure.svg: the file is not an SVG figure of this package; draw the figure"):
         render_page(Path("out"), results)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("ppo", "recipes 'ppo': 'ppo' must have the form RECIPE:SEEDS (number of seeds), for instance"),
-        ("ppo:0", "recipes 'ppo:0': 'ppo:0' must have the form RECIPE:SEEDS"),
-        ("ppo:2,ppo:3", "recipes 'ppo:2,ppo:3': two recipes have the same name"),
-    ],
-)
-def test_recipes_of_learning_curves__are_refused(text: str, message: str) -> None:
-    with refused(message):
-        LearningCurves.parse(text)
 
 
 def test_reproduction__is_written_to_a_folder_of_its_own(empty_folder: Path) -> None:
