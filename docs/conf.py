@@ -34,12 +34,7 @@ nb_ipywidgets_js: dict[str, dict[str, str]] = {}  # the site loads nothing; slid
 html_theme = "furo"
 html_title = f"ethbrake_marl {__version__}"
 html_favicon = "figures/favicon.svg"
-html_extra_path = [
-    "../scenarios/scenario.schema.json",
-    "../train/recipe.schema.json",
-    "sweep.schema.json",
-    "tuning.schema.json",
-]
+html_extra_path = ["../scenarios/scenario.schema.json", "../train/recipe.schema.json"]
 html_static_path = ["static"]
 html_css_files = ["site.css"]
 html_search_scorer = str(Path(__file__).parent / "static" / "search.js")

@@ -70,7 +70,7 @@ def groups() -> dict[str, dict[str, list[str]]]:
 
 
 def names_of_extensions() -> dict[str, list[str]]:
-    """Extension -> what its ``__init__`` offers: ``extensions.hosts.drive_host``."""
+    """Extension -> what its ``__init__`` offers: ``extensions.certified.parse_uncertainty``."""
     found = {}
     for file in sorted(PACKAGE.glob("extensions/*/__init__.py")):
         names = re.findall(r"\b(\w+) as \1\b", file.read_text("utf-8"))

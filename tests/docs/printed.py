@@ -147,7 +147,7 @@ BLOCKS: dict[str, How] = {
     "ethbrake train": _by(SUITE, "tests/test_imports.py"),
     "agent,world,impacts,first_impact_harm,total_harm": TUTORIAL,
     "-1.0 26.97": TUTORIAL,
-    "6.07 0": _by(SUITE, "tests/extensions/hosts/test_hosts.py"),
+    "6.08 7.43 0": _by(SUITE, "tests/extensions/report/test_extending.py"),
     "ethbrake train --scenario cooperation-3-pair": TRAINED,
     "ethbrake agent export runs/early": TRAINED,
     "Agent,                           First-impact": _by(TRAINING, "make run"),
@@ -174,7 +174,6 @@ TABLES: dict[str, How] = {
     ),
     "| no. | label | the paper": _by(BY_HAND),
     "| `--draw` | harm of `full_brake`": _by(SUITE, "tests/extensions/recorded/test_recorded.py"),
-    "| agent | our physics | SUMO": _by(SUITE, "tests/extensions/hosts/test_sumo.py"),
     "| work | has | lacks": _by(BY_HAND),
     "| `--sweep` | values that are compared": _by(BY_HAND),
     "| agent | what it does | knows": _by(

@@ -345,13 +345,7 @@ def test_version__is_the_same_wherever_it_stands() -> None:
 
 
 @pytest.mark.parametrize(
-    ("command", "file"),
-    [
-        ("scenario schema", "scenarios/scenario"),
-        ("train --schema", "train/recipe"),
-        ("study sweep --schema", "docs/sweep"),
-        ("study tune --schema", "docs/tuning"),
-    ],
+    ("command", "file"), [("scenario schema", "scenarios/scenario"), ("train --schema", "train/recipe")]
 )
 def test_schema__that_ships_is_printed_by_the_command_and_named_by_templates_and_examples(
     command: str, file: str, capsys: pytest.CaptureFixture[str]

@@ -208,12 +208,6 @@ def test_step__that_a_guard_rolls_back_leaves_the_impacts_as_they_were() -> None
         assert guarded.step(np.zeros((1, 1))).reward.tobytes() == free.step(np.zeros((1, 1))).reward.tobytes()
 
 
-def test_place__is_refused_as_nobody_knows_the_impacts() -> None:
-    engine = eb.make_engine(CRASH, 1, reward=INJURY)
-    with refused("place: the reward needs all impacts of an episode (for injury_lr4s)"):
-        engine.place(engine.worlds)
-
-
 # ---------------------------------------------------------------- by step
 
 

@@ -25,6 +25,9 @@ OVERLAPPING = replace(line([0.0, 8.0], [1e-9, 0.0, 8.0]), gaps_m=np.array([[-2.0
 WORLDS: dict[str, Callable[[], object]] = {
     "gaps_m[0, 1] = -0.5: must be finite and in [0, inf]": lambda: line([5.0, -0.5], [9.0, 9.0, 9.0]),
     "gaps_m[0, 1] = inf: must be finite and in [0, inf]": lambda: line([5.0, inf], [9.0, 9.0, 9.0]),
+    "gaps_m[0, 1] = -1: must be finite and in [0, inf]": lambda: line([5.0, 6.0], [9.0, 9.0, 9.0]).running(
+        1.0, [1.0, -1.0], 3.0
+    ),
     "speeds_mps[0, 1] = nan: must be finite and in [0, inf]": lambda: line([5.0, 6.0], [10.0, nan, 1.0]),
     "speeds_mps[1, 2] = 65: must be at most this vehicle's speed_limit_mps 64": lambda: line(
         [5.0, 6.0], [[1.0, 2.0, 3.0], [1.0, 2.0, 65.0]]

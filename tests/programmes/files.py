@@ -1,6 +1,6 @@
 """Hostile text files, and folders that were edited, exchanged, truncated or invented.
 
-Scenarios, recipes, sweeps, tunings, named worlds and tables of states are changed in the same ways: invalid YAML, wrong
+Scenarios, recipes, named worlds and tables of states are changed in the same ways: invalid YAML, wrong
 YAML, exchanged values, and the changes of their own keys that ``hostile.yaml`` lists. Policy bundles and run folders
 have their own changes.
 """
@@ -26,8 +26,6 @@ import yaml
 import ethbrake_marl as eb
 from ethbrake_marl.evaluation.varying import states_of
 from ethbrake_marl.extensions.studies.named_worlds import NamedWorld, NamedWorlds
-from ethbrake_marl.extensions.studies.sweep import SweepPlan
-from ethbrake_marl.extensions.studies.tuning import TuningPlan
 from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.policies.manifest import content_sha256
 from ethbrake_marl.policies.shipped import shipped_policies
@@ -79,28 +77,6 @@ reward: {harm: 1.0}
 seed: 3
 evaluation: {every_updates: 1, worlds: 10, seed: 7}
 checkpoint_every_updates: 100
-"""
-SWEEP = """title: Two jobs and one
-set: {total_steps: 256}
-grid:
-  scenario: [paper-random]
-  recipe: [quick]
-  seed: {first: 0, count: 2}
-  set:
-    gamma: [0.99, 0.995]
-jobs:
-  - {scenario: paper-random, recipe: ppo, seed: 0}
-"""
-TUNING = """title: Two settings of the quick recipe
-scenario: paper-random
-recipe: quick
-set: {total_steps: 256}
-search:
-  learning_rate.start: {low: 0.0001, high: 0.1, log: true}
-  network.policy: {choices: [[8], [16, 8]]}
-measure: {worlds: 10, seed: 11, times: 2}
-prune: {after_trials: 2, after_times: 1}
-sampler: {random_trials: 3}
 """
 NOT_FINITE = (
     ".nan", ".NaN", ".NAN", ".inf", "-.inf", "+.INF", ".Inf", "nan", "NaN", "inf", "-Infinity", "Infinity", "1e999",
@@ -359,16 +335,12 @@ def texts() -> dict[str, Text]:
     """Return all kinds of text files."""
     both, own = {**OF_EVERY_FILE, **WITH_NUMBERS}, {**UNCERTAIN, **SLOW}
     train = ("train", "--recipe", "mine.yaml", "--output", "taken")
-    sweep = ("study", "sweep", "mine.yaml", "--output", "taken", "--jobs", "1")
-    tune = ("study", "tune", "mine.yaml", "--output", "taken")
     states = ("read-states", "mine.csv")
     again = ("study", "falsify", "--again", "mine.yaml")
     paper = eb.load_scenario("paper-random")
     return {
         "scenario": Text(SCENARIO, ("scenario", "validate", "mine.yaml"), eb.load_scenario, 25, both, own),
         "recipe": Text(RECIPE, train, eb.load_recipe, 28, both, UNCERTAIN),
-        "sweep": Text(SWEEP, sweep, SweepPlan.read),
-        "tuning": Text(TUNING, tune, TuningPlan.read),
         "worlds": Text(worlds_text(), again, lambda path: NamedWorlds.read(path).worlds_of(paper, "x")),
         "CSV": Text(
             STATES, states, partial(read_worlds, paper), 10, CSV, {"damaged": UNCERTAIN["damaged"]}, "mine.csv"

@@ -254,7 +254,7 @@ def commands(rng: random.Random) -> Iterator[Case]:
 
 
 KINDS: dict[str, Generator] = {
-    **{kind: partial(text_cases, kind) for kind in ("scenario", "recipe", "sweep", "worlds", "tuning", "CSV")},
+    **{kind: partial(text_cases, kind) for kind in ("scenario", "recipe", "worlds", "CSV")},
     "table": table_cases,
     "place": places,
     "bundle": bundle_cases,
@@ -316,8 +316,6 @@ WARM = (
       for command, file, rest in (
           ("scenario validate", "scenario.yaml", ""),
           ("train --recipe", "recipe.yaml", " --output file"),
-          ("study sweep", "sweep.yaml", " --output file"),
-          ("study tune", "tuning.yaml", " --output file"),
           ("study falsify --again", "worlds.yaml", ""),
       )),
     "train --resume ppo", "train --resume sac", "nonsense", "shield --agents x",

@@ -127,7 +127,7 @@ def sweep_levels(name: str, sweep: str, settings: Sequence[Override], recipes: S
         key = values[0].key
         raise InvalidInput(
             f"--sweep {key}: this is a key of a recipe, but only a key of a scenario can be swept; to vary a recipe,"
-            " use ethbrake study sweep"
+            " write a recipe for each value, and use train/sweep.py"
         )
     key, path = scenario[0].key, scenario[0].path
     if path[0] in _LINE:

@@ -128,8 +128,6 @@ def limits_of(evaluation: Evaluation) -> Limits | Unproven:
 
 
 def _limits(evaluation: Evaluation) -> Limits | Unproven:
-    if evaluation.host:
-        return Unproven(f"{evaluation.host} simulated the worlds; the proofs assume the physics of this package")
     limits = known_limits(evaluation.worlds, evaluation.task)
     if isinstance(limits, Limits) and limits.warning:
         warnings.warn(limits.warning, IncompleteTable, stacklevel=4)

@@ -9,7 +9,6 @@ import pytest
 from ethbrake_marl.errors import AlreadyExists
 from ethbrake_marl.extensions.reproduction.folder import Reproduction
 from ethbrake_marl.extensions.reproduction.items import read_results
-from ethbrake_marl.extensions.reproduction.learning_curves import LearningCurves
 from ethbrake_marl.extensions.reproduction.making import make_items, open_folder
 from tests.extensions.reproduction.test_reproduction import made, planted
 from tests.refused import refused
@@ -63,19 +62,6 @@ def test_result__that_was_changed_is_made_again(where: str, changes: dict[str, A
             Reproduction("quick", Path("out"), 24, machine="a machine"),
             [planted("harm-delays", lambda settings: made())],
         )
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("ppo", "recipes 'ppo': 'ppo' must have the form RECIPE:SEEDS (number of seeds), for instance"),
-        ("ppo:0", "recipes 'ppo:0': 'ppo:0' must have the form RECIPE:SEEDS"),
-        ("ppo:2,ppo:3", "recipes 'ppo:2,ppo:3': two recipes have the same name"),
-    ],
-)
-def test_recipes_of_learning_curves__are_refused(text: str, message: str) -> None:
-    with refused(message):
-        LearningCurves.parse(text)
 
 
 def test_reproduction__is_written_to_a_folder_of_its_own(empty_folder: Path) -> None:

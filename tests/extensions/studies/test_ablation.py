@@ -37,7 +37,7 @@ from ethbrake_marl.training.callback import RunCallback
 from ethbrake_marl.training.recipe import Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.training.training import Training
 from tests.extensions.studies.conftest import ABLATE, LEVELS, study
-from tests.extensions.studies.counting import PROGRAM, end_when
+from tests.extensions.studies.killing import PROGRAM, end_when
 from tests.fixtures.snapshots import check_snapshot
 from tests.learning.tiny import TINY_PPO
 
