@@ -1,7 +1,6 @@
-"""What the pages show as the outcome of a command: blocks, tables and pictures, and the commands that make them again.
+"""Tables and pictures of the pages, and the commands with which ``make figures`` makes them again.
 
-A block is known by its first command, a table by how its header begins, a picture by its name. ``make test`` runs the
-commands of blocks that show an error, ``make figures`` those of ``TABLES``, ``PICTURES`` and tables in docs/results.
+A table is known by how its header begins, a picture by its name. A results page names the commands itself.
 """
 
 import re
@@ -14,13 +13,12 @@ from tests.docs.site import DOCS
 ROOT = DOCS.parent
 BLOCK = re.compile(r"^```(\S*)[^\n]*\n(.*?)^```", re.DOTALL | re.MULTILINE)
 TABLE = re.compile(r"(?:^\|.*\n)+", re.MULTILINE)
-ANYTHING = re.compile(r"\s*(?:\.\.\.|…)\s*")
 COMPARED = "`make figures` compares"  # in a section of docs/results
 
 
 @dataclass(frozen=True)
 class Shown:
-    """A block, table or picture of a page, and the commands that make it."""
+    """A table or picture of a page, and the commands that make it."""
 
     page: str
     begin: str
@@ -77,22 +75,14 @@ def pages() -> list[Path]:
     return [ROOT / "README.md", *sorted(written)]
 
 
-def errors_shown() -> Iterator[Shown]:
-    """Blocks in which a command prints an error."""
-    for page in pages():
-        for _, body in BLOCK.findall(page.read_text("utf-8")):
-            if body.startswith("$ ") and "ethbrake: error:" in body:
-                yield Shown(_name(page), commands_of(body)[0][0], body)
-
-
 def tables() -> Iterator[Shown]:
     """Tables that ``make figures`` compares: those of ``TABLES``, and those of docs/results that say so."""
     for page in pages():
         for section in page.read_text("utf-8").split("\n## "):
-            commands = tuple(command for _, body in BLOCK.findall(section) for command, _ in commands_of(body))
+            commands = tuple(re.findall(r"(?m)^\$ (.*)", section))
             for table in TABLE.findall(BLOCK.sub("", section)):
                 begin = table.partition("\n")[0]
-                if COMPARED in section and page.parent.name == "results":
+                if COMPARED in " ".join(section.split()) and page.parent.name == "results":
                     yield Shown(_name(page), begin, table, commands)
                 for key, known in TABLES.items():
                     if begin.startswith(key):
@@ -105,29 +95,6 @@ def pictures() -> Iterator[Shown]:
         for name in re.findall(r"!\[[^\]]*\]\([^)]*figures/([^)]+)\)", page.read_text("utf-8")):
             if name in PICTURES:
                 yield Shown(_name(page), name, name, PICTURES[name])
-
-
-def commands_of(block: str) -> list[tuple[str, list[str]]]:
-    """(command, lines that it printed) of a block, in order; a command that goes over several lines is one."""
-    found: list[tuple[str, list[str]]] = []
-    for line in re.sub(r"\\\n\s*", "", block).splitlines():
-        if line.startswith("$ "):
-            found.append((line[2:], []))
-        elif found:
-            found[-1][1].append(line.rstrip())
-    return found or [("", [])]
-
-
-def agrees(shown: list[str], told: list[str]) -> bool:
-    """Whether lines are as shown, where ``...`` stands for any number of lines, or for the rest of one."""
-    pattern = ""
-    for line in (each.rstrip() for each in shown):
-        if ANYTHING.fullmatch(line):
-            pattern += r"(.*\n)*?"
-        else:  # one that ends in ``...`` goes on somehow
-            pattern += re.escape(line.removesuffix("...")) + ".*\n" if line.endswith(" ...") else re.escape(line) + "\n"
-    text = "".join(f"{line.rstrip()}\n" for line in told)
-    return re.fullmatch(rf"{pattern}\n*", text) is not None or re.fullmatch(pattern, f"{text}\n") is not None
 
 
 def missing_figures(table: str, told: str) -> list[str]:

@@ -3,7 +3,6 @@
 import json
 import re
 import tomllib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,24 +14,9 @@ from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_h
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.scenario.catalogue import load_scenario, new_scenario_text
 from ethbrake_marl.scenario.tables import worlds_from_table
-from tests.docs.printed import (
-    BLOCK,
-    PICTURES,
-    ROOT,
-    TABLES,
-    Shown,
-    agrees,
-    commands_of,
-    errors_shown,
-    missing_figures,
-    pictures,
-    rows,
-    tables,
-)
+from tests.docs.printed import BLOCK, PICTURES, ROOT, TABLES, missing_figures, pictures, rows, tables
 from tests.docs.site import DOCS, load
 from tests.programmes.libraries import harm_of_programs
-
-Run = Callable[..., tuple[str, str]]
 
 
 def test_everything_compared__is_still_on_a_page() -> None:
@@ -41,33 +25,11 @@ def test_everything_compared__is_still_on_a_page() -> None:
     assert [each.begin for each in tables() if not each.commands] == []
 
 
-@pytest.fixture
-def told(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
-    """Runs a command line in this process in an empty folder; stderr and stdout."""
-    monkeypatch.setenv("COLUMNS", "100")
-    monkeypatch.chdir(tmp_path)
-
-    def call(command: str) -> tuple[str, str]:
-        capsys.readouterr()
-        run_command(command.split()[1:])
-        captured = capsys.readouterr()
-        return captured.err, captured.out
-
-    return call
-
-
-# See tests/test_imports.py for the error without torch.
-ERRORS = [each for each in errors_shown() if each.begin != "ethbrake train"]
-
-
-@pytest.mark.parametrize("block", ERRORS, ids=lambda block: block.begin[:60])
-def test_error__is_what_its_commands_print(block: Shown, told: Run) -> None:
-    if "rainy.yaml" in block.begin:  # whose mistake the page tells
-        told("ethbrake scenario new rainy")
-        text = Path("rainy.yaml").read_text("utf-8")
-        Path("rainy.yaml").write_text(text.replace("\nmass_t:", "\nmass_kg:"))
-    for command, shown in commands_of(block.text):
-        assert agrees(shown, "".join(told(command)).splitlines()), command
+def test_error__on_the_page_of_commands_is_what_the_command_prints(capsys: pytest.CaptureFixture[str]) -> None:
+    page = (DOCS / "reference" / "cli.md").read_text("utf-8")
+    shown = page.partition("$ ethbrake evaluate --agents ful_brake\n")[2].partition("```")[0]
+    assert run_command(["evaluate", "--agents", "ful_brake"]) == 2
+    assert capsys.readouterr().err == shown
 
 
 @pytest.mark.slow
@@ -89,27 +51,6 @@ def test_reference_values__are_those_of_the_closed_form() -> None:
         told = [found.spares_front_mps2, found.spares_rear_mps2, found.deceleration_mps2, found.harm]
         told.append(pairwise_harm(worlds, [6, 7, 6]).sum(axis=1))
         assert missing_figures(" ".join(ends), " ".join(repr(float(each[0])) for each in told)) == [], world
-
-
-@pytest.mark.parametrize(
-    ("shown", "printed", "same"),
-    [
-        ("a", "a", True),
-        ("a", "b", False),
-        ("a\n...\nd", "a\nb\nc\nd", True),
-        ("a\n...\nd", "a\nd", True),
-        ("a\n...", "a\nb", True),
-        ("a\n  ...\nc", "a\nb", False),
-        ("...\na", "b\na\n\n", True),
-        ("a", "a\nb", False),
-        ("", "a", False),
-        ("a ...", "a b c", True),
-        ("a ...", "b", False),
-        ("a...", "ab", False),
-    ],
-)
-def test_agrees__where_dots_stand_for_any_lines(shown: str, printed: str, same: bool) -> None:
-    assert agrees(shown.splitlines(), printed.splitlines()) == same
 
 
 @pytest.mark.parametrize(
