@@ -68,12 +68,7 @@ nb_ipywidgets_js: dict[str, dict[str, str]] = {}  # the site loads nothing; slid
 html_theme = "furo"
 html_title = f"ethbrake_marl {__version__}"
 html_favicon = "figures/favicon.svg"
-html_extra_path = [
-    "../scenarios/scenario.schema.json",
-    "../train/recipe.schema.json",
-    "sweep.schema.json",
-    "tuning.schema.json",
-]
+html_extra_path = ["../scenarios/scenario.schema.json", "../train/recipe.schema.json"]
 html_static_path = ["static"]
 html_css_files = ["site.css"]
 html_copy_source = False
@@ -91,6 +86,8 @@ def relink(text: str, docname: str, folder: Path) -> str:
 
     def lead(found: re.Match[str]) -> str:
         path, anchor = Path(os.path.normpath(folder / found[1])), found[2] or ""
+        if not path.exists():  # code that looks like a link
+            return found[0]
         if path.name == "card.md":
             path, anchor = DOCS / "reference" / "policies.md", f"#{path.parent.name}"
         pages = {ROOT / "README.md": "index.md", DOCS / "README.md": "index.md", ROOT / "CHANGELOG.md": "changelog.md"}
