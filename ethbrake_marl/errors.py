@@ -44,8 +44,8 @@ RENAMED: dict[str, str] = {  # old name -> new name, for messages
     "counterfactual-cooperation-3-pair": "vine-pair",
     "counterfactual-cooperation-4-all": "vine-all",
     "ppo@shipped": "ppo (ppo-obstacle on paper-random-obstacle)",
-    "policy@shipped": "universal (the policies for one scenario: docs/reference/policies.md)",
-    "team@shipped": "universal (the policies for one scenario: docs/reference/policies.md)",
+    "policy@shipped": "universal (the policies for one scenario: ethbrake agent list)",
+    "team@shipped": "universal (the policies for one scenario: ethbrake agent list)",
     "options@shipped": "rollout-obstacle",
     "counterfactual@shipped": "vine-preference, vine-front, vine-pair or vine-all",
 }

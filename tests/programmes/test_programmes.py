@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.docs.printed import rows
 from tests.programmes import ROOT, Told, __main__ as runner, audit, bounds, faults, hostile, libraries
 from tests.programmes.audit import Package
 from tests.programmes.cage import Case, judge
@@ -87,13 +88,11 @@ WAYS = [pytest.param(way, id=f"{way.library}: {way.title}") for way in libraries
 HERE = [each for each in WAYS if each.values[0].library in ("Stable-Baselines3", "SuperSuit")]
 
 
-def test_page_of_libraries__has_a_row_for_every_way_and_none_failed():
-    (table,) = libraries.MEASURED.read_tables("libraries")
-    ways = [(way.library, libraries.lowered(way.title), way.ran) for way in libraries.ways()]
-    assert [(row[0], *row[2:4]) for row in table.rows] == ways and {
-        way[0] for way in ways
-    } == libraries.LIBRARIES.keys()
-    assert {row[-1] for row in table.rows} == {"runs", "beats full braking"}
+def test_page_of_libraries__has_a_row_for_every_way():
+    _, *table = rows("results/libraries", "## Other libraries")
+    assert [tuple(row[k] for k in (0, 2, 3)) for row in table] == [
+        (way.library, libraries.lowered(way.title), way.ran) for way in libraries.ways()
+    ]
 
 
 @pytest.mark.parametrize("way", WAYS)

@@ -73,5 +73,3 @@ def test_reproduction__is_written_to_a_folder_of_its_own(empty_folder: Path) -> 
     with refused("mine: the folder exists, but does not contain a reproduction; give another folder", AlreadyExists):
         open_folder(Reproduction("quick", Path("mine"), 24), force=True).check()
     assert Path("mine/thesis.txt").read_text() == "years of work"
-    with refused("page.html: the name of the file must end in .json"):
-        Reproduction("quick", Path("out"), 24, docs=Path("page.html"))
