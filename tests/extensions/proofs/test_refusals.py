@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.programmes.archives import good, packed
 
 from ethbrake_marl.engine.profiles import ProfileProblem, Profiles, profile_problem
 from ethbrake_marl.errors import CorruptBundle
@@ -19,7 +20,6 @@ from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.task import Task
 from tests.fixtures.lines import line, wide_worlds
-from tests.programmes.archives import good, packed
 from tests.refused import refused
 
 PAPER, PAIR = load_scenario("paper-random"), load_scenario("cooperation-3-pair")

@@ -10,6 +10,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from tests.programmes.archives import CERTAIN, ONLY_A_PROBLEM_KNOWS
 
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
@@ -50,7 +51,6 @@ from ethbrake_marl.scenario.task import Task
 from tests.docs.site import load
 from tests.failing_worlds import planted_list, without
 from tests.fixtures.lines import line
-from tests.programmes.archives import CERTAIN, ONLY_A_PROBLEM_KNOWS
 
 BUDGET = 800
 SCENARIO = load_scenario("paper-random")
