@@ -10,7 +10,6 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import script_agents
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, UnknownName
-from ethbrake_marl.evaluation.trial import load_runnable
 from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.files.store import hold_lock
 from ethbrake_marl.policies.bundle import load_policy
@@ -58,42 +57,11 @@ def recipe(old: str, new: str) -> Any:
 
 
 RECIPES: dict[str, Callable[[], object]] = {
-    "mine.yaml, line 4: n_env: unknown key; did you mean n_envs?": lambda: recipe("n_envs: 16", "n_env: 16"),
-    "mine.yaml, line 15: network.policies: unknown key; did you mean policy?": lambda: recipe(
-        "policy: [8]", "policies: [8]"
-    ),
-    "mine.yaml, line 16: reward.speed: unknown key": lambda: recipe("harm: 1", "speed: 1"),
-    "mine.yaml: gamma: missing; this key is required; the shipped recipe ppo has all keys": lambda: recipe(
-        "gamma: 0.99\n", ""
-    ),
-    "mine.yaml, line 9: gamma = .nan: must be a finite number": lambda: recipe("gamma: 0.99", "gamma: .nan"),
-    "mine.yaml, line 9: gamma = 1.5: must be less than or equal to 1": lambda: recipe("gamma: 0.99", "gamma: 1.5"),
-    "mine.yaml, line 2: algorithm = trpo: must be one of ": lambda: recipe("algorithm: ppo", "algorithm: trpo"),
-    "must be a whole number, written without a decimal point": lambda: recipe("total_steps: 4096", "total_steps: 1e6"),
-    "mine.yaml, line 8: learning_rate.start = -0.001: must be greater than 0": lambda: recipe(
-        "start: 1e-3", "start: -1e-3"
-    ),
-    "mine.yaml, line 6: batch_size = 100: must divide n_envs x n_steps = 512": lambda: recipe(
-        "batch_size: 128", "batch_size: 100"
-    ),
-    "n_envs x n_steps = 3200000000 decisions per update": lambda: recipe("n_envs: 16", "n_envs: 100000000"),
-    "mine.yaml, line 15: network.policy = []: must not be empty": lambda: recipe("policy: [8]", "policy: []"),
-    "mine.yaml, line 16: reward = {harm: 0}: all weights of the reward except shaping are 0": lambda: recipe(
-        "harm: 1", "harm: 0"
-    ),
-    "mine.yaml, line 17: evaluation.every_updates = 0: must be greater than or equal to 1": lambda: recipe(
-        "every_updates: 2", "every_updates: 0"
-    ),
-    "must be 1 to 64 lower case letters, digits, - and _, beginning": lambda: recipe("name: mine", "name: ../mine"),
-    "mine.yaml, line 8: learning_rate = 0.0003: must be a mapping": lambda: recipe("{start: 1e-3, end: 1e-4}", "3e-4"),
-    "mine.yaml, line 2, column 10: not valid YAML: expected ',' or ']'": lambda: recipe("name: mine", "name: [mine"),
-    "mine.yaml: must be a mapping of keys to values": lambda: recipe(GOOD, "- ppo\n"),
-    "recipe 'ppo': seed = -1: must be greater than or equal to 0": lambda: load_recipe("ppo").replace(seed=-1),
-    "recipe 'sac': ent_coef = automatic: must be 'auto' or a finite number of at least 0": lambda: load_recipe(
-        "sac"
-    ).replace(ent_coef="automatic"),
-    "recipe 'sac': buffer_size = 63: must be at least n_envs = 128": lambda: load_recipe("sac").replace(buffer_size=63),
-    "recipe 'sac': n_steps: unknown key; did you mean total_steps?": lambda: load_recipe("sac").replace(n_steps=3),
+    "mine.yaml, line 4: n_env: unknown key;": lambda: recipe("n_envs: 16", "n_env: 16"),
+    "mine.yaml, line 2: algorithm = trpo:": lambda: recipe("algorithm: ppo", "algorithm: trpo"),
+    "mine.yaml, line 15: network.policy =": lambda: recipe("policy: [8]", "policy: []"),
+    "mine.yaml: must be a mapping of keys to": lambda: recipe(GOOD, "- ppo\n"),
+    "recipe 'sac': n_steps: unknown key; did": lambda: load_recipe("sac").replace(n_steps=3),
 }
 
 
@@ -105,21 +73,9 @@ def test_recipe__is_refused(message: str) -> None:
 
 
 SETTINGS: dict[str, Callable[[], object]] = {
-    "--set 'gamma': must be KEY=VALUE or KEY.KEY=VALUE": lambda: read_settings(["gamma"], [PPO]),
-    "--set 'a..b=1': must be KEY=VALUE or KEY.KEY=VALUE": lambda: read_settings(["a..b=1"], [PPO]),
-    "--set gamma, line 1, column 2: not valid YAML: expected the node content, but found '<stream end>'": lambda: (
-        read_settings(["gamma=["], [PPO])
-    ),
-    "--set gamma: this setting is given twice; give it once": lambda: read_settings(["gamma=0.9", "gamma=0.8"], [PPO]),
-    "recipe 'ppo': reward.terminl: unknown key; did you mean terminal?": lambda: read_settings(
-        ["reward.terminl=1"], [PPO]
-    ).change(PPO),
-    "--set gamma.x: 'x' cannot be set inside 0.995, which is neither a mapping nor a": lambda: read_settings(
-        ["gamma.x=1"], [PPO]
-    ).change(PPO),
-    "scenario 'paper-random': restitution = 3: must be finite and in [0, 1]": lambda: load_runnable(
-        "paper-random", read_settings(["restitution=3"]).scenario
-    ),
+    "--set 'gamma': must be KEY=VALUE or": lambda: read_settings(["gamma"], [PPO]),
+    "--set gamma: this setting is given": lambda: read_settings(["gamma=0.9", "gamma=0.8"], [PPO]),
+    "--set gamma.x: 'x' cannot be set inside": lambda: read_settings(["gamma.x=1"], [PPO]).change(PPO),
 }
 
 
@@ -130,43 +86,15 @@ def test_setting__is_refused(message: str) -> None:
 
 
 TRAININGS: dict[str, Callable[[], object]] = {
-    "algorithm 'My algorithm': the name must have 1 to 64 characters (a-z, 0-9, - and _), and must not begin": lambda: (
-        register_algorithm("My algorithm", PpoRecipe, Ppo)
+    "algorithm 'My algorithm': the name must": lambda: register_algorithm("My algorithm", PpoRecipe, Ppo),
+    "algorithm 'new': recipe = <class": lambda: register_algorithm("new", dict, Ppo),
+    "scenario 'cooperation-3-pair' has no": lambda: train(TINY_PPO, PAIR.with_learners([]), Path("run")),
+    "scheme single: scenario": lambda: train(TINY_PPO, PAIR, Path("run"), scheme="single"),
+    "recipe 'ppo': turns = 5 for each of 2": lambda: train(
+        TINY_PPO, PAIR, Path("run"), scheme="independent", steps=2048, turns=5
     ),
-    "algorithm 'new': recipe = <class 'dict'>: must be a class with the method network_spec, a subclass": lambda: (
-        register_algorithm("new", dict, Ppo)
-    ),
-    "algorithm 'new': algorithm = <built-in function len>: must be a class with the method build, or the": lambda: (
-        register_algorithm("new", PpoRecipe, len)
-    ),
-    "recipe 'ppo': total_steps = 0: must be greater than or equal to 1": lambda: train(
-        "ppo", "paper-random", Path("run"), steps=0
-    ),
-    "scenario 'cooperation-3-pair' has no learner; give at least one vehicle the role learner": lambda: train(
-        TINY_PPO, PAIR.with_learners([]), Path("run")
-    ),
-    "scheme single: scenario 'cooperation-3-pair' has 2 learners; use the scheme shared, independent or": lambda: train(
-        TINY_PPO, PAIR, Path("run"), scheme="single"
-    ),
-    "scheme independent: needs several learners, but scenario 'paper-random' has one; use the scheme": lambda: train(
-        TINY_PPO, PAPER, Path("run"), scheme="independent"
-    ),
-    "scheme independent: the algorithm sac of recipe 'sac' does not support this scheme; use a recipe for": lambda: (
-        train("sac", PAIR, Path("run"), scheme="independent")
-    ),
-    "scheme centralised: the algorithm sac of recipe 'sac' does not support this scheme; use a recipe for": lambda: (
-        train("sac", PAIR, Path("run"), scheme="centralised")
-    ),
-    "recipe 'ppo': turns = 3: is allowed with scheme: independent only; remove the key turns": lambda: train(
-        TINY_PPO, PAIR, Path("run"), scheme="shared", turns=3
-    ),
-    "recipe 'ppo': turns = 5 for each of 2 learners needs at least 10 updates, but total_steps = 2048 gives": lambda: (
-        train(TINY_PPO, PAIR, Path("run"), scheme="independent", steps=2048, turns=5)
-    ),
-    ".: is not the folder of a run; name the folder of a run, for instance": lambda: resume(Path()),
-    ".: has no file team.json, so it is not the folder of a team; give the folder of a training run": lambda: load_team(
-        Path(), PAIR
-    ),
+    ".: is not the folder of a run; name the": lambda: resume(Path()),
+    ".: has no file team.json, so it is not": lambda: load_team(Path(), PAIR),
 }
 
 
@@ -178,14 +106,8 @@ def test_training__is_refused(message: str) -> None:
 
 
 NAMES: dict[str, Callable[[], object]] = {
-    "unknown recipe 'ppo-papre'; did you mean 'ppo-paper'?": lambda: load_recipe("ppo-papre"),
-    "unknown recipe 'pppo'; did you mean 'ppo'?": lambda: train("pppo", PAPER, Path("run")),
-    "unknown scenario 'paper-randm'; did you mean 'paper-random'?": lambda: train("ppo", "paper-randm", Path("run")),
-    "unknown setting 'gama'; did you mean 'gamma'?": lambda: read_settings(["gama=0.9"], [PPO]),
-    "unknown setting 'mass_t'": lambda: read_settings(["recipe.mass_t=1"], [PPO]),
-    "unknown setting 'mass'; did you mean 'mass_t'?": lambda: load_runnable(
-        "paper-random", read_settings(["mass=3"]).scenario
-    ),
+    "unknown recipe 'ppo-papre'; did you": lambda: load_recipe("ppo-papre"),
+    "unknown setting 'gama'; did you mean": lambda: read_settings(["gama=0.9"], [PPO]),
 }
 
 
@@ -204,13 +126,8 @@ def test_algorithm__has_a_name_of_its_own() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"n_stepz": 3}, "mine.yaml, line 22: n_stepz: unknown key; did you mean n_steps?"),
-        ({"n_steps": 2.5}, "mine.yaml, line 21: n_steps = 2.5: must be a whole number"),
-        ({"algorithm": "a3c"}, "mine.yaml, line 1: algorithm = a3c: must be one of "),
-        (
-            {"scheme": "independent"},
-            "scheme independent: the algorithm a2c of recipe 'mine' does not support this scheme; use a",
-        ),
+        ({"n_stepz": 3}, "mine.yaml, line 22: n_stepz: unknown"),
+        ({"scheme": "independent"}, "scheme independent: the algorithm a2c"),
     ],
     ids=lambda value: str(value)[:30],
 )
@@ -248,14 +165,8 @@ def test_folder__that_is_there_is_not_replaced_unasked(run: RunDirectory) -> Non
     ("training", "other"),
     [
         (lambda: Training.of(TINY_PPO.replace(seed=1), PAPER), "recipe seed"),
-        (lambda: Training.of(TINY_PPO.replace(reward={"harm": 2.0}), PAPER), "recipe reward"),
-        (
-            lambda: Training.of(TINY_PPO, PAPER.replace(v2x="clear", early_impacts="keep")),
-            "scenario early_impacts, scenario v2x",
-        ),
         (lambda: Training.of(TINY_PPO, PAPER.replace(name="mine")), "scenario name"),
     ],
-    ids=["seed", "reward", "channel", "name"],
 )
 def test_folder__of_another_training_is_refused(
     training: Callable[[], Training], other: str, run: RunDirectory
@@ -267,19 +178,10 @@ def test_folder__of_another_training_is_refused(
 @pytest.mark.parametrize(
     ("status", "message"),
     [
-        (
-            '{"format": "ethbrake',
-            "run/run.json: is damaged: Unterminated string starting at: line 1 column 12 (char 11)",
-        ),
-        ("[]", "run/run.json: is damaged: the content is not a JSON object"),
-        ("{}", "run/run.json: format = None: must be ethbrake-run"),
-        (
-            '{"format": "ethbrake-run", "status": "done"}',
-            "run/run.json: status = 'done': must be running or finished or",
-        ),
-        (None, "run/run.json: is missing, but the run cannot be used without it"),
+        ('{"format": "ethbrake', "run/run.json: is damaged: Unterminated"),
+        ("[]", "run/run.json: is damaged: the content"),
+        ("{}", "run/run.json: format = None: must be"),
     ],
-    ids=["cut off", "a list", "empty", "other status", "missing"],
 )
 def test_status_of_a_run__is_refused(status: str | None, message: str, run: RunDirectory) -> None:
     run.status.unlink() if status is None else run.status.write_text(status)
@@ -289,15 +191,7 @@ def test_status_of_a_run__is_refused(status: str | None, message: str, run: RunD
 
 @pytest.mark.parametrize(
     ("changes", "message"),
-    [
-        ({"recipe": None}, "run/config.json: does not describe a training run, because the key 'recipe' is missing"),
-        ({"recipe": 3}, "run/config.json: recipe: must be a mapping of keys to values, for instance algorithm: ppo"),
-        ({"scenario": {"name": "paper-random"}}, "run/config.json: scenario: braking_capacity_mps2: missing"),
-        (
-            {"library": "benchmarl"},
-            "run: this run was trained with the library benchmarl, so it cannot be resumed; train again",
-        ),
-    ],
+    [({"recipe": None}, "run/config.json: does not describe a"), ({"recipe": 3}, "run/config.json: recipe: must be a")],
     ids=lambda value: str(value)[:30],
 )
 def test_configuration_of_a_run__is_refused(changes: dict[str, Any], message: str, run: RunDirectory) -> None:
@@ -379,21 +273,9 @@ def test_team__drives_a_line_of_its_length_and_vehicles_of_its_own(team: RunDire
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("{", "team/team.json: is not JSON (Expecting property name enclosed in double quotes"),
-        ("[]", "team/team.json: must be a mapping of keys to values"),
-        ("{}", "team/team.json: scheme: missing"),
-        (
-            {"drivers": {**DRIVERS, "vehicle_3": "../policy"}},
-            'drivers.vehicle_3 = "../policy": must be policy/vehicle_3',
-        ),
-        (
-            {"drivers": {**DRIVERS, "vehicle_3": "policy/vehicle_2"}},
-            "must be policy/vehicle_3 under scheme independent",
-        ),
-        ({"scheme": "shared"}, "drivers.vehicle_2 = policy/vehicle_2: must be policy under scheme shared"),
-        ({"vehicles": 2}, "drivers = vehicle_3: must be one of vehicle_1 to vehicle_2"),
-        ({"scheme": "together"}, "scheme = together: must be single, shared, independent or centralised"),
-        ({"drivers": {"vehicle_3": "policy/vehicle_3"}}, "must be two vehicles or more under scheme independent"),
+        ("{", "team/team.json: is not JSON (Expecting"),
+        ("[]", "team/team.json: must be a mapping of"),
+        ({"drivers": {"vehicle_3": "policy/vehicle_3"}}, "must be two vehicles or more under"),
     ],
     ids=lambda value: str(value)[:40],
 )
