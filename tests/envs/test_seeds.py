@@ -124,17 +124,6 @@ def test_np_random__drawn_from_by_a_wrapper_changes_no_world(name: str) -> None:
     assert begin(env) == begin(untouched)
 
 
-@pytest.mark.parametrize("name", [name for name in MAKERS if not name.endswith("sb3")])
-def test_np_random__is_not_drawn_from_by_a_reset_that_is_refused(name: str) -> None:
-    env, untouched = MAKERS[name](), MAKERS[name]()
-    for each in (env, untouched):
-        each.np_random = np.random.default_rng(3)
-    for state in ({"gaps_m": -1}, {"latency_s": 100, "speeds_mps": 20}):
-        with pytest.raises(InvalidInput):
-            env.reset(options={"initial_state": state})
-    assert begin(env) == begin(untouched)
-
-
 def test_seed__of_stable_baselines3_and_a_generator_count_in_the_order_in_which_they_are_set() -> None:
     env = eb.make_sb3_vec_env("paper-random", 3, seed=8)
     assert env.np_random_seed == 8
