@@ -230,11 +230,6 @@ def test_looking_ahead__needs_commands_that_are_fixed_at_the_alert(drives: Calla
         drives()
 
 
-TWO_OPTIMISE = FREE.replace(
-    obstacle_gap_m=42, roles={"vehicle_1": "learner", "vehicle_2": "e_v2x_bm", "vehicle_3": "e_v2x_bm"}
-)
-
-
 @pytest.mark.parametrize("knows", ["everything", ("messages", "gossip")])
 def test_knowledge__is_of_known_kinds(knows: Any) -> None:
     agent = Own(len)

@@ -202,20 +202,6 @@ def test_engine__steps_as_advance_does_and_its_ledger_counts_the_obstacle() -> N
     np.testing.assert_allclose(rewards, -running.ledger.world_harm("total"), rtol=1e-12)
 
 
-def test_infos__tell_the_same_shares_as_the_ledger() -> None:
-    env = eb.parallel_env(NEAR)
-    env.reset(seed=11)
-    while env.agents:
-        infos = env.step({f"vehicle_{i + 1}": np.array([-0.1], np.float32) for i in env.engine.learners})[4]
-    ledger = env.engine.ledger
-    assert ledger.obstacle_count[0] > 0
-    for count, key in (("first", "first_impact_harm"), ("total", "total_harm")):
-        assert [infos[f"vehicle_{i + 1}"][key] for i in range(3)] == ledger.vehicle_harm(count)[0].tolist()
-        assert infos["vehicle_3"][f"world_{key}"] == ledger.world_harm(count)[0]
-    assert env.state()[-2:].tolist() == [np.float32(env.engine.worlds.obstacle_gap_m[0] / 10.0), 1.0]
-    assert env.state_space.contains(env.state()) and len(env.state()) == 28
-
-
 def test_engine__worlds_that_are_given_may_have_an_obstacle_or_none_whatever_the_scenario_says() -> None:
     plain = eb.load_scenario("cooperation-3-pair")
     for scenario in (plain, ALL.with_learners([1, 2])):

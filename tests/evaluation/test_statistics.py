@@ -10,7 +10,6 @@ from hypothesis import given, strategies as st
 from scipy.stats import bootstrap
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation import seeds as seeds_module
 from ethbrake_marl.evaluation.seeds import interquartile_mean, mean_over_seeds, share_over_seeds
 from ethbrake_marl.evaluation.statistics import (
     Moments,
@@ -126,13 +125,6 @@ def test_mean_over_seeds__worlds_of_both_sides_are_drawn_together() -> None:
     half = 1.96 * difference.std(ddof=1) / 500**0.5
     expected = (difference.mean() - half, difference.mean() + half)
     assert mean_over_seeds(worlds + difference, worlds).interval == pytest.approx(expected, abs=0.02)
-
-
-@pytest.mark.parametrize("resamples", [1, 2, 3])
-def test_resamples__are_as_many_as_asked_for(resamples: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(seeds_module, "_AT_ONCE", 4)  # two at a time
-    sides = (np.arange(4.0).reshape(2, 2),)
-    assert seeds_module._resample_means(sides, np.arange(2), resamples, 0).shape == (resamples, 1)
 
 
 def rounded(estimate):

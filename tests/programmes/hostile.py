@@ -20,7 +20,7 @@ import traceback
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stdout
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -119,7 +119,7 @@ RECIPES: dict[str, tuple[str, str]] = {
     "more worlds than memory": ("\nn_envs: ", "\nn_envs: 99999999"),
     "a tag": ("\nalgorithm: ppo", "\nalgorithm: !!python/name:os.system"),
 }
-TABLES: dict[str, bytes] = {
+LISTS: dict[str, bytes] = {
     "a formula": STATES.replace("7,7", "=cmd|'/c calc'!A1,7").encode(),
     "an escape sequence in a column": STATES.replace("gap_1_m", "\x1b[2J").encode(),
     "100,000 columns": b",".join([b"gap_1_m"] * 100_000) + b"\n1\n",
@@ -146,7 +146,7 @@ def texts() -> Iterator[Case]:
             yield Case(f"{kind}: {name}", command, partial(put, "mine.yaml", text.replace(old, new, 1)))
     for name, raw in (("UTF-16", SCENARIO.encode("utf-16")), ("not text", SCENARIO.encode() + b"\xff")):
         yield Case(f"scenario: {name}", kinds[0][2], partial(put, "mine.yaml", raw))
-    for name, raw in TABLES.items():
+    for name, raw in LISTS.items():
         yield Case(f"table of states: {name}", read_states, partial(put, "mine.csv", raw))
 
 
@@ -164,14 +164,20 @@ class Touch:
         return Path.touch, (Path("pwned"),)
 
 
-def archives() -> Iterator[Case]:
-    """Yield tables of best known harm, as attackers might write them."""
+@cache
+def good_table() -> bytes:
+    """Return a valid table of best known harm, of three worlds."""
     scenario = eb.load_scenario("paper-random")
-    good = table_bytes(best_harm(scenario, scenario.sample(3, 7).worlds, budget=1, threads=1))
+    return table_bytes(best_harm(scenario, scenario.sample(3, 7).worlds, budget=1, threads=1))
+
+
+def tables() -> dict[str, bytes]:
+    """Return tables of best known harm, as attackers might write them."""
+    good = good_table()
     with np.load(io.BytesIO(good)) as arrays:
         members = {f"{name}.npy": npy(array) for name, array in arrays.items()}
     shape = members["identity.npy"].replace(b"(3,)", b"(1<<40,)")
-    attacks: dict[str, bytes] = {
+    return {
         "pickled objects": packed({**members, "identity.npy": npy(np.array([Touch()] * 3, object))}),
         "code in a header": packed({**members, "identity.npy": members["identity.npy"].replace(b"'<u8'", b"exit()")}),
         "a shape that is code": packed({**members, "identity.npy": shape}),
@@ -182,7 +188,10 @@ def archives() -> Iterator[Case]:
         "a pickle": pickle.dumps(Touch()),
         "cut off": good[: len(good) // 2],
     }
-    for name, content in attacks.items():
+
+
+def archives() -> Iterator[Case]:
+    for name, content in tables().items():
         yield Case(f"archive: {name}", partial(BestHarmTable.load, Path("t.npz")), partial(put, "t.npz", content))
 
 

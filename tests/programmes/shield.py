@@ -7,8 +7,9 @@ pieces        as joint, with every selection of message pieces: the shield must 
 interfaces    worlds in every shielded interface, with one learner and with a team
 interference  refused calls, exceptions and interrupts at random lines in every interface, and wrappers in between
 search        restarts of a search against the shield, and against twelve planted leaks, each of which must be found
-estimated     true worlds that are corners of the unknown ranges
-inside        true worlds between the corners, which robust mode does not cover; only reported
+estimated     true worlds that are corners of the unknown ranges, and true worlds inside the ranges
+inside        true worlds inside intervals, with robust mode; for corner mode the result is only reported
+horizon       harm after the horizon, which no bound covers; only reported
 """
 
 from functools import partial
@@ -34,6 +35,7 @@ from tests.shield.attacks import (
     TEAMS,
     TOLERANCE,
     Attack,
+    above_later,
     attack,
     begun,
     line,
@@ -42,6 +44,7 @@ from tests.shield.attacks import (
 from tests.shield.plays import INSIDE as WRAPPED, PLAYS, WRAPPERS, Tally, disturbed, played, wrapped
 
 CHUNK = 2_000  # worlds attacked together
+BATCH = 50_000  # worlds simulated together with the applied actions
 CELLS = {3: 3.0, 5: 1.0}  # number of vehicles -> weight of its worlds; lines of five take five times as long
 SLOW = {"worst_case": 0.14}  # adversary -> factor of its weight; it searches at every step
 RATES = {"brake_rate_mps3": {"uniform": [5, 40]}, "release_rate_mps3": {"uniform": [5, 60]}}
@@ -58,8 +61,8 @@ OPTIONS = {
     "--interfered": {"type": int, "default": 1_000, "help": "episodes with failing calls on each interface"},
     "--corner-worlds": {"type": int, "default": 60_000, "help": "worlds of 'estimated'"},
     "--restarts": {"type": int, "default": 1_000, "help": "restarts of the search"},
-    "--intervals": {"default": "gaps_m=0.5", "help": "uncertainty of 'inside'"},
-    "--boxes": {"type": int, "default": 20, "help": "boxes of 'inside'"},
+    "--intervals": {"default": "gaps_m=0.5", "help": "uncertainty of 'between'"},
+    "--boxes": {"type": int, "default": 20, "help": "boxes of 'between'"},
     "--draws": {"type": int, "default": 50_000, "help": "worlds from each box"},
     "--seed": {"type": int, "default": 1},
 }
@@ -67,7 +70,7 @@ OPTIONS = {
 
 def cases(given: Given) -> Cases:
     seed = given.seed
-    yield f"inside ({given.intervals})", partial(inside, given)
+    yield f"between the corners ({given.intervals})", partial(between, given)
     for name in PLAYS:
         yield f"interference: {name}", partial(disturbance, name, given.interfered, seed)
     for wrapper in WRAPPERS:
@@ -84,6 +87,8 @@ def cases(given: Given) -> Cases:
     for name in PLAYS:
         yield f"interfaces: {name}", partial(interface, name, given.interface_worlds, seed)
     yield from attacks(given)
+    for proposer in ("coast", "full_brake", "e_v2x_bm"):
+        yield f"horizon: {proposer}", partial(beyond_horizon, proposer)
 
 
 def attacks(given: Given) -> Cases:
@@ -228,22 +233,37 @@ def estimated(scenario: Any, way: str, worlds: int, seed: int) -> Told:
     )
 
 
-def inside(given: Given) -> Told:
-    """Report worlds from boxes around the worlds of a scenario, with one robust shield per box and the agent ``coast``.
+def between(given: Given) -> Told:
+    """Count the worlds between the corners that do more harm than the bound, with the agent ``coast``. None is wrong:
+    the bound does not cover these worlds.
 
-    One shield decides per box, and many worlds of the box are simulated with its actions.
+    The actions of robust mode do not depend on which world of the box is the true one. So one shield decides per box,
+    and many worlds of the box are simulated with its actions.
     """
     scenario, uncertainty, boxes = load_scenario("paper-random"), parse_uncertainty(given.intervals), given.boxes
     told, rng = scenario.sample(boxes, given.seed).worlds, np.random.default_rng(given.seed)
     shield = RobustShield(scenario, 1, uncertainty=uncertainty)
     shield.begin(told, np.arange(boxes))
+    decisions = 0
     while not shield.memory.running.finished.all():
+        decisions += int((~shield.memory.running.finished).sum())
         shield.decide(np.zeros(boxes))
-    above, excess = 0, -np.inf
-    for k in range(boxes):
-        truth = uncertainty.draw(told.take(np.full(given.draws, k)), rng)
-        plan = np.repeat(shield.memory.backup.plan[k : k + 1], given.draws, axis=0)
+    above, excess, harm = 0, -np.inf, 0.0
+    draws = [min(BATCH, given.draws - first) for first in range(0, given.draws, BATCH)]
+    for k, n in product(range(boxes), draws):
+        truth = uncertainty.draw(told.take(np.full(n, k)), rng)
+        plan = np.repeat(shield.memory.backup.plan[k : k + 1], n, axis=0)
         realised = plan_harm(begin_running(profile_problem(truth, [1], horizon_s=scenario.horizon_s)), plan)
         over = realised - shield.memory.first_bound[k]
-        above, excess = above + int((over > TOLERANCE).sum()), max(excess, over.max())
-    return Told(None, f"{boxes * given.draws:,} worlds of {boxes} boxes, above: {above:,}, most by {excess:.2g}")
+        above, excess, harm = above + int((over > TOLERANCE).sum()), max(excess, over.max()), harm + realised.sum()
+    worlds, bound = boxes * given.draws, float(shield.memory.first_bound.mean())
+    return Told(
+        None,
+        f"{worlds:,} worlds of {boxes} boxes, above: {above:,} ({above / worlds:.2%}), most by {excess:.2g}; bound"
+        f" {bound:.2f}, harm {harm / worlds:.2f}, replaced {shield.interventions.sum() / decisions:.0%}",
+    )
+
+
+def beyond_horizon(proposer: str) -> Told:
+    now, later = above_later(proposer, 2_000)
+    return Told(None, f"worlds above the bound at 3 s: {now:.1%}, when all vehicles are at rest: {later:.1%}")
