@@ -215,3 +215,11 @@ def test_shield__of_several_learners_tells_its_policies_and_can_be_compared(ethb
     Path("shield.json").write_text(answer.out)
     compared = ethbrake("compare", "shield.json", "shield.json")
     assert compared.status == 0 and "step-cap" in compared.out
+
+
+def test_evaluate__deletes_the_files_of_earlier_results_and_nothing_else(ethbrake: Command, tmp_path: Path) -> None:
+    line = ("evaluate", "--agents", "coast", "--episodes", "2", "--output", tmp_path / "out", "--force")
+    assert ethbrake(*line, "--per-world", "csv").status == 0
+    (tmp_path / "out" / "notes.txt").write_text("mine")
+    assert ethbrake(*line).status == 0
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"results.json", "notes.txt"}

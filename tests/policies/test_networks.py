@@ -19,14 +19,13 @@ import torch
 from torch import nn
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import agent_names
-from ethbrake_marl.errors import CorruptBundle
+from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.evaluation.identity import scenario_sha256
 from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.evaluation.rollout import evaluate
+from ethbrake_marl.game.features import FEATURES
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.game.observations import observe
-from ethbrake_marl.policies import shipped as shipped_module
 from ethbrake_marl.policies.actor import Actor
 from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.policies.layers import squash
@@ -34,8 +33,8 @@ from ethbrake_marl.policies.manifest import content_sha256
 from ethbrake_marl.policies.network_spec import NetworkSpec
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.shipped import load_named_policy, shipped_policies
-from ethbrake_marl.shields.paper_hybrid import HybridAgent
 from tests.docs.site import DOCS
+from tests.fixtures.policies import make_policy
 
 RandomTensors = Callable[[NetworkSpec], dict[str, np.ndarray]]
 
@@ -593,35 +592,6 @@ def test_load_policy__refuses_a_damaged_bundle_and_runs_and_opens_nothing_else(
     assert told.startswith(str(tmp_path / "policy")) and "\n" not in told
 
 
-def test_damaged_bundles__are_as_many_as_the_page_says() -> None:
-    page = Path(__file__).resolve().parents[2] / "docs" / "internals" / "bundles.md"
-    assert f"{len(SPOILED)} damaged and malicious bundles" in " ".join(page.read_text("utf-8").split())
-
-
-@pytest.fixture
-def folder(policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A package in which three policies ship; they were trained on paper-random."""
-    for name in ("ppo", "ppo-obstacle", "universal"):
-        policy.save(tmp_path / name / "policy")
-        (tmp_path / name / "card.md").write_text(f"# {name}\n")
-    monkeypatch.setattr(shipped_module, "_FOLDER", tmp_path)
-    return tmp_path
-
-
-def test_lineup__takes_what_ships(folder: Path) -> None:
-    specs = ["ppo", "universal", "ppo-obstacle", "ppo+episode"]
-    lineup = make_lineup(specs, SCENARIO)
-    assert [each.name for each in lineup.values()] == specs
-    assert isinstance(lineup["ppo+episode"], HybridAgent)
-    worlds = SCENARIO.sample(5, 1).worlds
-    acts = [lineup[spec].act(worlds, 1).tolist() for spec in specs[:3]]
-    assert acts == [acts[0]] * 3  # three copies of one policy ship here
-
-
-def test_shipped_policies__are_agents_by_their_names() -> None:
-    assert set(shipped_policies()) <= set(agent_names())
-
-
 @pytest.mark.parametrize(("name", "path"), shipped_policies().items())
 def test_shipped_policies__each_that_ships_is_small_and_has_a_card(name: str, path: Path, tmp_path: Path) -> None:
     manifest = load_named_policy(name).manifest
@@ -640,14 +610,6 @@ def test_shipped_policies__are_small_together() -> None:
     )
 
 
-def test_among__are_the_policies_inside_universal(policy: Policy) -> None:
-    universal = eb.load_shipped("universal")
-    seen = np.random.default_rng(0).uniform(0.0, 1.0, (50, universal.observation.size)).astype(np.float32)
-    acts = [*(each(seen) for each in universal.among), np.full((50, 1), -1.0), np.full((50, 1), 1.0)]
-    assert policy.among == () and len(universal.among) == 11
-    assert np.abs(np.stack(acts) - universal(seen)).min(axis=0).max() == 0.0
-
-
 @pytest.mark.parametrize("harm_count", HARM_COUNTS)
 @pytest.mark.parametrize("test", ["paper-random", "paper-random-brake-only", "paper-random-obstacle"])
 def test_shipped__drives_each_of_the_three_tests_alone_and_behind_its_shield(test: str, harm_count: HarmCount) -> None:
@@ -657,27 +619,6 @@ def test_shipped__drives_each_of_the_three_tests_alone_and_behind_its_shield(tes
     alone, shielded = (result.outcome(spec).ledger.world_harm(harm_count) for spec in lineup)
     assert shielded.mean() <= alone.mean()
     assert (shielded <= result.outcome("universal+episode").predicted_harm + 1e-9).all()
-
-
-def harms(sample: Any, specs: list[str], scenario: Any, harm_count: HarmCount) -> dict[str, float]:
-    """The mean harm of each agent."""
-    lineup = make_lineup(specs, scenario, harm_count=harm_count)
-    result = evaluate(sample, lineup, scenario=scenario, aftermath=False)
-    return {spec: float(result.outcome(spec).ledger.world_harm(harm_count).mean()) for spec in lineup}
-
-
-BEST = {("paper-random-obstacle", "first"): "ppo-obstacle", ("paper-random-obstacle", "total"): "rollout-obstacle"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("harm_count", HARM_COUNTS)
-@pytest.mark.parametrize("test", ["paper-random", "paper-random-brake-only", "paper-random-obstacle"])
-def test_shipped__the_one_for_a_test_is_the_best_that_ships(test: str, harm_count: HarmCount) -> None:
-    """By the mean harm in 2,000 worlds, within a hundredth of the best of all but those of levels of cooperation."""
-    scenario = eb.load_scenario(test)
-    names = [name for name in shipped_policies() if name not in ("vine-all", "vine-front", "vine-pair")]
-    found = harms(scenario.sample(2_000, 21), names, scenario, harm_count)
-    assert found[BEST.get((test, harm_count), "universal")] <= 1.01 * min(found.values())
 
 
 @pytest.mark.parametrize(
@@ -703,8 +644,18 @@ def test_shipped__drives_all_learners_of_a_level_of_cooperation(
     assert policy.collided.mean() <= collisions
 
 
-@pytest.mark.parametrize("harm_count", HARM_COUNTS)
-def test_shipped__universal_does_less_harm_than_ppo(harm_count: HarmCount) -> None:
-    """On worlds that are no training's."""
-    ppo, universal = harms(SCENARIO.sample(600, 9), ["ppo", "universal"], SCENARIO, harm_count).values()
-    assert universal < 0.98 * ppo
+def test_load_policy__refuses_a_registered_feature_that_differs_by_a_thousandth(tmp_path: Path) -> None:
+    def register(factor: float) -> None:
+        def speed(worlds: Any, vehicle: int) -> Any:
+            """Own speed."""
+            return factor * worlds.speeds_mps[:, vehicle]
+
+        FEATURES.loaded.pop("mine", None)
+        eb.register_feature("mine", speed, unit="m/s", scale=10.0, low=0.0, high=9.0)
+
+    register(1.0)
+    make_policy(eb.choose_observation(["own", "mine"]), {"name": "paper-random"}).save(tmp_path / "policy")
+    load_policy(tmp_path / "policy")
+    register(1.001)
+    with pytest.raises(InvalidInput, match="'mine', whose function now returns other numbers than in training"):
+        load_policy(tmp_path / "policy")
