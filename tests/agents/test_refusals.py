@@ -11,9 +11,8 @@ from stable_baselines3 import PPO
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_harm
-from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.making import make_agent
-from ethbrake_marl.agents.protocol import Knowledge, Team
+from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.agents.registry import register_agent
 from ethbrake_marl.errors import AgentFailed, AlreadyExists, UnknownName
 from ethbrake_marl.game.observations import observe
@@ -21,9 +20,6 @@ from tests.refused import refused
 
 PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")
 WORLDS = PAPER.sample(12, 7).worlds
-FREE = PAPER.replace(early_impacts="keep")
-SLOW = PAPER.replace(brake_rate_mps3=9)
-PIECES = PAPER.replace(roles={"vehicle_1": "profile:0=3,1=5", "vehicle_2": "learner"})
 BRAKE = make_agent("full_brake")
 
 
@@ -200,14 +196,6 @@ def test_file_of_an_agent__is_refused(spec: str, message: str, empty_folder: Pat
         make_agent(spec, scenario=PAPER)
 
 
-def test_file_of_an_agent__is_the_same_as_long_as_the_process_lives(empty_folder: Path) -> None:
-    Path("mine.py").write_text(FILE)
-    make_agent("mine.py:make_agent")
-    Path("mine.py").write_text(f"{FILE}# changed")
-    with refused("file 'mine.py': has changed since it was loaded; start a new Python process"):
-        make_agent("mine.py:make_agent")
-
-
 def test_file_of_an_agent__is_not_run_for_a_role(empty_folder: Path) -> None:
     Path("half.py").write_text("raise SystemExit('this ran')")
     with refused("agent 'half.py:make_agent': is a function in a Python file, which a scenario cannot use (the option"):
@@ -230,16 +218,6 @@ def test_looking_ahead__needs_commands_that_are_fixed_at_the_alert(drives: Calla
         drives()
 
 
-@pytest.mark.parametrize("knows", ["everything", ("messages", "gossip")])
-def test_knowledge__is_of_known_kinds(knows: Any) -> None:
-    agent = Own(len)
-    agent.knows = knows
-    with refused(
-        f"agent 'own': knows = {knows!r}: must be one or several of 'own sensors', 'messages', 'estimated model'"
-    ):
-        Knowledge.of(agent)
-
-
 def test_agent__has_a_name_and_its_act_takes_a_memory_if_it_begins_with_one() -> None:
     nameless = Own(len)
     del nameless.name
@@ -252,28 +230,6 @@ def test_agent__has_a_name_and_its_act_takes_a_memory_if_it_begins_with_one() ->
 
     with refused("agent 'own' of vehicle_2: the agent has a method begin, but its method act has no argument memory;"):
         evaluated(Begins(len))
-
-
-def test_policy__gives_one_action_per_world_and_a_state_per_world() -> None:
-    class Fixed:
-        observation = eb.ObservationSpec()
-
-        def __call__(self, seen: Any) -> Any:
-            return np.zeros((len(seen), 2), np.float32)
-
-    class Shared:
-        def predict(self, seen: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False) -> Any:
-            return np.zeros((len(seen), 1)), np.zeros((1, 8))
-
-    with refused("learned: actions have shape (12, 2); must have shape (12, 1), one action per world"):
-        LearnedAgent(Fixed()).act(WORLDS, 1)
-    with refused("27 features: an array of the policy's state has shape (1, 8) for two worlds and (1, 8) for three"):
-        eb.policy_agent(Shared())
-    states = eb.policy_agent(lambda seen, state: (seen, state), name="mine", initial_state=lambda n: np.zeros(3))
-    with refused(
-        "initial_state(12): state: contains ndarray of shape (3,); must contain only arrays of length 12", AgentFailed
-    ):
-        states.begin(WORLDS, 1, {})
 
 
 @pytest.mark.parametrize("around", ["", "+episode", "+episode:pairwise", "+step"])
@@ -295,24 +251,3 @@ def check_failure(around: str) -> None:
         eb.evaluate(
             PAPER.sample(12, 7), {"mine": make_agent("theirs" + around, scenario=PAPER)}, scenario=PAPER, chunk=5
         )
-
-
-def test_failure__after_the_first_step_is_told_with_its_step() -> None:
-    once = iter([1, 1, 1, 1, 0] + [1] * 99)
-    tired = eb.policy_agent(lambda seen: np.zeros((len(seen), 1 // next(once))), name="tired")
-    with refused("agent 'own', step 5: observations of shape (12, 27): ZeroDivisionError", AgentFailed):
-        evaluated(tired)
-
-
-def test_model_of_stable_baselines3__was_trained_on_the_features_that_it_is_given() -> None:
-    rows = eb.make_sb3_vec_env(PAPER, 2, observation=eb.ObservationSpec(front=2, rear=0))
-    with refused("agent 'PPO': the model was trained with the observation ObservationSpec(front=2, rear=0"):
-        eb.policy_agent(PPO("MlpPolicy", rows), observation=eb.ObservationSpec())
-    numbered = PPO("MlpPolicy", eb.make_sb3_vec_env(PAIR, 2, appended="number")).policy
-    with refused(
-        "the policy was trained for observations of shape (28,), but would get observations of 27 features; pass the"
-    ):
-        eb.policy_agent(numbered, scenario=PAIR)
-    stated = PPO("MlpPolicy", eb.make_sb3_vec_env(PAIR, 2, appended="state")).policy
-    with refused("agent 'ActorCriticPolicy': appended = 'state' needs the scenario of the training; pass it"):
-        eb.policy_agent(stated, appended="state")

@@ -6,26 +6,21 @@ import re
 import shlex
 import subprocess
 import sys
-import time
 from contextlib import nullcontext
 from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
 import typer
-from numba.core import event
 
 from ethbrake_marl import __version__, evaluation
 from ethbrake_marl.cli import app as frame
-from ethbrake_marl.cli.app import add_command, run_command, whole_command
+from ethbrake_marl.cli.app import run_command, whole_command
 from ethbrake_marl.cli.command import Out
-from ethbrake_marl.errors import AlreadyExists
 from ethbrake_marl.evaluation import evaluate, make_agents
-from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.scenario import load_scenario
 from tests.fixtures.commands import Command, check_refused, told_json
 
-ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = [""]  # every one, groups too
 for name, found in whole_command().commands.items():
     COMMANDS += [name, *(f"{name} {each}" for each in getattr(found, "commands", ()))]
@@ -70,47 +65,6 @@ def test_completion__a_shell_that_asks_gets_what_can_follow(monkeypatch, capsys,
         run_command(["--version"] if answered is None else [])
     assert ended is None or ended.value.code == 0
     assert (answered or f"ethbrake {__version__}\n") in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("loaded", "temporary", "told"),
-    [
-        (
-            [],
-            False,
-            "compiling the physics for the first time, which takes minutes; later commands use the stored result\n",
-        ),
-        (
-            ["advance-1"],
-            False,
-            "compiling parts of the physics for the first time; later commands use the stored result\n",
-        ),
-        ([], True, "no folder for compiled kernels is writable"),
-    ],
-)
-def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, loaded, temporary, told) -> None:
-    folder = tmp_path / ("ethbrake_marl-x" if temporary else "kept")
-    folder.mkdir()
-    monkeypatch.setattr("ethbrake_marl.kernel_store.cache_folder", lambda: folder)
-    monkeypatch.setattr("ethbrake_marl.physics.jit.cache_folder", lambda: folder)
-    monkeypatch.setattr("ethbrake_marl.physics.jit._loaded", loaded)
-    monkeypatch.setattr("ethbrake_marl.kernel_store._tellers", [])
-    monkeypatch.setitem(event._registered, "numba:compile", [])  # nobody listens any more after this test
-    monkeypatch.setattr("warnings.showwarning", None)
-    monkeypatch.setattr(frame, "EVERY_S", 0.001)
-    frame.prepare_streams()
-
-    @compiled
-    def next_number(x: int) -> int:
-        return x + 1
-
-    assert (next_number(1), next_number(1.5)) == (2, 2.5)
-    captured = capsys.readouterr()
-    first, *more = captured.err.splitlines()
-    assert captured.out == "" and told in f"{first}\n" and more  # each as long as it lasts
-    assert all(re.fullmatch(r"still compiling: \d+ kernels are done after \d+ s", line) for line in more)
-    time.sleep(0.1)
-    assert capsys.readouterr().err == ""  # nothing is compiled any more
 
 
 def test_results__stand_alone_on_stdout_whatever_a_file_of_the_users_prints(ethbrake: Command, tmp_path: Path) -> None:
@@ -175,18 +129,6 @@ def test_program__prints_a_table_on_a_narrow_stdout_and_needs_no_torch(encoding:
     assert out.endswith("loaded:\n"), out
 
 
-def test_kernels__a_temporary_cache_is_told_and_removed_at_the_end(tmp_path: Path) -> None:
-    _, out, _ = program(
-        "from ethbrake_marl.kernel_store import cache_folder; print(cache_folder(), cache_folder().is_dir())\n"
-        "from ethbrake_marl.cli.doctor import _kernel_cache; print(_kernel_cache()[1])",
-        NUMBA_CACHE_DIR="/dev/null/x",
-        TMPDIR=str(tmp_path),
-    )
-    where, told = out.splitlines()
-    assert where.startswith(str(tmp_path / "ethbrake_marl-")) and where.endswith(" True") and "temporary" in told
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_progress__without_a_terminal_is_lines_and_every_ten_seconds_the_time_that_is_left(capsys, monkeypatch) -> None:
     out = Out()
     out.progress("training", 0, 1000, "total harm 9.00")
@@ -237,20 +179,6 @@ def test_agents_from_a_file__drive_on_the_command_line_behind_a_shield(ethbrake,
     answer = ethbrake("evaluate", "--episodes", "10", "--agents", f"{spec},{spec}+step", "--json")
     assert [row["agent"] for row in json.loads(answer.out)] == [spec, f"{spec}+step"]
     assert ethbrake("shield", "--episodes", "10", "--agents", spec).status == 0
-
-
-def test_command_of_a_program__appears_runs_and_takes_no_other_place(ethbrake, monkeypatch):
-    monkeypatch.setattr(frame.COMMANDS, "loaded", dict(frame.COMMANDS.loaded))
-
-    def hello() -> None:
-        """Say hello."""
-        print("hello")
-
-    add_command("hello", hello)
-    assert "Say hello." in ethbrake("--help").out and ethbrake("hello").out == "hello\n"
-    for name in ("hello", "evaluate"):
-        with pytest.raises(AlreadyExists, match=f"command '{name}' is registered already"):
-            add_command(name, lambda: None)
 
 
 def test_stdout__has_results_alone_whatever_writes_past_python(capfd, monkeypatch) -> None:

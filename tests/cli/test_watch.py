@@ -27,7 +27,6 @@ from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.tables import read_worlds
 from tests.fixtures.commands import Command, check_refused, rows_of, told_json
 
-ROOT = Path(__file__).resolve().parents[2]
 SCENARIO = load_scenario("paper-random")
 
 

@@ -124,12 +124,6 @@ def test_episode__starts_at_the_alert_without_an_impact() -> None:
         make_engine(PAPER, 2).reset(worlds=hit)
 
 
-def test_branch__has_an_end_and_no_shaping() -> None:
-    shaped = make_engine(PAPER, 2, reward={"harm": 1.0, "shaping": 0.1})
-    with refused("branch: the reward has shaping = 0.1; branch needs shaping = 0"):
-        shaped.branch(shaped.moment())
-
-
 def test_snapshot__of_another_engine_is_refused() -> None:
     kept = make_engine(PAPER, 6).snapshot()
     with refused("engine snapshot: the array params has the shape (6, 25); must have the shape (6, 37)"):

@@ -14,7 +14,7 @@ from stable_baselines3.common.env_util import make_vec_env
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.game.discrete_actions import index_to_action
-from tests.contract.interfaces import BARE, CRASH, INTERFACES, PAPER, STEP, rows_of
+from tests.contract.interfaces import BARE, CRASH, INTERFACES, PAPER, rows_of
 
 PAIR = eb.load_scenario("cooperation-3-pair")
 
@@ -75,42 +75,6 @@ def test_spaces__are_discrete_for_learners_and_as_ever_for_scripts() -> None:
     assert eb.EthBrakeEnv(actions=9).action_space == eb.make_sb3_vec_env(PAIR, 2, actions=9).action_space == Discrete(9)
     many = gymnasium.make_vec("EthBrake-v1", num_envs=4, actions=9)
     assert many.single_action_space == Discrete(9) and many.action_space.shape == (4,)
-
-
-def test_team__acts_by_an_index_each() -> None:
-    env, same = eb.parallel_env(PAIR, actions=5), eb.parallel_env(PAIR)
-    env.reset(seed=1), same.reset(seed=1)
-    told = env.step({"vehicle_2": 1, "vehicle_3": np.int64(4)})[4]
-    assert repr(told) == repr(same.step({"vehicle_2": [-0.5], "vehicle_3": [1.0]})[4])
-    rows = eb.make_sb3_vec_env(PAIR, 2, seed=1, actions=5, step_infos=True)
-    rows.reset()
-    assert [info["chosen_action"].item() for info in rows.step(np.array([1, 4, 0, 2]))[3]] == [-0.5, 1.0, -1.0, 0.0]
-
-
-@pytest.mark.parametrize("name", STEP)
-def test_shield__replaces_an_index_by_any_action_and_the_infos_say_so(name: str) -> None:
-    rows = {"step_infos": True} if name.endswith("sb3") else {}
-    interface = STEP[name](PAPER, rows_of(name), actions=9, **rows)
-    interface.reset(7)
-    interface.step(np.full((interface.n, 1), 7))
-    info = interface.env.unwrapped.engine.guard.report(interface.env.unwrapped.engine)
-    assert (info["proposed_action"][:, 1] == 0.75).all() and info["intervened"][:, 1].any()
-    applied = info["applied_action"][info["intervened"][:, 1], 1]
-    assert (applied < 0.75).all()
-
-
-@pytest.mark.parametrize("environment", ["single", "parallel"])
-def test_shield__takes_the_policy_where_no_index_is_given(environment: str) -> None:
-    policy = eb.make_agent("full_brake")
-    if environment == "single":
-        env = eb.shield(eb.EthBrakeEnv(actions=9), policy)
-        env.reset(seed=7)
-        info = env.step(None)[4]
-    else:
-        env = eb.shield(eb.parallel_env(actions=9), policy)
-        env.reset(seed=7)
-        info = env.step({})[4]["vehicle_2"]
-    assert info["shield_proposed_action"] == -1.0
 
 
 # What is refused.

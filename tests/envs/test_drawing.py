@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.envs.rendering import BODY_M, HEIGHT, WIDTH, View, follow
+from ethbrake_marl.envs.rendering import BODY_M, HEIGHT, WIDTH
 from ethbrake_marl.envs.trace import Trace
 from ethbrake_marl.errors import InvalidInput
 from tests.contract.interfaces import CRASH
 
 near = pytest.approx
-SHAPE = (HEIGHT, WIDTH, 3)
 FLASH = (255, 214, 10)
 COAST = np.zeros(1, np.float32)
 
@@ -93,35 +92,6 @@ def test_scene__has_the_numbers_of_the_infos_and_the_places_of_the_physics() -> 
     assert -np.diff(last.front_m) == near(last.gaps_m + BODY_M)
     for scene in shown:
         assert scene.view.left_m < scene.front_m[-1] - BODY_M and scene.front_m[0] < scene.view.right_m
-
-
-@pytest.mark.parametrize(
-    ("ends", "view"),
-    [
-        ((44.0, -20.0), View(-30.0, 50.0)),
-        ((55.0, 0.0), View(-20.0, 60.0)),
-        ((55.0, -25.0), View(-32.5, 60.0)),
-        ((0.0, -40.0), View(-47.5, 50.0)),
-    ],
-)
-def test_view__stands_still_until_the_line_would_leave_it(ends: tuple[float, float], view: View) -> None:
-    assert follow(View(-30.0, 50.0), np.array(ends)) == view
-
-
-@pytest.mark.parametrize("make", [gymnasium.make, eb.EthBrakeEnv])
-def test_list__has_the_beginning_and_each_step_once(make: Any) -> None:
-    name = ("EthBrake-v1",) if make is gymnasium.make else ()
-    environment = make(*name, scenario=CRASH, render_mode="rgb_array_list")
-    environment.reset(seed=0)
-    for _ in range(3):
-        environment.step(COAST)
-    frames = environment.render()
-    assert [frame.shape for frame in frames] == [SHAPE] * 4 and environment.render() == []
-    environment.step(COAST)
-    assert len(environment.render()) == 1
-    environment.reset(seed=0)
-    (first,) = environment.render()
-    assert np.array_equal(first, frames[0])
 
 
 CRASHED = """\

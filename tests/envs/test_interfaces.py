@@ -1,8 +1,6 @@
 """What is special to one interface; what all promise: ``tests/contract``."""
 
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
@@ -14,7 +12,6 @@ import pettingzoo
 import pytest
 from gymnasium.vector import AutoresetMode
 from pettingzoo.utils.conversions import aec_to_parallel
-from stable_baselines3.common.monitor import Monitor
 
 import ethbrake_marl as eb
 from ethbrake_marl import ethbrake_v1
@@ -197,22 +194,6 @@ def test_registration__by_id_twice_and_with_the_projects_name() -> None:
     assert ethbrake_v1.parallel_env is eb.parallel_env and {"env", "raw_env"} <= set(dir(ethbrake_v1))
 
 
-def test_import__stays_light_until_a_name_is_used_and_lets_gymnasium_make_it_by_id() -> None:
-    program = (
-        "import sys, ethbrake_marl as eb\n"
-        "heavy = lambda: sorted({'torch', 'numba', 'stable_baselines3', 'matplotlib', 'pydantic'} & set(sys.modules))\n"
-        "print(heavy()); p = eb.parallel_env(); p.reset(seed=0); print(heavy())\n"
-        "import gymnasium; e = gymnasium.make('ethbrake_marl:EthBrake-v1'); print(type(e.unwrapped).__name__)\n"
-        "e.reset(seed=0); e.step(e.action_space.sample())\n"
-        "a = eb.EthBrakeEnv(render_mode='ansi'); a.reset(seed=0); a.render()\n"
-        "watched = e.unwrapped.engine._now.watched, p.engine._now.watched\n"
-        "print(*watched, *{'PIL', 'pygame', 'matplotlib'} & set(sys.modules))"
-    )
-    command = [sys.executable, "-W", "error", "-c", program]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert result.stdout.splitlines() == ["[]", "['numba', 'pydantic']", "EthBrakeEnv", "{} {}"], result.stderr
-
-
 def test_page__its_examples_run() -> None:
     names: dict[str, object] = {}
     for code in re.findall("```python\n(.*?)```", PAGE, re.DOTALL):
@@ -313,16 +294,6 @@ def test_reset_infos__belong_to_the_running_episodes_and_tell_the_news_of_each_l
     known = env.engine.packed.known_from_s
     told = [info["known_from_s"].tolist() for info in env.reset_infos]
     assert told == [known[k, i].tolist() for k in range(3) for i in range(4)]
-
-
-def test_attributes__belong_to_the_whole_batch() -> None:
-    env = make_sb3_vec_env(CRASH, 3)
-    assert isinstance(env, EthBrakeVecEnv) and env.get_attr("render_mode") == [None] * 3
-    assert [engine is env.engine for engine in env.get_attr("engine", indices=[0, 2])] == [True, True]
-    env.set_attr("label", 7)
-    assert (env.get_attr("label"), env.env_method("seed", 4)) == ([7] * 3, [[4] * 3] * 3)
-    assert (env.has_attr("engine"), env.has_attr("nothing")) == (True, False)
-    assert env.env_is_wrapped(Monitor) == [False] * 3
 
 
 def test_step_async__keeps_its_own_copy_of_the_actions() -> None:
@@ -515,25 +486,6 @@ def test_features__each_learner_may_observe_its_own(said) -> None:
     assert eb.observation_for(pair, "vehicle_2").size == 27
     assert eb.Scenario(**declared.declared()) == declared
     assert declared.replace(observation=["own"]).observation == ("own",)
-
-
-def test_shares_of_the_steps__add_up_to_those_of_the_episode() -> None:
-    pair = eb.load_scenario("cooperation-3-pair")
-    engine = eb.make_engine(pair, 6, seed=7)
-    shares = {"first": np.zeros((6, 3)), "total": np.zeros((6, 3))}
-    begun, cost = engine.ledger, np.zeros(6)
-    while not engine.ended.all():
-        before = engine.ledger
-        step = engine.step(np.full((6, 2), -1.0))
-        cost += step.counted_harm
-        for count, share in shares.items():
-            share += engine.ledger.since(before).vehicle_harm(count)
-    assert engine.observe_all().shape == (6, 2, 27)
-    assert step.reward.shape == (6, 3)
-    assert shares["first"].any()
-    for count, share in shares.items():
-        assert np.allclose(share, engine.ledger.since(begun).vehicle_harm(count))
-    assert np.allclose(cost, shares["first"].sum(axis=1))
 
 
 def test_stream__gives_every_world_of_its_list_once_and_in_order() -> None:

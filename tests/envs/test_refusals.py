@@ -106,30 +106,3 @@ def test_step__needs_an_episode_that_runs() -> None:
         in_turn.step(np.zeros(1, np.float32))
     with refused("step: the episode of vehicle_2 has ended; pass the action None, or call reset"):
         in_turn.step(np.zeros(1, np.float32))
-
-
-def test_worlds__that_go_on_from_a_snapshot_are_not_described() -> None:
-    env = eb.EthBrakeVectorEnv(2, PAPER)
-    start = {"gaps_m": [7, 8], "speeds_mps": [20, 18, 20], "mass_t": 2, "braking_capacity_mps2": 6}
-    start |= {"driving_capacity_mps2": 1, "latency_s": 0, "speed_limit_mps": 40}
-    env.reset(options={"initial_state": start})
-    env.engine.restore(env.engine.snapshot())
-    with refused(
-        "describe_worlds: the initial states of these worlds are not known, because the environment was restored"
-    ):
-        env.describe_worlds()
-
-
-def test_world__that_was_left_out_is_not_described() -> None:
-    env = started(eb.EthBrakeVectorEnv(2, "realistic-mixed"))
-    env.engine.roster.numbers[1] = 40  # as if world 40 had been left out
-    with refused(
-        "describe_worlds: the random draw of row 1 is unknown: the physics failed in world 40 of seed 3 before its"
-    ):
-        env.describe_worlds()
-
-
-def test_action__is_compared_after_the_rounding_of_float32() -> None:
-    beyond = np.nextafter(np.float32(1), np.float32(2))
-    with refused("action of vehicle_2 = 1.000000238418579: must be from -1 (full braking) to 1 (full driving)"):
-        started(eb.EthBrakeVectorEnv(2)).step(np.full((2, 1), np.nextafter(beyond, np.float32(2))))

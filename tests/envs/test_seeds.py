@@ -4,7 +4,6 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -15,7 +14,6 @@ from stable_baselines3.common.env_util import make_vec_env
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
 
-ROOT = Path(__file__).resolve().parents[2]
 MAKERS: dict[str, Callable[[], Any]] = {
     "parallel": eb.parallel_env,
     "in turn": eb.env,

@@ -14,7 +14,6 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.chunks import Lineup, evaluate_held, summarise_tally, tally_list
 from ethbrake_marl.evaluation.comparison import compare_results
 from ethbrake_marl.evaluation.per_world import read_result, results_to_json, write_per_world
-from ethbrake_marl.evaluation.seeds import mean_over_seeds, share_over_seeds
 from ethbrake_marl.evaluation.statistics import (
     Moments,
     mean,
@@ -82,22 +81,6 @@ def test_rows_that_are_repeated_in_one_cluster__tell_no_more_than_one_of_them(k:
     few = share_of(again > 4.0, names).interval
     factor = (stats.norm.ppf(0.975) / stats.t.ppf(0.975, 39)) ** 2
     assert few == pytest.approx(wilson(float((x > 4.0).mean()), 40 * factor), rel=1e-9)
-
-
-@pytest.mark.parametrize("k", [1, 2, 10])
-def test_rows_that_are_repeated_in_one_cluster__tell_no_more_over_seeds_either(k: int) -> None:
-    x, y, z = np.random.default_rng(5).exponential(3.0, (3, 2, 40))
-    names = np.repeat([f"drive {number:02}" for number in range(40)], k)
-    again, other, best = (np.repeat(each, k, axis=1) for each in (x, y, z * 0.1))
-    for found, once in (
-        (mean_over_seeds(again, clusters=names), mean_over_seeds(x)),
-        (mean_over_seeds(again, other, clusters=names), mean_over_seeds(x, y)),
-        (share_over_seeds(again, other + 3.0, best, clusters=names), share_over_seeds(x, y + 3.0, z * 0.1)),
-    ):
-        assert found.value == pytest.approx(once.value) and found.interval == pytest.approx(once.interval)
-    hit = mean_over_seeds(np.zeros((2, 40 * k), np.bool_), clusters=names).interval
-    assert hit == pytest.approx(share_of(np.zeros(40, np.bool_), np.arange(40).astype(str)).interval)
-    assert mean_over_seeds(again, clusters=np.repeat("a", 40 * k)).interval is None
 
 
 def test_intervals__of_one_cluster_are_unknown() -> None:

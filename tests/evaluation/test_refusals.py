@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import UnknownName
 from ethbrake_marl.evaluation.comparison import compare_results
 from ethbrake_marl.evaluation.lineup import make_lineup
@@ -21,20 +20,9 @@ from ethbrake_marl.evaluation.statistics import exact_sum, mean, paired_differen
 from ethbrake_marl.evaluation.summary import summarise
 from tests.refused import refused
 
-PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")
+PAPER = eb.load_scenario("paper-random")
 WORLDS = PAPER.sample(3, 0).worlds
 BRAKE = {"full_brake": eb.make_agent("full_brake")}
-FOUR = PAPER.replace(
-    vehicles=4,
-    gaps_m=7.0,
-    speeds_mps=20.0,
-    braking_capacity_mps2=6.0,
-    driving_capacity_mps2=6.0,
-    mass_t=5.0,
-    latency_s=0.5,
-    roles={"vehicle_2": "learner"},
-)
-HEAD = "agent,world,first_impact_harm,total_harm\n"
 
 
 class Confused:
@@ -94,13 +82,6 @@ def test_groups__are_those_of_a_mixture_or_of_vehicle_types() -> None:
         eb.summarise_by(eb.evaluate(mixed.sample(3, 7), BRAKE, scenario=mixed), "vehicle_9_type")
 
 
-def test_agent__says_what_it_knows() -> None:
-    knowing = Confused((3,))
-    knowing.knows = "all"
-    with refused("agent 'confused': knows = 'all': must be one or several of 'own sensors', 'messages'"):
-        eb.evaluate(WORLDS, {"x": knowing}, scenario=PAPER)
-
-
 # ---------------------------------------------------------------- results that are compared
 
 
@@ -145,20 +126,6 @@ def test_results_file__has_means_inside_their_intervals(changes: dict[str, Any],
 def test_results__of_something_else_are_not_compared(key: str, message: str, empty_folder: Path) -> None:
     with refused(f"x.json and x.json {message}"):
         compare_results(result([row()]), result([row(**{key: "0" * 64})]))
-
-
-def test_results__whose_mean_is_not_that_of_their_worlds_are_not_compared(empty_folder: Path) -> None:
-    assert (
-        run_command(["evaluate", "--agents", "full_brake", "--episodes", "5", "--output", "a", "--per-world", "csv"])
-        == 0
-    )
-    (told,) = json.loads(Path("a/results.json").read_text())
-    changed = {**told, "first_impact_harm": 3.0, "first_impact_harm_interval": [2.0, 4.0]}
-    Path("a/x.json").write_text(json.dumps([changed]))
-    with refused(
-        "a/x.json: full_brake: first_impact_harm = 3, but its mean over the file with one row per world is 27.1787; one"
-    ):
-        compare_results(read_result(Path("a/results.json")), read_result(Path("a/x.json")))
 
 
 # ---------------------------------------------------------------- episodes, statistics, figures

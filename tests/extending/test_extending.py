@@ -204,21 +204,6 @@ def test_term__that_is_wrong_is_named_and_the_step_is_not_made(later: Any, messa
     assert engine.packed.state.tobytes() == before.tobytes()
 
 
-def test_term__counts_in_running_worlds_only() -> None:
-    moving = changed(lambda step: np.where(step.speeds_mps.max(axis=1) > 0.0, 1.0, np.nan))
-    eb.register_measure("mine", moving, by="step")
-    engine = engine_of(1, reward={"harm": 1.0, "mine": 2.0})
-    with pytest.raises(InvalidInput, match="at step"):
-        for _ in range(90):
-            engine.step(-np.ones((1, 1)))
-    eb.register_measure("calm", one, by="step")
-    ending = engine_of(2, reward={"harm": 1.0, "mine": 0.0, "calm": 1.0})
-    while not ending.ended.all():
-        last = ending.step(-np.ones((2, 1)))
-    again = ending.step(-np.ones((2, 1))).further["calm"]
-    assert (last.further["calm"][~last.ended] == 0.0).all() and not again.any()
-
-
 # ---------------------------------------------------------------- presets, objectives, schemas
 
 

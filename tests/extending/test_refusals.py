@@ -11,7 +11,6 @@ import ethbrake_marl as eb
 from ethbrake_marl.errors import AlreadyExists, UnknownName
 from ethbrake_marl.game.features import FEATURES
 from ethbrake_marl.game.rewards import reward_params
-from ethbrake_marl.scenario.catalogue import new_scenario_text
 from tests.fixtures.policies import make_policy
 from tests.refused import refused
 
@@ -148,24 +147,6 @@ def test_objective__gives_a_finite_number_per_world_and_changes_nothing(given: A
         started({"harm": 1.0, "objective": "mine"}).step({"vehicle_2": [0.0]})
 
 
-def test_objective__of_the_user_is_suggested_and_takes_no_argument() -> None:
-    eb.register_objective("front-first", gives(lambda harm: harm.borne[:, 0]))
-    with refused("objective = frontfirst: unknown objective 'frontfirst'; did you mean 'front-first'?"):
-        PAPER.replace(objective="frontfirst")
-    with refused("objective 'front-first:3': front-first takes no argument"):
-        PAPER.replace(objective="front-first:3")
-
-
-def test_feature__that_is_not_finite_later_is_told_with_its_world_and_step() -> None:
-    late = gives(lambda worlds: np.where((worlds.time_s > 1.0) & (np.arange(worlds.n) == 1), np.inf, 0.0))
-    eb.register_feature("late", late, **SCALED)
-    engine = eb.make_sb3_vec_env(PAPER, 3, seed=1, observation=["own", "late"]).engine
-    with refused("feature 'late': its value is inf for vehicle_2 in world 1 at 1.1 s after step 6; must be finite"):
-        for _ in range(20):
-            engine.step(-np.ones((3, 1)))
-            engine.observe(1)
-
-
 @pytest.mark.parametrize(
     ("urgency", "message"),
     [(None, "observes the feature 'urgency', which"), ((1.0, 3.0), "observes the feature 'urgency', whose")],
@@ -183,16 +164,6 @@ def test_policy__observes_the_features_that_it_was_trained_on(urgency: Any, mess
         eb.load_policy("kept")
 
 
-def test_channel__of_the_user_is_checked_and_listed_as_ours() -> None:
-    eb.register_preset("wired", {"preset": "nominal", "link_latency_s": 0.4})
-    with refused("v2x.radio_s = 0.1: has no effect, because link_latency_s fixes the delay of messages"):
-        PAPER.replace(v2x={"preset": "wired", "radio_s": 0.1})
-    with refused(
-        "v2x.preset = wierd: must be a preset: paper, clear, nominal, congested, blocked, sensors-only or wired"
-    ):
-        PAPER.replace(v2x="wierd")
-
-
 @pytest.mark.parametrize(
     ("few", "kind"),
     [(lambda n: np.zeros(n, bool), "truth value per world"), (lambda n: np.zeros((n, 3)), "number per vehicle")],
@@ -203,33 +174,3 @@ def test_measure__always_gives_what_it_gave_when_it_was_registered(few: Any, kin
     eb.register_measure("mine", changes, unit="1")
     with refused(f"measure 'mine': its function returned a number per world, but a {kind} when it was registered"):
         eb.evaluate(PAPER.sample(40, 7), {"full_brake": eb.make_agent("full_brake")}, scenario=PAPER)
-
-
-def folder(name: str, *scenarios: str) -> None:
-    """A folder with these scenarios."""
-    Path(name).mkdir()
-    for scenario in scenarios:
-        Path(name, f"{scenario}.yaml").write_text(new_scenario_text(scenario))
-
-
-def test_folder_of_scenarios__has_some_and_names_of_its_own(empty_folder: Path) -> None:
-    folder("empty")
-    with refused("scenarios 'empty': has no file that ends in .yaml"):
-        eb.register_scenarios("empty")
-    folder("shipped", "paper-random")
-    with refused(
-        "shipped/paper-random.yaml: a shipped scenario already has the name 'paper-random'; rename", AlreadyExists
-    ):
-        eb.register_scenarios("shipped")
-    folder("mine", "hills", "valleys")
-    folder("twin", "hills")
-    eb.register_scenarios("mine")
-    with refused("mine/hills.yaml already has the name 'hills'; rename the file", AlreadyExists):
-        eb.register_scenarios("twin")
-    with refused("unknown scenario 'valley'; did you mean 'valleys'?", UnknownName):
-        eb.load_scenario("valley")
-    Path("mine", "valleys.yaml").write_text("name: valleys\n")
-    with refused(
-        "mine/valleys.yaml: braking_capacity_mps2: missing; write, for instance, braking_capacity_mps2: [6, 7"
-    ):
-        eb.load_scenario("valleys")

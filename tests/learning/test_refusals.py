@@ -8,11 +8,8 @@ from typing import Any
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.driving import script_agents
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, UnknownName
-from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.files.store import hold_lock
-from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.training.ppo import Ppo
 from ethbrake_marl.training.recipe import load_recipe, register_algorithm
 from ethbrake_marl.training.recipes import PpoRecipe
@@ -22,7 +19,6 @@ from ethbrake_marl.training.settings import read_settings
 from ethbrake_marl.training.team import load_team
 from ethbrake_marl.training.training import Training, check_same_training
 from tests.fixtures.policies import make_policy
-from tests.learning.test_algorithms import A2C, recipe_file
 from tests.learning.tiny import TINY_PPO
 from tests.refused import refused
 
@@ -123,21 +119,6 @@ def test_algorithm__has_a_name_of_its_own() -> None:
         register_algorithm("ppo", PpoRecipe, Ppo)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"n_stepz": 3}, "mine.yaml, line 22: n_stepz: unknown"),
-        ({"scheme": "independent"}, "scheme independent: the algorithm a2c"),
-    ],
-    ids=lambda value: str(value)[:30],
-)
-def test_recipe_of_a_user__is_checked_as_ours(changes: dict[str, Any], message: str, empty_folder: Path) -> None:
-    Path("my_algorithm.py").write_text(A2C)
-    load_from_file("my_algorithm.py", "A2C")
-    with refused(message):
-        train(recipe_file(Path(), **changes), PAIR, Path("run"))
-
-
 # ---------------------------------------------------------------- the folder of a run
 
 
@@ -201,18 +182,6 @@ def test_configuration_of_a_run__is_refused(changes: dict[str, Any], message: st
         resume(run.path)
 
 
-def test_training_that_has_finished__says_how_to_measure_it(run: RunDirectory) -> None:
-    run.write_status("finished")
-    with refused("evaluate its policy with: ethbrake evaluate --scenario paper-random --agents full_brake,ppo@"):
-        resume(run.path)
-    team = RunDirectory(Path("team")).create(Training.of(TINY_PPO, PAIR, scheme="independent").config())
-    team.write_status("finished")
-    with refused(
-        "evaluate its policy with: ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,team@team"
-    ):
-        resume(team.path)
-
-
 def test_lock__is_held_by_one_and_is_a_file(empty_folder: Path) -> None:
     Path("some.lock").mkdir()
     with (
@@ -230,14 +199,6 @@ def test_lock__is_held_by_one_and_is_a_file(empty_folder: Path) -> None:
 
 # ---------------------------------------------------------------- a policy for each vehicle
 
-FOUR = PAIR.replace(
-    vehicles=4,
-    braking_capacity_mps2=6,
-    driving_capacity_mps2=6,
-    mass_t=5,
-    latency_s=0.5,
-    roles={"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "learner", "vehicle_4": "full_brake"},
-)
 TEAM = Path("team/team.json")
 DRIVERS = {name: f"policy/{name}" for name in ("vehicle_2", "vehicle_3")}
 
@@ -249,25 +210,6 @@ def team(empty_folder: Path) -> RunDirectory:
         make_policy(eb.ObservationSpec(), {"name": "cooperation-3-pair"}).save(TEAM.parent / path)
     TEAM.write_text(json.dumps({"scheme": "independent", "vehicles": 3, "drivers": DRIVERS}))
     return RunDirectory(TEAM.parent)
-
-
-def test_team__drives_a_line_of_its_length_and_vehicles_of_its_own(team: RunDirectory) -> None:
-    assert sorted(load_team(team.path, PAIR).drivers) == [1, 2]
-    assert sorted(load_team(team.path, PAIR.with_learners(["vehicle_3"])).drivers) == [2]
-    with refused(
-        "team: this team is for a line of 3 vehicles, but scenario 'cooperation-3-pair' has 4 vehicles; choose a"
-    ):
-        load_team(team.path, FOUR)
-    with refused("team: this team can drive vehicle_2, vehicle_3, but scenario 'cooperation-3-pair' has no learner"):
-        load_team(team.path, PAIR.with_learners([]))
-    with refused(
-        "team: has one policy for each learner; give the path of one of them, for instance team/policy/vehicle_2"
-    ):
-        load_policy(TEAM.parent)
-    with refused(
-        "team: this team can drive vehicle_2, vehicle_3, but scenario 'cooperation-3-pair' has learner vehicle_1"
-    ):
-        script_agents(PAIR.replace(roles={"vehicle_1": "team@team", "vehicle_2": "team@team", "vehicle_3": "learner"}))
 
 
 @pytest.mark.parametrize(
@@ -283,13 +225,4 @@ def test_file_of_a_team__is_refused(content: Any, message: str, team: RunDirecto
     good = {"scheme": "independent", "vehicles": 3, "drivers": DRIVERS}
     TEAM.write_text(content if isinstance(content, str) else json.dumps(good | content))
     with refused(message, CorruptBundle):
-        load_team(team.path, PAIR)
-
-
-def test_policy_of_a_team__is_whole(team: RunDirectory) -> None:
-    Path("team/policy/vehicle_3/weights.safetensors").unlink()
-    with refused("team/policy/vehicle_3/weights.safetensors: is missing", CorruptBundle):
-        load_team(team.path, PAIR)
-    Path("team/policy/vehicle_2/manifest.json").write_text("{}")
-    with refused("team/policy/vehicle_2/manifest.json: algorithm: is missing", CorruptBundle):
         load_team(team.path, PAIR)

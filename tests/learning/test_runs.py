@@ -23,7 +23,6 @@ from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.files.store import new_folder, write_file
-from ethbrake_marl.game.objectives import objective_harm, objectives_of
 from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.policies.layers import dense
 from ethbrake_marl.policies.policy import Policy
@@ -221,24 +220,6 @@ def check_one_update(recipe: TrainingRecipe, run: Path) -> None:
     assert load_policy(run).manifest.algorithm == recipe.algorithm
 
 
-def test_train__keeps_and_tells_what_the_learners_objectives_make_of_the_harm(tmp_path: Path) -> None:
-    objectives = ["total", "own", "weighted:0.001,0.001,1"]
-    scenario = SCENARIO.with_learners(["vehicle_2", "vehicle_3"]).replace(objective=objectives)
-    recipe = TINY.replace(total_steps=6 * 128, evaluation={"every_updates": 1, "worlds": 10, "seed": 7})
-    said: list[str] = []
-    result = train_module.train(recipe, scenario, tmp_path / "run", on_progress=lambda shown: said.append(shown.harm))
-    assert said[0] == f"objective by first impacts (own, {objectives[2]}) {result.evaluations[0]['objective']:.2f}"
-    rows = [row for row in RunDirectory(tmp_path / "run").rows() if row["eval/objective"]]
-    best = min(result.evaluations, key=lambda each: each["objective"])
-    kept = load_policy(tmp_path / "run" / "policy")
-    assert len(rows) == len(result.evaluations) > 3 and kept.manifest.steps == best["steps"]
-    found = evaluate(scenario.sample(10, 7).worlds, {"kept": eb.LearnedAgent(kept)}, scenario=scenario)
-    harm = objective_harm(found.outcome("kept").ledger, "first", objectives_of(objectives, 3)).mean(axis=0)
-    told = [best["objective_vehicle_2"], best["objective_vehicle_3"]]
-    assert told == pytest.approx(harm[1:]) and best["objective"] == sum(told) / 2
-    assert "objective" not in train_module.train(TINY, SCENARIO, tmp_path / "plain", steps=1).evaluations[0]
-
-
 def test_course__the_best_is_judged_by_the_count_of_the_reward_and_comes_back_from_json(policy) -> None:
     other = policy.__class__(policy.manifest.model_copy(update={"steps": 5}), policy.tensors)
     course, again = Course("total"), Course("total")
@@ -250,18 +231,6 @@ def test_course__the_best_is_judged_by_the_count_of_the_reward_and_comes_back_fr
     assert (again.evaluations, again.best_harm) == (course.evaluations, 10.0)
     assert again.wall_s >= course.wall_before_s
     assert course.evaluations[1] == {"steps": 0, "updates": 0, **second, "episode_return": -3.0}
-
-
-def test_course__the_best_goes_by_the_objective_where_one_is_told(policy) -> None:
-    by_steps = [policy.__class__(policy.manifest.model_copy(update={"steps": k}), policy.tensors) for k in range(4)]
-    course, adversary = Course(), Course()
-    for each, line, objective in zip(by_steps, (24.0, 30.0, 20.0, 18.0), (8.0, 0.1, 6.0, 7.0), strict=True):
-        metrics = {"first_impact_harm": line, "objective": objective, "objective_vehicle_2": objective}
-        course.add_evaluation(each, metrics, None)
-    assert course.chosen is by_steps[1] and course.best_harm == 0.1
-    for k, each in enumerate([*by_steps, *by_steps]):
-        adversary.add_evaluation(each, {"first_impact_harm": 20.0 + k, "objective": -20.0 - k}, float(k))
-    assert adversary.best_harm == -27.0
 
 
 def test_write_file__replaces_in_one_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -685,20 +654,6 @@ def test_dense_layer__by_hand() -> None:
     x, y = np.array([[1, 0], [1, 0], [1, 0], [1, 0], [1, 2]], np.float32), np.empty((2, 2), np.float32)
     dense(weight, np.array([10, 20], np.float32), x, y)
     assert y.tolist() == [[25.0, 20.0], [19.0, 18.0]]
-
-
-def test_independent_learners__have_features_of_their_own(empty_folder: Path) -> None:
-    own = PAIR.replace(
-        observation={"vehicle_2": ["own", "front_1.gap"], "vehicle_3": ["rear_1.gap", "place", "own.speed"]}
-    )
-    training = Training.of(TINY_PPO.replace(scheme="independent"), own)
-    assert training.observation.size == 10
-    assert training.columns == [[0, 1, 2, 3, 4, 5, 6, 7], [8, 9, 0]]
-    made = eb.train(training.recipe, own, "own", steps=300, on_progress=None).policies
-    assert {
-        name: (policy.observation.size, policy.manifest.observation.features[-1]) for name, policy in made.items()
-    } == {"vehicle_2": (8, "front_1.gap"), "vehicle_3": (3, "own.speed")}
-    assert sorted(eb.make_agent("team@own", scenario=own).drivers) == [1, 2]
 
 
 def test_script_with_a_memory__leaves_a_folder_whose_agent_remembers(

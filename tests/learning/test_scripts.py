@@ -16,8 +16,7 @@ from tests.docs.site import load
 from tests.learning.tiny import harm_beside_full_braking
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning", "ignore::FutureWarning")
-TRAIN = Path(__file__).resolve().parents[2] / "train"
-PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")
+PAIR = eb.load_scenario("cooperation-3-pair")
 
 
 @pytest.fixture

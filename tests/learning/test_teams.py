@@ -24,7 +24,6 @@ from ethbrake_marl.training.training import Training, check_same_training
 from tests.learning.tiny import TINY_PPO, Answer, harm_beside_full_braking, marked, watch_steps
 
 PAIR = eb.load_scenario("cooperation-3-pair")
-ALONE = eb.load_scenario("cooperation-2-paper")
 NAMES = ("vehicle_2", "vehicle_3")
 TINY = TINY_PPO.replace(total_steps=4 * 256)
 

@@ -1,7 +1,5 @@
 """What policies, their folders and their observations may not be."""
 
-import os
-import socket
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -46,28 +44,6 @@ POLICIES: dict[str, Callable[[], object]] = {
 def test_policy__is_refused(message: str) -> None:
     with refused(message):
         POLICIES[message]()
-
-
-def listen(path: Path) -> None:
-    """A socket at this path."""
-    with socket.socket(socket.AF_UNIX) as server:
-        server.bind(str(path))
-
-
-@pytest.mark.parametrize("make", [listen, os.mkfifo], ids=["socket", "pipe"])
-def test_folder_of_a_policy__is_a_plain_folder(make: Callable[[Path], None], empty_folder: Path) -> None:
-    make(Path("door"))
-    with refused(
-        "door: is not a folder; give the folder of a policy bundle (manifest.json, weights.safetensors) or of a"
-    ):
-        load_policy("door")
-
-
-def test_files_of_a_policy__are_plain_files(empty_folder: Path) -> None:
-    listen(Path("manifest.json"))
-    Path("weights.safetensors").touch()
-    with refused("manifest.json: is a device, a pipe or a socket; must be a plain file", CorruptBundle):
-        load_policy(".")
 
 
 def test_folder_of_a_policy__holds_one_and_replaces_none(empty_folder: Path) -> None:

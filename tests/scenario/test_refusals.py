@@ -193,12 +193,6 @@ def test_roles__of_a_copy_are_frozen(scenario: Scenario) -> None:
         scenario.roles.clear()
 
 
-@pytest.mark.parametrize("spec", ["Full_brake", "2fast", "full brake", "constant:", ":3", "constant: 3", "a\n", None])
-def test_agent_of_a_role__is_a_name_in_lower_case_and_an_argument(spec: object) -> None:
-    with refused(f"agent {spec!r}: must be name or name:argument"):
-        ScriptSpec.parse(spec)  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize("name", ["My Scenario", "-x", "x" * 65, "../x", "x\n"])
 def test_name_of_a_new_scenario__is_a_plain_word(name: str) -> None:
     with refused(f"scenario name {name!r}: must be 1 to 64 lower case letters, digits, - and _"):
@@ -212,14 +206,6 @@ def test_unknown_vehicle_or_scenario__is_told_what_is_near() -> None:
         load_scenario("paper-randon")
     with refused("unknown scenario 'zzz'; known: cooperation-0-sensors, ", UnknownName):
         load_scenario("zzz")
-
-
-@pytest.mark.parametrize(("near", "name"), [("near.yml", "near"), ("sub/near.yaml", "near")])
-def test_unknown_scenario__is_told_a_file_that_is_near(near: str, name: str, empty_folder: Path) -> None:
-    Path("sub").mkdir()
-    Path(near).touch()
-    with refused(f"unknown scenario '{name}'; did you mean {near}?", UnknownName):
-        load_scenario(name)
 
 
 def test_file__has_the_name_of_its_scenario(empty_folder: Path) -> None:

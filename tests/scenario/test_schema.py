@@ -33,8 +33,6 @@ from ethbrake_marl.scenario.roles import ScriptSpec
 from ethbrake_marl.scenario.schema import scenario_json_schema
 from tests.contract.interfaces import LEVELS
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
-PAGE = (DOCS / "scenarios.md").read_text("utf-8")
 GIVEN = {
     "name": "given",
     "gaps_m": {"uniform": [5, 10]},
@@ -212,17 +210,6 @@ def test_json_schema__a_number_is_in_range_exactly_where_the_reader_says_so(key:
             told = in_range(content), editor.is_valid(content)
             above_0 = "loguniform" in str(content) and x <= 0.0
             assert told == (good and not above_0,) * 2, content
-
-
-def test_scenario__has_defaults_for_what_it_leaves_out() -> None:
-    scenario = build()
-    assert scenario.vehicles == 3
-    assert scenario.time_step_s == 0.1
-    assert scenario.horizon_s == 8.0
-    assert scenario.speed_limit_mps == 40.0
-    assert scenario.restitution == 0.1
-    assert scenario.early_impacts == "keep"
-    assert dict(scenario.roles) == {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "full_brake"}
 
 
 def test_scenario__one_entry_stands_for_all() -> None:

@@ -18,7 +18,6 @@ from ethbrake_marl.shields.guard import MovingAtHorizon
 from ethbrake_marl.shields.paper_hybrid import HybridAgent
 from ethbrake_marl.shields.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv
 from tests.fixtures.asked import Acts, Asked
-from tests.shield.attacks import above_later
 from tests.shield.plays import reported
 
 PAPER = eb.load_scenario("paper-random")
@@ -139,11 +138,6 @@ def test_horizon__what_still_moves_then_is_told_and_warned_of_once():
         env.reset(seed=1)
     assert len(told) == 1
     assert [each.step(DRIVE)[-1]["shield_settles"] for each in (env, shielded())] == [False, True]
-
-
-def test_horizon__beyond_it_the_bound_says_nothing():
-    now, later = above_later("coast", 200)
-    assert now == 0.0 and later > 0.5
 
 
 # Mode episode: never worse than its baseline, in any world, and as predicted.

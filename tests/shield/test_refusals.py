@@ -15,7 +15,6 @@ from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.envs.gymnasium import EthBrakeEnv
 from ethbrake_marl.envs.pettingzoo import parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
-from ethbrake_marl.envs.vector import EthBrakeVectorEnv
 from ethbrake_marl.errors import UncertifiedStep, UnknownName
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.shields.certify import certify, plan_harm
@@ -25,28 +24,19 @@ from ethbrake_marl.shields.options import ShieldOptions
 from ethbrake_marl.shields.paper_hybrid import HybridAgent
 from ethbrake_marl.shields.sb3 import ShieldedVecEnv
 from ethbrake_marl.shields.step import StepShield
-from ethbrake_marl.shields.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
-from tests.fixtures.lines import line as one_line
+from ethbrake_marl.shields.wrappers import HybridShield, ShieldedEnv, shielded_aec
 from tests.refused import refused
 from tests.shield.attacks import begun
 
 PAPER, PAIR = load_scenario("paper-random"), load_scenario("cooperation-3-pair")
 WORLDS = PAPER.sample(5, 3).worlds
 BRAKE, COAST = make_agent("full_brake"), make_agent("coast")
-PERIODIC = load_scenario("cooperation-2-paper").replace(v2x={"preset": "blocked", "persistence": "periodic"})
-WORLD = one_line([10.0, 8.0], [20.0, 18.0, 39.9], [8, 6, 5], [0, 0.4, 0.7], driving=2.0, mass=[1, 2, 4])
 
 
 @cache
 def started() -> StepShield:
     """A shield of Vehicle 2 in five episodes."""
     return begun(PAPER, WORLDS)
-
-
-@cache
-def team() -> StepShield:
-    """A shield of two vehicles in one episode."""
-    return begun(PAIR, PAIR.sample(1, 3).worlds)
 
 
 STEP_SHIELD: dict[str, Callable[[], object]] = {
@@ -171,21 +161,6 @@ def test_action__is_refused(actions: object, message: str) -> None:
         env.step(actions)
 
 
-def test_action__of_agents_in_turn_is_refused() -> None:
-    env = shielded_aec(parallel_env(), mode="step")
-    env.reset(seed=7)
-    env.step(None)
-    with refused("action of vehicle_2 = 3.0: must be from -1 (full braking) to 1 (full driving)"):
-        env.step([3.0])
-
-
-def test_actions__of_many_environments_are_refused() -> None:
-    env = ShieldedVectorEnv(EthBrakeVectorEnv(2))
-    env.reset(seed=3)
-    with refused("action of the learners: array([[0.+1.j],"):
-        env.step(np.full((2, 1), 1j))
-
-
 def test_closed_shield__is_refused_and_cannot_be_used() -> None:
     env = ShieldedEnv(EthBrakeEnv())
     env.close()
@@ -195,22 +170,6 @@ def test_closed_shield__is_refused_and_cannot_be_used() -> None:
     many.close()
     with refused("ShieldedVecEnv: this shield was closed; put a new shield around the environment"):
         many.reset()
-
-
-def test_snapshot__is_restored_before_the_shield_is_put_around() -> None:
-    env = ShieldedVecEnv(make_sb3_vec_env(PAPER, 2))
-    env.reset()
-    with refused("engine snapshot: this engine has a shield, whose memory a snapshot does not contain"):
-        env.env_method("restore", env.venv.snapshot())
-
-
-def test_step_wait__needs_a_step() -> None:
-    env = ShieldedVecEnv(make_sb3_vec_env(PAPER, 2))
-    env.reset()
-    env.step_async(np.ones((2, 1)))
-    env.step_wait()
-    with refused("step: no episode is running; call reset first"):
-        env.step_wait()
 
 
 def test_episode_that_began_before_the_shield__is_not_certified() -> None:
