@@ -146,69 +146,15 @@ def test_version__is_the_same_wherever_it_stands() -> None:
 
 
 @pytest.mark.parametrize(
-<<<<<<< HEAD
-    ("command", "file"), [("scenario schema", "scenarios/scenario"), ("train --schema", "train/recipe")]
-=======
     ("command", "file", "template"),
     [
         ("scenario schema", "scenarios/scenario", lambda: new_scenario_text("mine")),
         ("train --schema", "train/recipe", lambda: eb.load_recipe("ppo").new_text("mine")),
     ],
->>>>>>> w-docs
 )
 def test_schema__that_ships_is_printed_by_the_command_and_named_by_templates(
     command: str, file: str, template: Callable[[], str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run_command(command.split()) == 0
     assert (ROOT / f"{file}.schema.json").read_text("utf-8") == capsys.readouterr().out
-<<<<<<< HEAD
-    texts = {"scenarios": [new_scenario_text("mine")], "train": [eb.load_recipe("ppo").new_text("mine")]}
-    texts["docs"] = [each.read_text("utf-8") for each in ROOT.glob(f"{file}-*.yaml")]
-    named = f"# yaml-language-server: $schema={Path(file).name}.schema.json\n"
-    assert [text for text in texts[Path(file).parent.name] if named not in text] == []
-
-
-def test_schemas__are_no_scenario_and_no_recipe() -> None:
-    assert all(
-        path.suffix == ".yaml" for path in (*eb.TrainingRecipe.shipped().values(), *(e.path for e in list_scenarios()))
-    )
-
-
-@pytest.mark.parametrize("name", GUIDES)
-def test_guide__has_links_that_lead_somewhere(name: str) -> None:
-    text = (ROOT / ".github" / name).read_text("utf-8")
-    links = re.findall(r"\]\((?!https?:)([^)#\s]+)", text)
-    assert [link for link in links if not (ROOT / ".github" / link).exists()] == []
-
-
-def test_hooks__run_tools_of_the_environment_and_download_nothing() -> None:
-    hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text("utf-8"))["repos"]
-    assert [repo["repo"] for repo in hooks] == ["local"]
-    assert all(hook["entry"].startswith(".venv/bin/") for repo in hooks for hook in repo["hooks"])
-
-
-MOST_CHARACTERS = 100
-PAGES = sorted([ROOT / "README.md", *ROOT.glob(".github/*.md"), *DOCS.glob("*.md"), *DOCS.glob("[einrt]*/**/*.md")])
-CODE = re.compile(r"^\s*(```+|~~~+|:::+).*?^\s*\1\s*$", re.DOTALL | re.MULTILINE)
-FREE = re.compile(r"\s*(\||#|<|!\[)|    |\[[\w-]+\]: |\s*([-*] )?\S+$")  # tables, headings, HTML, code, one word
-
-
-@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.relative_to(ROOT).as_posix())
-def test_page__has_short_lines_and_code_blocks_on_lines_of_their_own(path: Path) -> None:
-    text = path.read_text("utf-8")
-    prose = CODE.sub("", text).splitlines()
-    assert [line for line in prose if len(line) > MOST_CHARACTERS and not FREE.match(line)] == []
-    assert [line for line in prose if line.startswith("%")] == []  # the site takes it for a comment
-    broken = re.compile(r"\S.*```|```\S+ .*\S *```")
-    assert [line for line in text.splitlines() if broken.search(line) and "````" not in line] == []
-
-
-def test_readme__is_short_and_begins_with_a_picture_of_less_than_200_kb() -> None:
-    text = (ROOT / "README.md").read_text("utf-8")
-    assert len(text.splitlines()) <= 120
-    found = re.search(r"!\[[^\]]*\]\(([^)]*\.png)\)", text)
-    assert found is not None and found.start() < text.index("\n## ")
-    assert (ROOT / found[1]).stat().st_size < 200_000
-=======
     assert f"# yaml-language-server: $schema={Path(file).name}.schema.json\n" in template()
->>>>>>> w-docs

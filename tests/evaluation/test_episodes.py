@@ -112,19 +112,6 @@ def test_motion__is_exact_at_every_moment(name: str, spec: str, pair: eb.Scenari
         assert motion.at_rest and motion.stepped_in_s.size == 0
 
 
-def test_motion__counts_what_the_evaluation_counts(evaluation: Evaluation) -> None:
-    motions = follow_episodes(evaluation.worlds.take(np.arange(60)), make_agent("constant:4.5"), evaluation.scenario)
-    o = evaluation.outcome("constant:4.5")
-    expected = zip(o.first_impact_harm, o.total_harm, o.impacts, o.final.time_s, strict=True)
-    assert [(*each.harm, len(each.impacts.time_s), each.end_s) for each in motions] == list(expected)[:60]
-
-
-def test_motion__tells_where_a_shield_stepped_in(paper_random: eb.Scenario) -> None:
-    agent = make_agent("constant:3+episode", scenario=paper_random)
-    times = [each.stepped_in_s for each in follow_episodes(paper_random.sample(4, 7).worlds, agent, paper_random)]
-    assert any(each.size for each in times) and min(np.concatenate(times)) >= 0.5  # Vehicle 2 acts from then on
-
-
 def test_motion__tells_where_the_shield_of_a_team_stepped_in_as_its_log_does() -> None:
     scenario = eb.load_scenario("cooperation-3-pair")
     worlds = scenario.sample(6, 7).worlds

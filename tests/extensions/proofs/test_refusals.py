@@ -1,5 +1,6 @@
 """What proofs and searches of the least harm refuse."""
 
+import io
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -18,7 +19,7 @@ from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.task import Task
 from tests.fixtures.lines import line, wide_worlds
-from tests.programmes.archives import good, packed
+from tests.programmes.hostile import good_table
 from tests.refused import refused
 
 PAPER = load_scenario("paper-random")
@@ -115,7 +116,8 @@ def test_file__is_no_table(empty_folder: Path) -> None:
     Path("t.npz").write_bytes(b"no table")
     with refused("t.npz: is not a table of best known harm: not a plain .npz archive", CorruptBundle):
         BestHarmTable.load(Path("t.npz"))
-    Path("t.npz").write_bytes(packed({**good(), "first_harm": np.zeros(4)}))
+    with np.load(io.BytesIO(good_table())) as arrays:
+        np.savez_compressed("t.npz", **{**arrays, "first_harm": np.zeros(4)})
     with refused("array 'first_harm' has type <f8 and shape [4]; must have type <f8 and shape [3]", CorruptBundle):
         BestHarmTable.load(Path("t.npz"))
 

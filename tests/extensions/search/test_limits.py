@@ -470,3 +470,10 @@ def test_summarise__has_the_keys_of_the_limits_beside_its_own(evaluation: Evalua
 
 def test_per_world__has_the_columns_of_the_limits(evaluation: Evaluation, tmp_path: Path) -> None:
     assert set(KNOWN_OF_WORLDS) < set(per_world(evaluation, tmp_path)[0])
+
+
+def test_below__is_less_than_the_best_known_harm_and_not_equal_to_it() -> None:
+    known = SimpleNamespace(first_impact_harm=np.array([3.0, 3.0, 3.0]), total_harm=np.array([5.0, 5.0, 5.0]))
+    found = SimpleNamespace(first_impact_harm=np.array([3.0, 3.0, 2.9]), total_harm=np.array([5.0, 4.9, 6.0]))
+    regrets = regret.Regrets(known, known.first_impact_harm, known.total_harm, np.array(["table"] * 3))
+    assert regrets.below(found).tolist() == [False, True, True]
