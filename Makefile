@@ -121,7 +121,6 @@ figures: $(STAMP)
 	@$(PROGRAMME) figures $(ARGS)
 
 programme: $(STAMP)
-	@$(if $(filter cluster,$(NAME)),$(INSTALL) -e ".[cluster]",:)
 	@$(if $(filter proofs,$(NAME)),NUMBA_DISABLE_JIT=1) $(PROGRAMME) $(NAME) $(ARGS)
 
 clean:

@@ -2,25 +2,59 @@
 
 from __future__ import annotations
 
-import sys
+import os
+import re
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
+
+from sphinx.application import Sphinx
+from typer.cli import get_docs_for_click
 
 from ethbrake_marl import __version__
+from ethbrake_marl.cli.app import Installed, whole_command
 
-sys.path.insert(0, str(Path(__file__).parent))  # for the folder extension/
+DOCS = Path(__file__).resolve().parent
+ROOT = DOCS.parent
 
 project = "ethbrake_marl"
 author = "ethbrake_marl contributors"
 copyright = f"2026, {author}"
 release = version = __version__
 
-extensions = ["myst_nb", "sphinx_copybutton", "extension"]
-exclude_patterns = ["_build", "**.ipynb_checkpoints", "README.md", "extension"]
+extensions = [
+    "myst_nb",
+    "sphinx_copybutton",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "sphinxcontrib.autodoc_pydantic",
+]
+exclude_patterns = ["_build", "**.ipynb_checkpoints", "README.md", "templates"]
+templates_path = ["templates"]
 highlight_language = "none"
 
 # Links to headings are those of GitHub, so that pages read the same there.
 myst_heading_anchors = 4
 myst_enable_extensions = ["dollarmath"]
+
+# The Python reference.
+autodoc_typehints = "none"  # the signature has them
+autodoc_member_order = "bysource"
+autodoc_default_options = {
+    "members": True,
+    "inherited-members": "object, int, tuple, Exception, BaseModel, Env, VectorEnv, ParallelEnv, AECEnv, VecEnv",
+}
+napoleon_use_rtype = False
+autodoc_pydantic_model_show_json = False
+autodoc_pydantic_model_show_config_summary = False
+autodoc_pydantic_model_show_field_summary = False
+autodoc_pydantic_model_show_validator_summary = False
+autodoc_pydantic_model_show_validator_members = False
+autodoc_pydantic_model_hide_paramlist = True
+autodoc_pydantic_model_member_order = "bysource"
+autodoc_pydantic_field_list_validators = False
+autodoc_pydantic_field_show_constraints = False
 
 # Notebooks are committed with their outputs, and run again here, each in an empty folder. Outputs are kept from build
 # to build until a cell changes; `make clean` forgets them.
@@ -34,16 +68,95 @@ nb_ipywidgets_js: dict[str, dict[str, str]] = {}  # the site loads nothing; slid
 html_theme = "furo"
 html_title = f"ethbrake_marl {__version__}"
 html_favicon = "figures/favicon.svg"
-html_extra_path = [
-    "../scenarios/scenario.schema.json",
-    "../train/recipe.schema.json",
-    "sweep.schema.json",
-    "tuning.schema.json",
-]
+html_extra_path = ["../scenarios/scenario.schema.json", "../train/recipe.schema.json"]
 html_static_path = ["static"]
 html_css_files = ["site.css"]
-html_search_scorer = str(Path(__file__).parent / "static" / "search.js")
 html_copy_source = False
 html_show_sourcelink = False
 copybutton_prompt_text = "$ "
 copybutton_only_copy_prompt_lines = True
+
+# Pages that the site makes from other files: README, cards of policies, help texts.
+
+LINK = re.compile(r"\]\((?!https?:|mailto:|#)([^)\s#]+)(#[^)\s]*)?\)")
+
+
+def relink(text: str, docname: str, folder: Path) -> str:
+    """Return a text whose links are relative to ``folder``, with links that work on the page ``docname``."""
+
+    def lead(found: re.Match[str]) -> str:
+        path, anchor = Path(os.path.normpath(folder / found[1])), found[2] or ""
+        if not path.exists():  # code that looks like a link
+            return found[0]
+        if path.name == "card.md":
+            path, anchor = DOCS / "reference" / "policies.md", f"#{path.parent.name}"
+        pages = {ROOT / "README.md": "index.md", DOCS / "README.md": "index.md", ROOT / "CHANGELOG.md": "changelog.md"}
+        return f"]({os.path.relpath(DOCS / pages.get(path, path), (DOCS / docname).parent)}{anchor})"
+
+    return LINK.sub(lead, text)
+
+
+def navigation(pages: Iterable[str], caption: str = "") -> str:
+    """Return a hidden table of contents."""
+    options = ":hidden:\n" + (f":caption: {caption}\n" if caption else "")
+    return f"\n\n```{{toctree}}\n{options}\n" + "\n".join(dict.fromkeys(pages)) + "\n```\n"
+
+
+def first_page() -> str:
+    """Return README, with the sections of docs/README.md as the site's navigation."""
+    text = relink((ROOT / "README.md").read_text("utf-8"), "index", ROOT)
+    for section in relink((DOCS / "README.md").read_text("utf-8"), "index", DOCS).split("\n## ")[1:]:
+        caption, _, listed = section.partition("\n")
+        pages = re.findall(r"(?m)^- \[[^\]]*\]\(([^)\s]+)\)", listed)  # the first link of each entry
+        text += navigation([page for page in pages if page != "index.md"], caption)
+    return text
+
+
+def commands() -> str:
+    """Return the help of every command, as ``typer utils docs`` writes it, with the commands of extensions."""
+
+    def imported(group: Any) -> Any:
+        for name, command in group.commands.items():
+            group.commands[name] = command.command() if isinstance(command, Installed) else command
+            if hasattr(command, "commands"):
+                imported(command)
+        return group
+
+    whole = imported(whole_command())
+    context = whole.context_class(whole, info_name="ethbrake", **whole.context_settings)
+    text = get_docs_for_click(obj=whole, ctx=context, name="ethbrake", indent=1)
+    options = r"(?s)```.*?```|`[^`]*`|(--[a-z][a-z-]*)"  # outside code they become code, since the site changes hyphens
+    return re.sub(options, lambda found: f"`{found[1]}`" if found[1] else found[0], text)
+
+
+def cards() -> str:
+    """Return the card of every shipped policy, its headings one level lower."""
+    paths = sorted((ROOT / "ethbrake_marl" / "_policies").glob("*/card.md"))
+    texts = [relink(path.read_text("utf-8"), "reference/policies", path.parent) for path in paths]
+    return "\n\n".join(re.sub(r"(?m)^#(?=#* )", "##", text) for text in texts)
+
+
+def make_page(app: Sphinx, docname: str, source: list[str]) -> None:
+    """Complete the pages that are made, and lead links that leave docs/ to their page on the site."""
+    text = relink(source[0], docname, (DOCS / docname).parent)
+    if docname == "index":
+        text = first_page()
+    elif docname == "reference/cli":
+        text += "\n" + commands()
+    elif docname == "reference/policies":
+        text += "\n" + cards()
+    elif docname.endswith("/README"):
+        text += navigation(path for path, _ in LINK.findall(source[0]) if path.endswith(".md") and path[0] != ".")
+    source[0] = text
+
+
+def tidy(app: Sphinx, what: str, name: str, value: object, options: object, lines: list[str]) -> None:
+    """Keep napoleon from taking words before a colon for a type, and drop what Python says about a named tuple."""
+    if what in ("attribute", "property"):
+        lines[:] = ["", *(line for line in lines if not line.startswith("Alias for field number"))]
+
+
+def setup(app: Sphinx) -> None:
+    """Connect to Sphinx."""
+    app.connect("autodoc-process-docstring", tidy, priority=100)  # before napoleon
+    app.connect("source-read", make_page)

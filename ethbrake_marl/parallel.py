@@ -18,16 +18,10 @@ from typing import Any
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, naming_extras
 
 LOCAL = "local"
-_WORKERS = {  # environment variables of Ray's workers: one thread each, in the folder of the command
-    **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
-    "RAY_CHDIR_TO_TRIAL_DIR": "0",
-}
+_WORKERS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")  # one thread each
 _DRIVER = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_raylet_start_wait_time_s": "300",  # the machine may be busy; by default Ray gives up after 30 s
-    "RAY_AIR_NEW_OUTPUT": "0",
-    "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
-    "TUNE_PRINT_ALL_TRIAL_ERRORS": "0",
 }
 _WATCH_S = 1.0
 _AGAIN = 10  # how often Ray restarts a lost worker and repeats its call
@@ -121,14 +115,13 @@ def _sigterm_as_ctrl_c() -> Iterator[None]:
 
 
 @contextmanager
-def own_signals() -> Iterator[None]:
-    """Context manager: restore the caller's handlers of Ctrl-C, SIGTERM and SIGUSR1 after the block.
+def _own_signals() -> Iterator[None]:
+    """Context manager: restore the caller's handlers of Ctrl-C and SIGTERM after the block, because Ray sets its own.
 
-    Ray and Ray Tune set their own handlers and do not restore the caller's. The handler of Ray Tune would swallow the
-    caller's next Ctrl-C. Outside the main thread, where no handler can be set, this function does nothing.
+    Outside the main thread, where no handler can be set, this function does nothing.
     """
     in_main = threading.current_thread() is threading.main_thread()
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1) if in_main else ()
+    numbers = (signal.SIGINT, signal.SIGTERM) if in_main else ()
     before = {number: signal.getsignal(number) for number in numbers}
     try:
         yield
@@ -144,8 +137,8 @@ def _backend(ray: str | None, jobs: int | None) -> Iterator[tuple[dict[str, Any]
     if ray is None:
         yield {"backend": "loky", "inner_max_num_threads": 1}, jobs or 1
         return
-    with own_signals():
-        connected = connect_ray(ray, jobs)
+    with _own_signals():
+        connected = _connect_ray(ray, jobs)
         from ray.util.joblib import register_ray
 
         register_ray()
@@ -157,7 +150,7 @@ def _backend(ray: str | None, jobs: int | None) -> Iterator[tuple[dict[str, Any]
             connected.shutdown()
 
 
-def connect_ray(address: str, cores: int | None = None) -> Any:
+def _connect_ray(address: str, cores: int | None = None) -> Any:
     """Connect to Ray and return the module ``ray``.
 
     ``address`` is the address of a running cluster in Ray's own format, or ``local`` to start Ray on this machine, on
@@ -177,7 +170,7 @@ def connect_ray(address: str, cores: int | None = None) -> Any:
     number = len(os.sched_getaffinity(0)) if cores is None else cores
     own = {"num_cpus": number, "include_dashboard": False} if address == LOCAL else {}
     try:
-        with own_signals():
+        with _own_signals():
             ray.init(
                 address=address, log_to_driver=False, configure_logging=False, runtime_env={"env_vars": _WORKERS}, **own
             )

@@ -14,8 +14,7 @@ from ethbrake_marl.extensions.cooperation import (
     find_equilibria,
     price_of_anarchy,
 )
-from ethbrake_marl.extensions.datasets.minari import write_dataset
-from ethbrake_marl.extensions.hosts.protocol import Host, HostCommand, HostFailed, HostState, drive_host
+from ethbrake_marl.extensions.datasets import to_parquet
 from ethbrake_marl.extensions.report.deceleration import deceleration_curve, deceleration_figure
 from ethbrake_marl.extensions.report.episode_figure import trajectories
 from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap
@@ -104,7 +103,7 @@ def measure(folder: Path) -> list[eb.SummaryRow]:
     outcome: eb.Outcome = found.outcome("learned")
     record: eb.EpisodeRecord = eb.record_episode(found.worlds.take([0]), Cautious(), scenario=scenario)
     assert record.ledger.world_harm("first").shape == outcome.first_impact_harm[:1].shape
-    write_dataset(folder / "brakes.parquet", agents, scenario=scenario, episodes=10, format="parquet")
+    to_parquet(folder / "brakes.parquet", agents, scenario=scenario, episodes=10)
     return eb.summarise(found)
 
 
@@ -125,29 +124,6 @@ def play(level: eb.Scenario, worlds: eb.Worlds) -> float:
     spread: Spread = compare_starts(ends, "first")
     price = price_of_anarchy(spread.worst, best_joint_harm(level, worlds, ends.values(), budget=300)["first"])
     return price.value if price else 1.0
-
-
-class Still:
-    """A host of one's own."""
-
-    dt = 0.1
-
-    def __init__(self, worlds: eb.Worlds) -> None:
-        self.worlds, self.time_s = worlds, 0.0
-
-    def state(self) -> HostState:
-        return HostState(self.time_s, self.worlds.gaps_m, self.worlds.speeds_mps)
-
-    def apply(self, command: HostCommand) -> None:
-        self.time_s += float(command.acceleration_mps2.max())
-
-
-def bench(worlds: eb.Worlds) -> eb.Outcome:
-    host: Host = Still(worlds)
-    try:
-        return drive_host(host, Cautious(), "paper-random", worlds).outcome
-    except HostFailed as failed:
-        raise SystemExit(str(failed.ledger)) from None
 
 
 def version() -> str:

@@ -1,7 +1,5 @@
 """Worlds that cannot be advanced: every layer names them by the rows of its own batch, and the others go on."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -12,13 +10,11 @@ from ethbrake_marl.envs.making import make_engine
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.forecast import forecast
-from ethbrake_marl.physics.left_out import leaving_out_failed
 from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.shields.certify import Backup, certify
 from ethbrake_marl.shields.running import begin_running
 from ethbrake_marl.shields.step import StepShield
-from tests.failing_worlds import plant, planted_list, without
+from tests.failing_worlds import planted_list
 
 PAPER = load_scenario("paper-random")
 N, PLANTED = 9, [2, 6]
@@ -52,18 +48,6 @@ def test_every_search_and_forecast__names_all_of_them(worlds):
         assert failed_rows(call) == PLANTED
 
 
-def test_mixed_batches__name_them_by_the_rows_of_the_whole(worlds):
-    obstacle = np.full(N, np.inf)
-    obstacle[[1, 2, 4]] = 300.0
-    mixed = replace(worlds, obstacle_gap_m=obstacle)
-    assert failed_rows(lambda: advance(mixed, braking(mixed), until_s=8.0)) == PLANTED
-    well, rows, failed = leaving_out_failed(
-        lambda at: advance(mixed.take(at), braking(mixed)[at], until_s=8.0)[0], np.arange(N)
-    )
-    assert sorted(failed) == PLANTED and rows.tolist() == without(N, PLANTED).tolist()
-    assert well.n == len(rows)
-
-
 def engine(n=3, seed=5):
     return make_engine(PAPER, n, seed=seed)
 
@@ -95,28 +79,6 @@ def test_engine__cuts_the_episode_off_names_the_world_and_steps_the_others():
     break_row(running, 1)
     with pytest.warns(FailedWorld, match=r"^world 3 of seed 5"):
         running.step(np.zeros((3, 1)))
-
-
-def test_engine__after_a_snapshot_names_the_world():
-    running, other = engine(), engine(seed=9)
-    other.restore(running.snapshot())
-    break_row(other, 2)
-    with pytest.warns(FailedWorld, match=r"^world 2 of seed 5: a contact was missed"):
-        other.step(np.zeros((3, 1)))
-
-
-def test_stream__a_world_that_never_reaches_its_first_decision_gives_its_place_to_the_next(monkeypatch):
-    well = engine(n=4)
-    drawn = Scenario.sample
-
-    def planted(self, n, seed, **options):
-        sample = drawn(self, n, seed, **options)
-        return replace(sample, worlds=plant(sample.worlds, [1]))
-
-    monkeypatch.setattr(Scenario, "sample", planted)
-    with pytest.warns(FailedWorld, match=r"^world 1 of seed 5: a contact was missed.*left out"):
-        running = engine(n=4)
-    assert np.array_equal(running.packed.state, well.packed.state[[0, 2, 2, 3]])
 
 
 def test_shield__a_proposal_that_cannot_be_advanced_is_not_certified():

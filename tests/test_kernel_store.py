@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import cache
 from pathlib import Path
-from unittest.mock import Mock
 
 import numba
 import pytest
@@ -54,18 +53,6 @@ def test_cache_folder__is_in_the_named_place(monkeypatch, tmp_path, numba, xdg, 
         if folder:
             monkeypatch.setenv(name, str(tmp_path / folder))
     assert cache_folder() == tmp_path / place / "ethbrake_marl" and cache_folder().is_dir()
-
-
-@pytest.mark.skipif(not hasattr(os, "getuid"), reason="users have no number here")
-def test_cache_folder__without_a_home_is_a_temporary_one(monkeypatch, tmp_path):
-    """In a container: no HOME, and a user id that stands in no list of users."""
-    for variable in ("HOME", "USERPROFILE", "NUMBA_CACHE_DIR", "XDG_CACHE_HOME"):
-        monkeypatch.delenv(variable, raising=False)
-    monkeypatch.setattr(os, "getuid", lambda: 987_654_321)
-    monkeypatch.setattr(kernel_store.tempfile, "tempdir", str(tmp_path))
-    with pytest.raises(RuntimeError, match="home"):
-        Path.home()
-    assert cache_folder().parent == tmp_path and cache_folder().is_dir()
 
 
 def test_cache_folder__that_cannot_be_written_is_a_temporary_one_that_goes_at_the_end_of_the_process(
@@ -118,13 +105,6 @@ def test_load_kernel__of_another_users_file_is_nothing(monkeypatch, user, loaded
     monkeypatch.setattr(jit.os, "fstat", owned)
     monkeypatch.setattr(jit.os, "getuid", lambda: 1001)
     assert (load_kernel("one-1") is not None) == loaded
-
-
-def test_keep_kernel__on_a_full_disk_costs_a_warning(monkeypatch):
-    monkeypatch.setattr(jit.os, "replace", Mock(side_effect=OSError("No space left on device")))
-    with pytest.warns(UserWarning, match=r"could not be written to this folder: .*No space left"):
-        keep_kernel("one-1", b"machine code")
-    assert list(cache_folder().iterdir()) == []
 
 
 # ---------------------------------------------------------------- what a kernel is made of
@@ -195,22 +175,6 @@ def test_kernel_sources__hold_every_kernel_that_a_kernel_names():
                 assert {Path(file) for file in called} <= set(sources), f"{source.name}: {kernel}"
                 checked += len(called)
     assert checked > 300
-
-
-def test_kernel_sources__are_found_behind_front_doors(copied):
-    """A folder offers names of several files; only the files of the names that are taken count."""
-    (copied / "physics" / "__init__.py").write_text(
-        "if TYPE_CHECKING:\n"
-        "    from ethbrake_marl.physics.impact import pool as pool\n"
-        "    from ethbrake_marl.physics.advance import (\n        advance as advance,\n    )\n"
-        "    from ethbrake_marl.physics.state import Worlds as Worlds\n"
-    )
-    kernel = copied / "kernel_of_mine.py"
-    kernel.write_text("from ethbrake_marl.physics import Worlds, pool\n\n@compiled\ndef mine(): ...\n")
-    forget()
-    found = {source.relative_to(copied).as_posix() for source in kernel_sources(kernel)}
-    assert {"kernel_of_mine.py", "physics/impact.py"} <= found
-    assert not {"physics/advance.py", "physics/state.py", "physics/__init__.py"} & found
 
 
 # ---------------------------------------------------------------- processes
@@ -311,64 +275,3 @@ def test_kernels__of_a_moved_package_are_at_hand_and_one_damaged_or_an_edited_ca
 def test_kernels__that_two_processes_need_at_once_are_compiled_by_one(run):
     assert run(at_once=2) == SAME + COMPILED
     assert not list(cache_folder().glob("*.lock"))
-
-
-def test_kernels__without_a_folder_to_write_to_are_compiled_in_each_process(monkeypatch, tmp_path, run):
-    monkeypatch.setenv("NUMBA_CACHE_DIR", "/dev/null/x")
-    assert run(at_once=2) == COMPILED + COMPILED
-    assert not list(tmp_path.glob("ethbrake_marl-*"))
-
-
-INNER = """
-import sys
-from ethbrake_marl.physics.jit import compiled
-
-@compiled(apart=True)
-def checked(x):
-    if x < 0.0:
-        raise ValueError("negative", x)
-    print("seen", x)
-    return x
-
-@compiled
-def inner(x):
-    return checked(x) + checked(1.0)
-
-@compiled(apart=True)
-def other(x):
-    return inner(x)
-
-for function, value in ((inner, 2.0), (inner, -1.0), (other, 3.0), (other, -1.0)):
-    try:
-        print(function(value), flush=True)
-    except ValueError as error:
-        print(error.args, flush=True)
-"""
-TOLD = "seen 2.0\nseen 1.0\n3.0\n('negative', -1.0)\nseen 3.0\nseen 1.0\n4.0\n('negative', -1.0)\n"
-
-
-def test_kernels__raise_and_print_inside_of_what_they_call_also_when_they_were_loaded(run):
-    for loaded, way in (([], "warm"), ([".entry"], "cold"), ([".linked"], "cold")):
-        for file in cache_folder().iterdir():
-            if loaded and file.suffix not in loaded:
-                file.unlink()
-        assert run(program=INNER, way=way) == TOLD
-    assert {file.suffix for file in cache_folder().iterdir()} == {".entry", ".linked"}
-
-
-@pytest.mark.parametrize(("known", "linked", "overloads"), [(False, 0, 1), (True, 1, 0)])
-def test_kernels__are_compiled_once_for_all_numbers_or_as_numba_does_where_it_is_not_known(
-    monkeypatch, known, linked, overloads
-):
-    monkeypatch.setattr(jit, "_KNOWN", jit._KNOWN and known)
-
-    @jit.compiled(apart=True)
-    def twice(k: int) -> int:
-        return 2 * k
-
-    @jit.compiled(apart=True)
-    def outer(k: int) -> int:
-        return twice(k) if not known else twice(1) + twice(2) + twice(k)
-
-    assert outer(3) == (12 if known else 6)
-    assert (len(twice._linked), len(twice.overloads)) == (linked, overloads)

@@ -1,13 +1,10 @@
 """Texts of errors and what a terminal is shown."""
 
 import pickle
-import re
 
 import pytest
 from rich.text import Text
 
-import ethbrake_marl as eb
-from ethbrake_marl.cli import doctor
 from ethbrake_marl.cli.command import Out, say
 from ethbrake_marl.errors import (
     LINE_LIMIT,
@@ -16,28 +13,9 @@ from ethbrake_marl.errors import (
     InvalidInput,
     PhysicsError,
     UnknownName,
-    count_of,
     one_line,
     plain_text,
-    unknown_name,
 )
-
-
-@pytest.mark.parametrize(
-    ("known", "name", "text"),
-    [
-        ([], "mine", "unknown agent 'mine'; known: none; your own agent must be registered or installed first"),
-        (["coast"], "mine", "unknown agent 'mine'; known: coast; your own agent must be registered or installed first"),
-        (["coast"], "cost", "unknown agent 'cost'; did you mean 'coast'?"),
-    ],
-)
-def test_unknown_name__reminds_of_what_is_of_ones_own_where_nothing_is_close(known, name, text) -> None:
-    assert str(unknown_name("agent", name, known, may_be_own=True)).startswith(text)
-
-
-def test_count_of__one_is_no_plural() -> None:
-    assert [count_of(n, "world") for n in (0, 1, 2, 10_000)] == ["0 worlds", "1 world", "2 worlds", "10,000 worlds"]
-    assert str(PhysicsError(dict.fromkeys(range(6), "broke"))).endswith("world 4: broke; and 1 more world")
 
 
 def test_control_characters__are_shown_not_sent(capsys: pytest.CaptureFixture[str]) -> None:
@@ -46,28 +24,6 @@ def test_control_characters__are_shown_not_sent(capsys: pytest.CaptureFixture[st
     assert capsys.readouterr().err == "runs/\\x1b[2J\\nx\n"
     Out().show("# \u202egnp\n", Text("[/] ppo@\x1b[31m :smile:"), "6\N{NO-BREAK SPACE}m/s²")
     assert capsys.readouterr().out == "# \\u202egnp\n\n[/] ppo@\\x1b[31m :smile:\n6\N{NO-BREAK SPACE}m/s²\n"
-
-
-def test_requirement__stands_with_the_extra_that_brings_it() -> None:
-    extra_of = {requirement.name: extra for extra, requirement in doctor._requirements()}
-    assert [extra_of.get(name) for name in ("numpy", "numba", "torch", "benchmarl", "onnx", "ray", "pytest")] == [
-        "",
-        "",
-        "train",
-        "marl",
-        "export",
-        "cluster",
-        None,
-    ]
-
-
-def test_public_name_that_there_is_not__suggests_the_nearest() -> None:
-    with pytest.raises(
-        AttributeError, match=re.escape("module 'ethbrake_marl' has no attribute 'evalute'; did you mean 'evaluate'?")
-    ):
-        _ = eb.evalute
-    with pytest.raises(AttributeError, match=re.escape("module 'ethbrake_marl' has no attribute 'zzzzzz'")):
-        _ = eb.zzzzzz
 
 
 def test_physics_error__lists_a_few_worlds_and_travels_between_processes() -> None:

@@ -7,12 +7,9 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.errors import PhysicsError
-from ethbrake_marl.game import observations
 from ethbrake_marl.game.contact_features import FORECAST_S
 from ethbrake_marl.game.features import GROUPS
 from ethbrake_marl.game.observations import ObservationSpec, choose_observation, observe
-from tests.fixtures.policies import make_policy
 from tests.physics.random_worlds import line
 
 near = pytest.approx
@@ -105,59 +102,6 @@ def test_contact__hides_whom_no_news_has_come_from_whatever_they_do():
     changed = replace(worlds, speeds_mps=worlds.speeds_mps.copy())
     changed.speeds_mps[~news[:, 2], 2] = 39.0
     assert observe(changed, 1, CONTACT)[~news[:, 2]].tobytes() == observe(worlds, 1, CONTACT)[~news[:, 2]].tobytes()
-
-
-def test_contact__where_brakes_build_up_is_the_same_for_who_trains_and_who_is_asked():
-    roles = {"vehicle_1": "constant:2", "vehicle_2": "learner", "vehicle_3": "coast"}
-    scenario = SCENARIO.replace(brake_rate_mps3=12.65, release_rate_mps3=12.65, roles=roles)
-    env = eb.EthBrakeEnv(scenario, observation=CONTACT)
-    env.reset(seed=1)
-    for _ in range(3):
-        seen = env.step(np.array([-0.3], np.float32))[0]
-        assert seen.tobytes() == observe(env.engine.worlds, 1, CONTACT)[0].tobytes()
-
-
-@pytest.mark.parametrize("group", ["contact", "contact_far"])
-def test_policy__observes_contacts_at_the_steps_of_its_training(group):
-    spec = choose_observation(["own", group])
-    policy = make_policy(spec, SCENARIO.replace(time_step_s=0.05).model_dump(mode="json"))
-    assert policy.observation == choose_observation(["own", group], 0.05)
-    outcome = eb.evaluate(SCENARIO.sample(5, 7), {"mine": eb.LearnedAgent(policy)}, scenario=SCENARIO).outcome("mine")
-    assert np.isfinite(outcome.total_harm).all()
-    assert choose_observation(["own"], 0.1).time_step_s is None  # nothing that depends on it
-
-
-def test_contact__failed_forecast_names_its_world(monkeypatch):
-    def fail(*arguments):
-        arguments[-1][1] = True
-
-    monkeypatch.setattr(observations, "observe_contacts", fail)
-    worlds = SCENARIO.sample(3, 1).worlds
-    with pytest.raises(PhysicsError, match="world 1: a forecast of contacts failed before the end of its 10 s"):
-        observe(worlds, 1, CONTACT)
-
-
-def test_contact_far__tells_what_the_others_cut_off():
-    """The times up to 10 s, and the square roots of the harms, of the same forecasts; the others stay as they are."""
-    wide = eb.load_scenario("stress-wide").sample(300, 3).worlds
-    worlds = eb.advance(wide, np.zeros((300, 3)), until_s=0.4)[0]
-    both = choose_observation(["own", "contact", "contact_far"], STEP_S)
-    seen = dict(zip([f.name for f in both.features], observe(worlds, 1, both).T, strict=True))
-    alone = observe(worlds, 1, choose_observation(["contact_far"], STEP_S))
-    assert alone.shape == (300, 12) and alone.tobytes() == observe(worlds, 1, both)[:, -12:].tobytes()
-    for name, values in zip([f.name for f in CONTACT.features], observe(worlds, 1, CONTACT).T, strict=True):
-        assert values.tobytes() == seen[name].tobytes()
-    hard = 0
-    for command in ("brake", "coast", "drive"):
-        for time in ("front_time", "rear_time"):
-            found, cut = seen[f"contact_far.{command}_{time}"] * 5.0, seen[f"contact.{command}_{time}"] * 2.0
-            np.testing.assert_allclose(np.minimum(found, 4.0), cut, rtol=1e-6)
-            assert (found <= 10.0).all()
-        for far, near in (("first_impact_speed", "first_impact_harm"), ("total_speed", "total_harm")):
-            found, cut = (seen[f"contact_far.{command}_{far}"] * 10.0) ** 2, seen[f"contact.{command}_{near}"] * 50.0
-            np.testing.assert_allclose(np.minimum(found, 200.0), cut, rtol=1e-5, atol=1e-4)
-            hard += int((found > 200.0).sum())
-    assert hard > 30
 
 
 def seen(worlds, vehicle, spec, *parts):

@@ -1,8 +1,6 @@
 """An obstacle ahead of Vehicle 1, from the scenario to the results: every module counts it, and counts it alike."""
 
-import csv
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,11 +10,8 @@ from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.engine.profiles import profile_problem
-from ethbrake_marl.evaluation.per_world import write_per_world
 from ethbrake_marl.game.harm import empty_ledger
-from ethbrake_marl.policies.manifest import ObservationSchema
 from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.tables import worlds_from_state
 from ethbrake_marl.shields.drivers import ShieldedDriver
 from tests.refused import refused
@@ -51,35 +46,6 @@ def test_coupled__vehicle_1_stops_short_of_the_obstacle_if_it_can() -> None:
     assert harms[-1].tolist() == found.harm.tolist() and (found.harm <= np.min(harms, axis=0)).all()
 
 
-@pytest.fixture(scope="module")
-def near_one() -> Scenario:
-    return NEAR.with_learners(["vehicle_1"])
-
-
-def test_per_world__the_table_tells_the_obstacles_part(near_one: Scenario, tmp_path: Path) -> None:
-    result = eb.evaluate(near_one.sample(40, 7), {"coast": make_agent("coast")}, scenario=near_one)
-    write_per_world(tmp_path / "worlds.csv", result)
-    rows = list(csv.DictReader((tmp_path / "worlds.csv").read_text().splitlines()))
-    outcome = result.outcome("coast")
-    told = {name: [float(row[name]) for row in rows] for name in rows[0] if "obstacle" in name or name == "impacts"}
-    assert told == {
-        "obstacle_first_impact_harm": outcome.ledger.obstacle_first_harm.tolist(),
-        "obstacle_total_harm": outcome.ledger.obstacle_total_harm.tolist(),
-        "obstacle_gap_m": result.worlds.obstacle_gap_m.tolist(),
-        "final_obstacle_gap_m": outcome.final.obstacle_gap_m.tolist(),
-        "impacts": outcome.ledger.impacts.tolist(),
-    }
-    assert min(told["obstacle_total_harm"]) > 0.0
-
-
-def test_record__positions_end_at_the_obstacle(near_one: Scenario) -> None:
-    record = eb.record_episode(near_one.sample(1, 7).worlds, make_agent("coast"), scenario=near_one)
-    gap = float(record.initial.obstacle_gap_m[0])
-    assert record.positions_m[:, 0].max() == pytest.approx(gap, abs=1e-9) and (record.positions_m <= gap + 1e-9).all()
-    struck = record.impacts.pair == -1
-    assert struck.any() and record.impacts.closing_speed_mps[struck][0] ** 2 == record.ledger.obstacle_first_harm[0]
-
-
 @pytest.mark.parametrize("vehicle", [0, 1])
 def test_shield__step_mode_bounds_the_harm_of_the_obstacle_too_to_the_last_bit(vehicle: int) -> None:
     scenario = NEAR.with_learners([vehicle])
@@ -89,13 +55,6 @@ def test_shield__step_mode_bounds_the_harm_of_the_obstacle_too_to_the_last_bit(v
     assert not shield.memory.distrusted.any()
     assert (harm <= shield.predicted_harm).all() and np.array_equal(harm, shield.bound)
     assert (shield.interventions > 0).sum() > 5 and (episodes.ledger.obstacle_count > 0).any()
-
-
-@pytest.mark.parametrize("name", ["paper-random", "cooperation-4-all"])
-def test_manifest__a_policys_observation_is_known_again_by_its_features(name: str) -> None:
-    schema = ObservationSchema.of(eb.observation_for(load_scenario(name)))
-    assert schema.spec == eb.observation_for(load_scenario(name)) and ObservationSchema.of(schema.spec) == schema
-    assert set(schema.model_dump()) == {"front", "rear", "features", "scaling_sha256"}  # as in every shipped policy
 
 
 STATE = {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}

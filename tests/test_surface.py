@@ -16,19 +16,12 @@ import ethbrake_marl as eb
 ROOT = Path(__file__).resolve().parents[1]
 PUBLIC = {name: getattr(eb, name) for name in eb.__all__ if name != "__version__"}
 CLASSES = {name: value for name, value in PUBLIC.items() if inspect.isclass(value)}
-MOST_WORDS = 100
 
 
 def own_docstring(value: Any) -> str:
     """The docstring that stands at the name itself, never an inherited one."""
     text = vars(value).get("__doc__") if inspect.isclass(value) else value.__doc__
     return inspect.cleandoc(text or "")
-
-
-def prose(text: str) -> str:
-    """A docstring without its list of arguments and its examples."""
-    without_arguments = re.sub(r"(?ms)^Args:\n.*?(\n\n(?=\S)|\Z)", "", text)
-    return re.sub(r"(?ms)^>>> .*?(\n\n|\Z)", "", without_arguments)
 
 
 def examples() -> Iterator[Any]:
@@ -68,18 +61,3 @@ def test_example__runs(example: doctest.DocTest, tmp_path: Path, monkeypatch: py
     report: list[str] = []
     failed, _ = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE).run(example, out=report.append)
     assert not failed, "".join(report)
-
-
-@pytest.mark.parametrize("name", PUBLIC)
-def test_public_name__says_what_it_is_in_few_words(name: str) -> None:
-    words = len(prose(own_docstring(PUBLIC[name])).split())
-    assert 0 < words <= MOST_WORDS
-
-
-QUESTIONS = frozenset({"What", "Who", "Whose", "How", "Where", "Whether", "When", "Which", "Why"})
-
-
-@pytest.mark.parametrize("path", sorted((ROOT / "ethbrake_marl").rglob("*.py")), ids=lambda path: path.stem)
-def test_module__says_what_it_is(path: Path) -> None:
-    text = ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""
-    assert text and re.split(r"\W", text)[0] not in QUESTIONS, f"{path}: {text.splitlines()[:1]}"

@@ -1,6 +1,6 @@
 """Behaviour cloning: a network learns from a dataset to act as an agent did. Read it from top to bottom.
 
-    write_dataset("runs/ppo.parquet", "ppo", scenario="paper-random", episodes=10_000, seed=1)  # in Python
+    to_parquet("runs/ppo.parquet", "ppo", scenario="paper-random", episodes=10_000, seed=1)  # in Python
     python train/clone.py runs/ppo.parquet --output runs/clone
     ethbrake evaluate --agents full_brake,ppo,train/clone.py:make_agent:runs/clone,best_harm --episodes 2000
 
@@ -35,11 +35,11 @@ EPOCHS, BATCH, LEARNING_RATE = 20, 512, 1e-3
 
 
 def read_dataset(path: Path) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Return observations [k, F], actions [k, 1] and metadata of a Parquet file from `write_dataset`."""
+    """Return observations [k, F], actions [k, 1] and metadata of a Parquet file from `to_parquet`."""
     try:
         metadata = json.loads(pyarrow.parquet.read_metadata(path).metadata[b"ethbrake_marl"])
     except (KeyError, TypeError, pyarrow.ArrowInvalid):
-        raise InvalidInput(f"{path}: must be a Parquet file from `write_dataset`") from None
+        raise InvalidInput(f"{path}: must be a Parquet file from `to_parquet`") from None
     if len(metadata["learners"]) != 1:
         raise InvalidInput(f"{path}: has {len(metadata['learners'])} learners; it must have one")
     number = metadata["learners"][0].removeprefix("vehicle_")
@@ -127,7 +127,7 @@ def make_agent(argument: str | None, settings: eb.AgentSettings) -> eb.Agent:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("dataset", type=Path, help="a Parquet file from `write_dataset`")
+    parser.add_argument("dataset", type=Path, help="a Parquet file from `to_parquet`")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("runs/clone"), help="new folder for the policy")
     args = parser.parse_args()

@@ -118,7 +118,7 @@ def search(given: argparse.Namespace, command: str) -> tuple[BestHarmTable, dict
 
 
 def proven_of_table(worlds: Worlds, task: Task, table: BestHarmTable) -> dict[str, Any] | None:
-    """Return what is proven about the worlds of a list; None if nothing is proven.
+    """Return what is proven about the worlds of a list; None if no harm is proven.
 
     The result has the mean proven harm (m2/s2, valid for both counts), the shares of worlds with proven contact and
     with proven impact, and ``Between``, which uses the least harms of the table. Undecided values are None. Worlds that
@@ -128,7 +128,7 @@ def proven_of_table(worlds: Worlds, task: Task, table: BestHarmTable) -> dict[st
     def of(rows: Ints) -> dict[str, Any] | None:
         some = worlds.take(rows)
         proof, identity = prove(some, task), task_problem(some, task).identity
-        if isinstance(proof, Unproven):
+        if isinstance(proof, Unproven) or proof.harm is None or proof.impact is None:
             return None
         known = (table.harm(identity, harm_count) for harm_count in HARM_COUNTS)
         contact, impact = proof.contact, proof.impact

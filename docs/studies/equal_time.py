@@ -27,7 +27,6 @@ from ethbrake_marl.scenario.schema import Scenario
 AGENTS = (
     "ppo+search", "ppo", "universal", "full_brake+search", "e_v2x_bm",
     *(f"best_harm:{candidates}" for candidates in (1000, 3000, 10_000, 40_000)),
-    *(f"planner:{candidates}" for candidates in (64, 256, 1024)),
 )  # fmt: skip
 WORLDS, SEED, REPEATS = 1000, 8, 2
 CHUNK = 500  # worlds simulated together, equal for all agents

@@ -1,17 +1,14 @@
-"""Equilibria of the levels of cooperation, and teams with own or common objectives: docs/results/equilibria.json.
+"""Equilibria of the levels of cooperation, and teams with own or common objectives.
 
     .venv/bin/python docs/studies/equilibria.py runs/equilibria --jobs 2
 
-Trains the teams that are missing in the folder, searches equilibria, and writes the tables, all on the same worlds.
+Trains the teams that are missing in the folder, searches equilibria, and prints the tables, all on the same worlds.
 Searches minimise first-impact harm. Processor seconds of a search do not contain compiling.
 """
 
 from __future__ import annotations
 
 import argparse
-import datetime
-import importlib.util
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -33,10 +30,7 @@ from ethbrake_marl.extensions.cooperation import (
     price_of_anarchy,
 )
 from ethbrake_marl.extensions.cooperation.levels import STANDARD
-from ethbrake_marl.extensions.studies.machine import this_machine
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.files.store import write_file
-from ethbrake_marl.game.harm import HARM_COUNTS
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.training.recipe import Scheme
 from ethbrake_marl.training.team import load_team
@@ -47,8 +41,11 @@ OBJECTIVES = ("own", "total", "maximin")
 TRAINED = ("cooperation-3-pair", "cooperation-4-all")
 SCHEMES: dict[str, Scheme] = {"cooperation": "shared", "cooperation-ppo": "independent"}  # recipe -> scheme
 SEEDS = {"cooperation": (0, 1, 2), "cooperation-ppo": (0, 1)}
-DOCS = Path(__file__).resolve().parents[1]
-RESULTS = DOCS / "results" / "equilibria.json"
+PRICES = (
+    *("level", "objective", "ends converged", "worlds where ends differ", "joint optimum"),
+    *("best end", "worst end", "price of stability", "price of anarchy", "processor s"),
+)
+LEARNED = ("level", "recipe, scheme", "objective", "Vehicle 1", "Vehicle 2", "Vehicle 3", "line")
 
 
 class Level(NamedTuple):
@@ -123,20 +120,6 @@ def price_rows(level: Level) -> list[list[str]]:
     return rows
 
 
-def bearing_rows(level: Level) -> list[list[str]]:
-    """Return rows with the harm of each vehicle where the best responses end, per start, and in the joint optimum."""
-    rows = [[f"`{level.name}`", "total", "joint optimum", *(show(mean(each)) for each in level.optimum.T), "", ""]]
-    rows[0][-2] = show(mean(level.optimum.sum(axis=1)))
-    rows[0][-1] = "–"
-    for objective, ends in level.ends.items():
-        for start, end in ends.items():
-            first, total = (end.borne[count] for count in HARM_COUNTS)
-            each = [show(mean(vehicle)) for vehicle in first.T]
-            line = [show(mean(harm.sum(axis=1))) for harm in (first, total)]
-            rows.append([f"`{level.name}`", objective, start, *each, *line])
-    return rows
-
-
 def learned_rows(place: Path, name: str, worlds: int) -> list[list[str]]:
     """Return rows with the harm of each vehicle with trained teams."""
     rows = []
@@ -152,70 +135,17 @@ def job(name: str, objective: str, recipe: str, seed: int) -> str:
     return f"{name}-{objective}-{recipe}-seed{seed}"
 
 
-def write(levels: Sequence[Level], learned: list[list[str]], worlds: int, file: Path) -> str:
-    """Write the tables in the format of docs/results, and return them as Markdown."""
-    spec = importlib.util.spec_from_file_location("docs_results", DOCS / "extension" / "results.py")
-    assert spec is not None and spec.loader is not None
-    results = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = results  # its data classes look up annotations here
-    spec.loader.exec_module(results)
-    about = f"{worlds} worlds of seed {SEED}; first-impact harm in m²/s², mean per world with 95 % intervals."
-    how = f"Best responses in turn from three starts, with {BUDGET:,} candidates per response"
-    how += f" and at most {ROUNDS} rounds."
-    vehicles = ["Vehicle 1", "Vehicle 2", "Vehicle 3"]
-    tables = {
-        "price-of-anarchy": (
-            "Cost of separate decisions",
-            [
-                *("level", "objective", "ends converged", "worlds where ends differ", "joint optimum"),
-                *("best end", "worst end", "price of stability", "price of anarchy", "processor s"),
-            ],
-            [row for level in levels for row in price_rows(level)],
-            f"{about} {how} Ends differ if the harm of some vehicle differs by more than 0.1. Best and worst end are"
-            " chosen per world, among converged ends. A price is a ratio of means.",
-            "a long search",
-        ),
-        "equilibria-borne": (
-            "Harm of each vehicle where best responses end",
-            ["level", "objective", "start", *vehicles, "line, first-impact", "line, total"],
-            [row for level in levels for row in bearing_rows(level)],
-            f"{about} {how} All worlds, with and without convergence.",
-            "a long search",
-        ),
-        "equilibria-learned": (
-            "Harm of each vehicle with trained teams, own and common objectives",
-            ["level", "recipe, scheme", "objective", *vehicles, "line"],
-            learned,
-            f"{about} Three seeds of `cooperation`, two of `cooperation-ppo`, a million decisions each; intervals over"
-            " seeds and worlds.",
-            "a training",
-        ),
-    }
-    made = [
-        results.Table(
-            id=name,
-            title=title,
-            columns=columns,
-            rows=rows,
-            commands=["python docs/studies/equilibria.py runs/equilibria --jobs 2"],
-            machine=this_machine().processor + ", shared with other work",
-            date=datetime.datetime.now(datetime.UTC).date().isoformat(),
-            compared=compared,
-            note=note,
-        )
-        for name, (title, columns, rows, note, compared) in tables.items()
-    ]
-    write_file(file, results.text_of(made).encode())
-    return "\n\n".join(f"{each.title}\n\n{each.markdown}" for each in made)
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train, search, write the tables and print them."""
+    """Train, search, and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="folder of the trainings; existing ones are not repeated")
     parser.add_argument("--jobs", type=int, default=1, help="number of parallel processes, with one thread each")
     parser.add_argument("--worlds", type=int, default=WORLDS, help="worlds of the list")
-    parser.add_argument("--output", type=Path, default=RESULTS, help="JSON file for the tables")
     given = parser.parse_args(arguments)
     given.folder.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(given.jobs, get_context("spawn")) as pool:
@@ -228,7 +158,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for each in trainings:
             each.result()
     learned = [row for name in TRAINED for row in learned_rows(given.folder, name, given.worlds)]
-    print(write(levels, learned, given.worlds, given.output))
+    print(table(PRICES, [row for level in levels for row in price_rows(level)]), table(LEARNED, learned), sep="\n\n")
 
 
 if __name__ == "__main__":

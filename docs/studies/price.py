@@ -30,7 +30,6 @@ POLICY = "ppo"
 ALONE = ("full_brake", POLICY)  # agents that have no variant ``estimated``
 LIMITS = {  # agent that decides on received messages -> the same agent that knows the line exactly
     "e_v2x_bm:estimated": "e_v2x_bm",
-    "planner:128:estimated": "planner:128",
     f"{POLICY}+step:estimated": f"{POLICY}+step",
     f"{POLICY}+robust:estimated": f"{POLICY}+step",  # no robust shield is exact
 }

@@ -34,7 +34,7 @@ def make_agent(
     """Make a new agent, which drives one vehicle, or the team of agents that one training run has trained.
 
     Args:
-        spec: ``name[:argument][@policy]``, followed by wrappers, for example ``constant:3.5``, ``planner:64`` or
+        spec: ``name[:argument][@policy]``, followed by wrappers, for example ``constant:3.5`` or
             ``ppo+search+step``. ``ethbrake agent list`` lists all agents and wrappers. ``my_file.py:make_agent`` runs
             ``my_file.py`` with all your rights, and calls its function ``make_agent`` with the arguments of a factory
             (see ``register_agent``), or without arguments if the function has no parameters.
@@ -112,7 +112,7 @@ def make_role(scenario: Scenario, vehicle: int, *, most_candidates: int | None =
 
 
 def find_entry(spec: AgentSpec | str) -> Entry:
-    """Return the registry entry of an agent, such as ``planner:64`` or ``ppo``.
+    """Return the registry entry of an agent, such as ``constant:3.5`` or ``ppo``.
 
     Raises ``UnknownName`` for an unknown agent, with a similar name as a suggestion. Raises ``InvalidInput`` for an
     argument or policy that the agent does not accept.

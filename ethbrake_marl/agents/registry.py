@@ -125,7 +125,7 @@ def around_forms() -> tuple[str, ...]:
 
 
 def shield_forms() -> tuple[str, ...]:
-    """Return all texts after ``+`` that select a shield without a variant: ``("episode", "robust:interior", ...)``.
+    """Return all texts after ``+`` that select a shield without a variant: ``("episode", "episode:pairwise", ...)``.
 
     A shield with arguments appears once without an argument, and once with each argument.
     """

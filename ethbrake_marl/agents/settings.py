@@ -19,12 +19,12 @@ class AgentSettings:
     """Settings for a function that makes an agent, in addition to the argument in the agent's specification.
 
     >>> import ethbrake_marl as eb
-    >>> eb.AgentSettings("planner:64", scenario=eb.load_scenario("paper-random")).needed_scenario().name
+    >>> eb.AgentSettings("constant:3.5", scenario=eb.load_scenario("paper-random")).needed_scenario().name
     'paper-random'
 
     """
 
-    spec: str  # specification of the agent, such as "planner:64", with the wrappers that were already made
+    spec: str  # specification of the agent, such as "constant:3.5", with the wrappers that were already made
     policy: str | None = None  # text after the @ of the specification; None without an @
     scenario: Scenario | None = None  # scenario in which the agent drives; None: unknown
     harm_count: HarmCount = "first"  # impacts whose harm an optimising agent minimises: each pair's first, or all

@@ -120,8 +120,6 @@ def run_command(
         out.result(result.results, Text(headline), *result.tables)
         for note in result.notes:
             out.note(note)
-        if result.interrupted:
-            out.interrupted(f"interrupted: {result.interrupted}; the report does not include it: {trained.directory}")
         _end(out, trained)
 
 

@@ -29,19 +29,18 @@ from ethbrake_marl.engine.memory import (
 from ethbrake_marl.engine.own_grid import OwnGrid, Stop, Way
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.engine.state import State
-from ethbrake_marl.engine.stream import Roster, Start, Stream, check_alert, packed_with
+from ethbrake_marl.engine.stream import Roster, Start, Stream, check_alert
 from ethbrake_marl.engine.terms import Terms
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep, renumbered
 from ethbrake_marl.game.actions import checked_action
 from ethbrake_marl.game.definition import Game
-from ethbrake_marl.game.harm import Ledger, empty_ledger
+from ethbrake_marl.game.harm import Ledger
 from ethbrake_marl.game.impacts import EpisodeImpacts
 from ethbrake_marl.game.observations import Observation, Observations, ObservationSpec, Plan
 from ethbrake_marl.game.observed import common_observation, observations_of
 from ethbrake_marl.game.reward_vector import RewardVector
 from ethbrake_marl.game.rewards import Reward
 from ethbrake_marl.physics.columns import Packed
-from ethbrake_marl.physics.episode import Decisions
 from ethbrake_marl.physics.messages import hear_rows
 from ethbrake_marl.physics.rows import FLAG
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
@@ -609,41 +608,6 @@ class Engine:
         """
         builds_up = self.scenario.builds_up or state.packed.builds_up or self.in_pieces
         return self._now.rules._replace(builds_up=builds_up)
-
-    def place(self, worlds: Worlds, ledger: Ledger | None = None, *, ended: Bools | None = None) -> None:
-        """Replace all n worlds, for example by worlds that another simulator has moved.
-
-        The parameters of the vehicles, the memories and the times of decisions do not change. The next step leads from
-        the time of ``worlds`` to the next decision.
-
-        Args:
-            worlds: n worlds at any time of their episodes.
-            ledger: harm and number of impacts of each pair since the episodes began; None: no harm and no impacts.
-            ended: whether each episode has ended, [n]; steps do not move the world of an ended episode. None: an
-                episode has ended if its time is at or after the horizon.
-
-        Raises ``InvalidInput`` if ``worlds`` has another number of worlds or vehicles than the engine, or if a term of
-        the reward is computed from single impacts.
-
-        """
-        state = self.state
-        if state.impacts is not None:
-            names = ", ".join(self._terms.impact_names)
-            raise InvalidInput(
-                f"place: the reward needs all impacts of an episode (for {names}), but a world that is placed in the"
-                " engine has no record of its impacts"
-            )
-        if worlds.speeds_mps.shape != state.wanted.shape:
-            n, N = state.wanted.shape
-            raise InvalidInput(
-                f"place: got {worlds.n} worlds of {worlds.N} vehicles; {n} worlds of {N} vehicles are needed"
-            )
-        ledger = empty_ledger(worlds) if ledger is None else ledger
-        motion, clock = self._now.kept(packed_with(worlds, ledger)).state, state.clock.copy()
-        latest = Decisions(clock[:, START], self.scenario.time_step_s).latest(worlds.time_s)
-        clock[:, STEP] = np.maximum(latest, 0)
-        clock[:, ENDED] = worlds.time_s >= self.scenario.horizon_s if ended is None else ended
-        self._now = self._now._replace(state=state._replace(motion=motion, clock=clock), ruling=None)
 
     def moment(self) -> State:
         """Return a copy of the present state, from which ``branch`` can continue."""

@@ -49,7 +49,6 @@ class Terms:
         registered = [MEASURES[name] for name in self.params.terms]
         self._by_step = [measure for measure in registered if measure.by == "step"]
         self._by_impacts = [measure for measure in registered if measure.by == "impacts"]
-        self.impact_names = [measure.name for measure in self._by_impacts]
         self.count_impacts = bool(self._by_impacts)  # whether a measure of single impacts has a weight
         self.by_objective = bool(self._objectives)  # whether each vehicle has an objective of its own
         self.are_foreign = bool(registered)  # whether some measure was registered by a user, and so may fail

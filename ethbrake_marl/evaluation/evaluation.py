@@ -64,7 +64,6 @@ class Evaluation:
     # ``vehicle_2_type`` and so on if it has vehicle types, ``recording`` if its worlds come from recordings.
     kinds: Mapping[str, NDArray[np.str_]] = field(default_factory=dict)
     rejected: int = 0  # number of drawn worlds that were rejected because of an early impact
-    host: str = ""  # name of the external simulator that moved the vehicles; "": the physics of this package
     _computed: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)  # cache of ``once``
 
     def __repr__(self) -> str:

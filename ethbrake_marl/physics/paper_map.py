@@ -130,16 +130,6 @@ def held_motion(speed: float, command: float, limit: float, step: float) -> tupl
 
 
 @compiled
-def held_speeds(speeds: Floats, command: Floats, limit: Floats, step: float) -> Floats:
-    """Return the speeds after a step of constant command, [n, N] m/s: ``held_motion`` of each vehicle."""
-    after = np.empty(speeds.shape)
-    for k in range(speeds.shape[0]):
-        for i in range(speeds.shape[1]):
-            after[k, i] = held_motion(speeds[k, i], command[k, i], limit[k, i], step)[0]
-    return after
-
-
-@compiled
 def move_to_grid(
     k: int, duration: float, time: float, gaps: Floats, speeds: Floats, command: Floats, latency: Floats, limit: Floats
 ) -> None:

@@ -269,13 +269,11 @@ class StepShield:
             plan[better] = actions[better]
             harm = np.where(better, alone, harm)
         settles = ends_under(running, plan)[0]
-        harm, enclosure = self._bound_at_alert(possible, problem, rows, plan, harm)
         constants = joint_constants(len(vehicles)) if len(vehicles) > 1 else np.array(CONSTANTS)
         return StepMemory(
             running, Backup(plan, harm, constants), first_bound=harm, alone_harm=alone, settles=settles,
             replaced=np.zeros((worlds.n, *plan.shape[2:]), np.int64), distrusted=np.zeros(worlds.n, np.bool_),
             baseline_shares=borne[::members, borne.shape[1] - worlds.N :], episode=np.zeros(worlds.n, np.int64),
-            enclosure=enclosure,
         )  # fmt: skip
 
     def _problem(self, possible: Worlds, members: int) -> ProfileProblem:
@@ -306,18 +304,6 @@ class StepShield:
                 possible, vehicles, harm_count=self.harm_count, horizon_s=horizon_s,
                 time_step_s=self.scenario.time_step_s, others_mps2=others, written_out=self.scenario.has_obstacle,
             )  # fmt: skip
-
-    def _bound_at_alert(
-        self, possible: Worlds, problem: ProfileProblem, rows: Ints, plan: Floats, harm: Floats
-    ) -> tuple[Floats, Any]:
-        """Return the bound of each episode at the alert, [n] m2/s2, and further memory (``StepMemory.enclosure``).
-
-        ``plan`` is the first plan of each world, [n, L] or [n, L, K]; ``harm`` is the harm of this plan, the largest
-        over the possible worlds, [n] m2/s2. ``problem`` describes the possible worlds for the functions of
-        ``engine.profiles``. This class returns ``harm`` and None; a subclass may return another bound and a further
-        memory.
-        """
-        return harm, None
 
     def decide(
         self,
@@ -367,7 +353,6 @@ class StepShield:
         decision = certify(now, actions, held, budget)
         if proposer is not None:
             decision = certify_by_policy(decision, now, actions, budget, held.plan, proposer)
-        decision = self._also_certified(now, memory, budget, decision, asked & ~memory.distrusted)
         decision.reason[asked & memory.distrusted] = ShieldReason.ASSUMPTION_BROKEN
         decision.applied[goes_on] = -1.0  # full braking where the episode should have ended
         after = memory._replace(
@@ -382,17 +367,6 @@ class StepShield:
             self._entries.extend(interventions(now, memory.episode, self.vehicles, proposed, decision, held))
             after = after._replace(logged=len(self._entries))
         return decision, after
-
-    def _also_certified(
-        self, now: Running, memory: StepMemory, budget: Floats, decision: Decision, asked: Bools
-    ) -> Decision:
-        """Return the decision that is applied: ``decision``, in which a subclass may replace further actions.
-
-        ``decision`` already accepts proposals that only a rollout of the policy certifies, and its plans stay within
-        the ``budget`` [n] (m2/s2) in every possible world. ``now`` are the running episodes before the decision;
-        ``asked`` is True only for trusted worlds. This class returns ``decision`` unchanged.
-        """
-        return decision
 
     def as_seen(self, seen: Floats) -> Floats:
         """Return the observed worlds ``seen`` in a form that can be compared with the prediction.

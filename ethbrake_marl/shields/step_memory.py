@@ -23,32 +23,29 @@ class StepMemory(NamedTuple):
     distrusted: Bools = np.zeros(0, np.bool_)  # [n] whether the world differed from the prediction
     baseline_shares: Floats = np.zeros((0, 0))  # [n, N] harm of each vehicle under the best constant actions (m2/s2)
     episode: Ints = np.zeros(0, np.int64)  # [n] number of each row's running episode, from 0
-    enclosure: Any = None  # further memory of a subclass of shield, an object with ``take(rows)``; None: no memory
     logged: int = 0  # number of interventions in the log
 
     def take(self, rows: Ints) -> StepMemory:
         """Return the memory of only the episodes in the rows ``rows``."""
-        running, backup, enclosure = self.running, self.backup, self.enclosure
+        running, backup = self.running, self.backup
         return self._replace(
             running=None if running is None else running.take(rows),
             backup=backup._replace(plan=backup.plan[rows], harm=backup.harm[rows]),
-            enclosure=None if enclosure is None else enclosure.take(rows),
             **{name: getattr(self, name)[rows] for name in (*BEGUN, "episode")},
         )
 
     def put(self, rows: Ints, begun: StepMemory) -> StepMemory:
         """Return a copy of this memory in which new episodes replace the episodes in the rows ``rows``.
 
-        ``begun`` is the memory of the new episodes, in the order of ``rows``; only its field ``enclosure`` contains all
-        rows of the batch. If there are at least as many new episodes as rows in the batch, the new episodes replace the
-        whole batch. Each new episode gets a higher number than the old episode in its row.
+        ``begun`` is the memory of the new episodes, in the order of ``rows``. If there are at least as many new
+        episodes as rows in the batch, the new episodes replace the whole batch. Each new episode gets a higher number
+        than the old episode in its row.
         """
         old, new = self.running, begun.running
         assert new is not None
         if old is None or new.n >= old.n:
             episode = np.full(len(rows), self.episode.max(initial=-1) + 1)
-            ordered = begun._replace(enclosure=None, episode=episode)
-            return ordered.take(np.argsort(rows))._replace(enclosure=begun.enclosure, logged=self.logged)
+            return begun._replace(episode=episode, logged=self.logged).take(np.argsort(rows))
         at = old.rows_of(rows)
         running = Running(
             old.problem.put(at, new.problem), put(old.states, at, new.states), put(old.steps, rows, new.steps),
@@ -58,7 +55,7 @@ class StepMemory(NamedTuple):
         columns: dict[str, Any] = {name: put(getattr(self, name), rows, getattr(begun, name)) for name in BEGUN}
         columns["episode"] = put(self.episode, rows, self.episode[rows] + 1)
         backup = begun.backup._replace(plan=plan, harm=harm)
-        return self._replace(running=running, backup=backup, enclosure=begun.enclosure, **columns)
+        return self._replace(running=running, backup=backup, **columns)
 
 
 BEGUN = (

@@ -72,8 +72,6 @@ class RunReport:
 
     tables: tuple[Any, ...]  # tables to print instead of the results table
     note: str  # text that says where the report is
-    # What the report lacks because of Ctrl-C, such as "the training alone/vehicle_2"; "": the report is complete.
-    interrupted: str = ""
 
 
 MakeReport = Callable[[Experiment, OnProgress], RunReport]  # writes a report, and calls the second argument meanwhile
@@ -99,7 +97,6 @@ class ExperimentResult:
     results: list[dict[str, Any]]  # content of results.json: one object per agent
     tables: tuple[Any, ...]  # tables of the evaluation, for a terminal
     notes: tuple[str, ...]  # texts that say where results and reports are
-    interrupted: str = ""  # what the reports lack because Ctrl-C stopped them (``RunReport.interrupted``); "": nothing
 
 
 def run_experiment(
@@ -123,8 +120,7 @@ def run_experiment(
 
     Ctrl-C during the training stops the training after the current update, and the policy trained so far is evaluated.
     A second Ctrl-C, or Ctrl-C during the evaluation, raises ``KeyboardInterrupt``; the folder still contains the
-    policy. Ctrl-C while a report trains further policies stops their training, and the report is written without these
-    policies (``ExperimentResult.interrupted``). ``run.json`` records how the run ended.
+    policy. ``run.json`` records how the run ended.
 
     ``episodes`` is the number of worlds of the evaluation list, and ``list_seed`` its seed. ``on_progress`` is called
     with the progress of training, evaluation and reports. For ``directory``, ``steps``, ``seed``, ``force`` and
@@ -167,8 +163,7 @@ def run_experiment(
         tell(Progress("results", 1, 1))
         experiment = Experiment(trained, agents, evaluation, rows, list_seed, harm_count, started)
         written = [make(experiment, tell) for make in reports]
-    stopped = ", ".join(report.interrupted for report in written if report.interrupted)
-    _note(run, trained.status, "report", f"interrupted: {stopped}" if stopped else None)
+    _note(run, trained.status, "report", None)
     tables = tuple(table for report in written for table in report.tables)
     notes = tuple(report.note for report in written)
     return ExperimentResult(
@@ -176,7 +171,6 @@ def run_experiment(
         results,
         tables or (*rows.tables(),),
         notes or (f"results, with every measure: {run.path / 'results.json'}",),
-        stopped,
     )
 
 

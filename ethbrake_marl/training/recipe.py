@@ -132,7 +132,7 @@ class TrainingRecipe(FileModel):
     n_envs: int = Field(ge=1, description="number of worlds that are simulated together")
     learning_rate: LearningRate = Field(description="learning rate of the optimiser, which falls from start to end")
     gamma: Fraction = Field(description="discount factor per time step; must be equal to reward.shaping_discount")
-    reward: RewardParams = Field(description="weights and constants of the reward's terms (docs/reference/rewards.md)")
+    reward: RewardParams = Field(description="weights and constants of the reward's terms (game/rewards.py)")
     observation: Annotated[ListedFeatures | None, Field(exclude_if=not_)] = Field(
         None,
         description="groups and features that learners observe, such as [own, front_1, rear_1]; if missing, the"

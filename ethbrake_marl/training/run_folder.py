@@ -6,12 +6,9 @@ import csv
 import json
 import os
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_args
-
-from filelock import FileLock, Timeout
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.files.plain import read_object
@@ -120,11 +117,6 @@ class RunDirectory:
     @property
     def is_finished(self) -> bool:
         return self.status.is_file() and read_object(self.status).get("status") == "finished"
-
-    def wait_for_others(self, longest_s: float) -> None:
-        """Wait until no other process trains in this folder, at most ``longest_s`` seconds. Raises no errors."""
-        with suppress(Timeout, OSError), FileLock(self.lock, timeout=longest_s, mode=0o666):
-            pass
 
     @classmethod
     def chosen_by(cls, evaluations: Sequence[Mapping[str, Any]], harm_count: HarmCount, prefix: str = "") -> str:

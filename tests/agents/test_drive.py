@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.driving import drive, script_agents
+from ethbrake_marl.agents.driving import Episodes, drive, episode_engine, script_agents
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
-from ethbrake_marl.agents.foreign import policy_agent
-from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.agents.registry import agent_entries, agent_names, register_agent
@@ -69,20 +67,6 @@ def test_drive__a_scripted_vehicle_that_is_driven_follows_its_script_in_nobodys_
     assert found[0].tolist() == found[1].tolist()
 
 
-def test_drive__an_agent_sees_what_a_learner_sees_from_the_first_decision_on():
-    worlds, seen = SCENARIO.sample(20, 7).worlds, []
-
-    def half(observation):
-        seen.append(observation.tobytes())
-        return np.full((len(observation), 1), -0.5, np.float32)
-
-    drive(worlds, policy_agent(half, scenario=SCENARIO), SCENARIO, 1)
-    engine = eb.Engine(SCENARIO, 20, learners=(1,), scripts=script_agents(SCENARIO, except_for=1), worlds=worlds)
-    for each in seen[:3]:
-        assert engine.observe(1).tobytes() == each
-        engine.step(np.full((20, 1), -0.5))
-
-
 def test_drive__a_policy_as_a_role_does_what_it_does_when_it_is_driven():
     def with_roles(**roles):
         return SCENARIO.replace(early_impacts="keep", roles={"vehicle_1": "full_brake", **roles})
@@ -130,15 +114,6 @@ def test_record__and_motion_follow_scripts_that_decide_within_a_step(swinging):
         assert record.gaps_m[-1] == pytest.approx(outcome.final.gaps_m[k])
 
 
-def test_team__of_one_drives_as_the_agent_alone():
-    sample, agent = SCENARIO.sample(40, 7), make_agent("e_v2x_bm")
-    result = evaluate(sample, {"alone": agent, "team": Team({1: agent}, "team")}, scenario=SCENARIO)
-    named = evaluate(sample, {"alone": agent}, scenario=SCENARIO, vehicle="vehicle_2")
-    outcomes = result.outcome("alone"), result.outcome("team"), named.outcome("alone")
-    assert len({(each.final.gaps_m.tobytes(), each.predicted_harm.tobytes()) for each in outcomes}) == 1
-    assert result.vehicle == named.vehicle == 1
-
-
 def test_evaluate__an_agent_alone_drives_every_learner_and_a_team_of_nobody_none():
     brake, gentle = make_agent("full_brake"), make_agent("constant:4")
     agents = {"alone": brake, "by_hand": Team({1: brake, 2: brake}, "t"), "unlike": Team({1: gentle, 2: brake}, "u")}
@@ -158,16 +133,6 @@ def test_evaluate__an_agent_alone_drives_every_learner_and_a_team_of_nobody_none
         np.testing.assert_allclose(*harms, rtol=1e-12)
     assert found.outcome("alone").total_harm.tolist() == found.outcome("by_hand").total_harm.tolist()
     assert found.vehicles == (1, 2)
-
-
-def test_evaluate__several_learners_do_what_they_do_in_training(policy: eb.Policy) -> None:
-    worlds = PAIR.sample(50, 3).worlds
-    engine = eb.Engine(PAIR, 50, learners=(1, 2), scripts={0: make_agent("full_brake")}, worlds=worlds)
-    while not engine.ended.all():
-        engine.step({i: policy(engine.observe(i))[:, 0].astype(np.float64) for i in (1, 2)})
-    outcome = evaluate(worlds, {"soft": LearnedAgent(policy)}, scenario=PAIR).outcome("soft")
-    assert outcome.ledger.total_harm.tolist() == engine.ledger.total_harm.tolist()
-    assert outcome.final.gaps_m.tolist() == engine.worlds.gaps_m.tolist()
 
 
 def test_evaluate__one_agent_remembers_each_learner_apart_and_predicts_for_nobody():
@@ -344,3 +309,13 @@ def test_register_agent__makes_names_and_policies_known():
     assert {each[2] for each in seen} == {"total"} and "mine" in agent_names()
     with pytest.raises(AlreadyExists, match="agent 'mine' is registered already"):
         register_agent("mine", lambda argument, settings: make_agent("coast"))
+
+
+def test_drive__terms_of_an_episode_that_has_ended_stay_as_they_are_while_others_run():
+    worlds, brake = SCENARIO.sample(20, 7).worlds, make_agent("full_brake")
+
+    def risk(some: Worlds) -> list[list[float]]:
+        engine = episode_engine(some, brake, SCENARIO, 1, {"harm": 0.0, "risk": 1.0})
+        return Episodes.of(engine, some, summed=("risk",)).terms["risk"].tolist()
+
+    assert risk(worlds) == [risk(worlds.take([k]))[0] for k in range(20)]

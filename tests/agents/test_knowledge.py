@@ -127,14 +127,9 @@ WORDS = {"A": "3", "CANDIDATES": "20"}
 
 
 def in_two(stated):
-    """Those that do not see through a channel, and those that do; what bounds a box takes minutes to compile."""
+    """Those that do not see through a channel, and those that do."""
     return (
-        [
-            pytest.param(spec, marks=pytest.mark.slow if "interior" in spec else ())
-            for spec, knows in stated.items()
-            if Knowledge(knows).sees_through == seeing
-        ]
-        for seeing in (False, True)
+        [spec for spec, knows in stated.items() if Knowledge(knows).sees_through == seeing] for seeing in (False, True)
     )
 
 
@@ -222,10 +217,9 @@ def with_channels(honest):
     What goes around an agent, or estimates, sees what it is told; the fast ones are three kinds of telling.
     """
     return [
-        pytest.param(*spec.values, channel, marks=[*spec.marks, *slow])
+        pytest.param(spec, channel, marks=pytest.mark.slow if k % 3 and (":" in spec or "+" in spec) else ())
         for spec in honest
         for k, channel in enumerate(HIDING)
-        for slow in [(pytest.mark.slow,) if k % 3 and (":" in spec.values[0] or "+" in spec.values[0]) else ()]
     ]
 
 

@@ -6,7 +6,6 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.spec import parse_spec, split_names, split_specs
-from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.policies.shipped import shipped_policies
 
 NAMES = (
@@ -49,18 +48,6 @@ def check_folder(path, ways):
     assert split_names(f"{path},{path}") == [path, path]
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_policy__in_a_folder_of_any_name_drives_in_python_and_in_commands(name, capsys):
-    put(name)
-    scenario = eb.load_scenario("paper-random")
-    found = eb.evaluate(agents=f"full_brake,ppo@{name}", scenario=scenario, episodes=5)
-    assert list(found.outcomes) == ["full_brake", f"ppo@{name}"]
-    ours = eb.evaluate(agents="ppo", scenario=scenario, episodes=5).outcome("ppo")
-    assert (found.outcome(f"ppo@{name}").total_harm == ours.total_harm).all()
-    assert run_command(["evaluate", "--agents", f"full_brake,ppo@{name}", "--episodes", "5", "--json"]) == 0
-    assert "ppo@" in capsys.readouterr().out
-
-
 def test_folder__that_is_not_there_separates_as_before():
     assert parse_spec("ppo@c+step").around == ("step",) and parse_spec("ppo@c+step").policy == "c"
     assert split_specs("ppo@lr=0.001,seed=1") == ["ppo@lr=0.001", "seed=1"]
@@ -68,32 +55,6 @@ def test_folder__that_is_not_there_separates_as_before():
     put("c")
     assert parse_spec("ppo@c+step").policy == "c+step" and parse_spec("ppo@c/+step").around == ("step",)
     assert parse_spec("ppo@c").policy == "c" and parse_spec("ppo@c+step+step").around == ("step",)
-
-
-def test_folder__that_is_called_like_a_list_of_agents_is_none_of_them():
-    put("full_brake,coast")
-    assert split_specs("full_brake,coast") == ["full_brake", "coast"]
-    assert split_specs("coast+robust:estimated,coast+step") == ["coast+robust:estimated", "coast+step"]
-    put("a")
-    put("b")
-    assert split_specs("ppo@a,ppo@b,coast") == ["ppo@a", "ppo@b", "coast"]
-
-
-@pytest.mark.parametrize("name", ["my,agents.py", "a:b.py", "a@b.py", "a+step.py", "lr=1,x/y+z.py", "a.py:make.py"])
-def test_python_file__of_any_name_makes_agents(name, tmp_path):
-    (tmp_path / name).parent.mkdir(exist_ok=True)
-    (tmp_path / name).write_text(
-        "import ethbrake_marl as eb\ndef make(argument, settings):\n    return eb.make_agent(argument or 'coast')\n",
-        "utf-8",
-    )
-    put("w,1")
-    for behind, argument, policy in (("", None, None), (":full_brake", "full_brake", None), ("@w,1", None, "w,1")):
-        spec = f"{name}:make{behind}"
-        parts = parse_spec(spec)
-        assert (parts.file, parts.argument, parts.policy) == ((name, "make"), argument, policy)
-        assert parse_spec(f"{spec}+step").around == ("step",)
-        assert split_specs(f"coast,{spec}+step,{spec}") == ["coast", f"{spec}+step", spec]
-    assert eb.make_agent(f"{name}:make:full_brake").name == "full_brake"
 
 
 @pytest.mark.parametrize("name", ["constant:b.py", "policy@b.py"])

@@ -6,7 +6,6 @@ import numpy as np
 import onnxruntime
 import pytest
 import stable_baselines3 as stable
-import torch
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
@@ -14,7 +13,6 @@ from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import policy_sha256
 from ethbrake_marl.game.actions import action_to_command
 from ethbrake_marl.game.observations import ObservationSpec, observe
-from ethbrake_marl.shields.drivers import ShieldedDriver
 from tests.fixtures.asked import Asked
 
 SCENARIO = eb.load_scenario("paper-random")
@@ -56,23 +54,6 @@ def test_trained_model__drives_as_in_its_own_librarys_rollout(model, seed):
     worlds = SCENARIO.sample(1, seed, channel="training").worlds
     agent = eb.policy_agent(model, name="sb3", scenario=SCENARIO.name)
     assert harms(agent, worlds)[0] == pytest.approx(-reward, rel=1e-5, abs=1e-5)
-
-
-def test_policy_of_another_library__is_known_by_its_weights():
-    module = torch.nn.Linear(27, 1)
-    agent = eb.policy_agent(module)
-    before = policy_sha256(agent)
-    assert before == policy_sha256(ShieldedDriver(agent, SCENARIO)) == policy_sha256(eb.policy_agent(module))
-    with torch.no_grad():
-        module.bias += 0.1
-    assert policy_sha256(agent) not in (before, None)
-    assert policy_sha256(eb.policy_agent(lambda seen: seen[:, :1])) is None
-
-
-def test_torch_module__drives_without_gradients():
-    module = torch.nn.Sequential(torch.nn.Linear(27, 1), torch.nn.Tanh())
-    by_hand = eb.policy_agent(lambda seen: module(torch.from_numpy(seen)).detach().numpy())
-    assert harms(eb.policy_agent(module, name="torch")).tolist() == harms(by_hand).tolist()
 
 
 def test_onnx__path_and_session_drive_as_the_policy_does(tmp_path: Path):
@@ -149,16 +130,6 @@ def test_model_trained_under_vec_normalize__drives_by_what_was_counted():
     normalised.obs_rms.mean = mean
     assert policy_sha256(agent) == before  # asking has counted nothing
     assert harms(eb.policy_agent(model.policy)).tolist() != harms(agent).tolist()  # the statistics do matter
-
-
-def test_model_that_has_its_environment__observes_what_it_was_trained_on():
-    other = {"observation": eb.ObservationSpec(front=2, rear=0)}  # as many features as the usual ones
-    assert other["observation"].size == eb.ObservationSpec().size
-    for rows in (
-        eb.make_sb3_vec_env("paper-random", 2, **other),
-        stable.common.env_util.make_vec_env("EthBrake-v1", env_kwargs=other),
-    ):
-        assert eb.policy_agent(stable.PPO("MlpPolicy", rows)).observation.front == 2
 
 
 @pytest.mark.parametrize("appended", ["number", "state"])

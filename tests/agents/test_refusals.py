@@ -11,20 +11,15 @@ from stable_baselines3 import PPO
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_harm
-from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.making import make_agent
-from ethbrake_marl.agents.protocol import Knowledge, Team
+from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.agents.registry import register_agent
 from ethbrake_marl.errors import AgentFailed, AlreadyExists, UnknownName
 from ethbrake_marl.game.observations import observe
-from tests.fixtures.asked import Asked
 from tests.refused import refused
 
 PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")
 WORLDS = PAPER.sample(12, 7).worlds
-FREE = PAPER.replace(early_impacts="keep")
-SLOW = PAPER.replace(brake_rate_mps3=9)
-PIECES = PAPER.replace(roles={"vehicle_1": "profile:0=3,1=5", "vehicle_2": "learner"})
 BRAKE = make_agent("full_brake")
 
 
@@ -63,26 +58,16 @@ def policy(answer: Callable[[int], Any]) -> Any:
 
 SPECS: dict[str, Callable[[], object]] = {
     "agent 'coast:1': coast takes no argument": lambda: make_agent("coast:1"),
-    "agent 'full_brake@': a path must follow '@'": lambda: make_agent("full_brake@"),
-    "agent 'coast@runs/x': coast does not use a policy; leave": lambda: make_agent("coast@runs/x"),
-    "agent 'ladder': is the name of a group of agents; write the name of one agent": lambda: make_agent("ladder"),
-    "agent 'constant': constant needs a finite deceleration in m/s2 after the colon": lambda: make_agent("constant"),
-    "agent 'constant:fast': constant needs a finite deceleration in m/s2 after the colon": lambda: make_agent(
-        "constant:fast"
-    ),
-    "agent 'e_v2x_bm:total': after the first colon, write 'coupled' or 'pairwise', then 'estimated'": lambda: (
-        make_agent("e_v2x_bm:total")
-    ),
-    "harm_count = 'both': must be 'first' or 'total'": lambda: make_agent("e_v2x_bm", harm_count="both"),
-    "horizon_s = 0.0: must be a finite number of seconds above 0": lambda: make_agent("e_v2x_bm", horizon_s=0.0),
-    "agent name 'mine:x': must be a name without ':' and '@', for instance": lambda: register_agent("mine:x", Own),
+    "agent 'full_brake@': a path must follow": lambda: make_agent("full_brake@"),
+    "agent 'coast@runs/x': coast does not": lambda: make_agent("coast@runs/x"),
+    "agent 'constant': constant needs a": lambda: make_agent("constant"),
+    "agent 'e_v2x_bm:total': after the first": lambda: make_agent("e_v2x_bm:total"),
+    "harm_count = 'both': must be 'first' or": lambda: make_agent("e_v2x_bm", harm_count="both"),
+    "horizon_s = 0.0: must be a finite": lambda: make_agent("e_v2x_bm", horizon_s=0.0),
+    "agent name 'mine:x': must be a name": lambda: register_agent("mine:x", Own),
     "file 'nowhere/none.py': does not exist": lambda: make_agent("nowhere/none.py:make_agent"),
-    "agent 'profile:0=3,1=5+step': a braking profile can only be the role of a vehicle; write it": lambda: make_agent(
-        "profile:0=3,1=5+step", scenario=PAPER
-    ),
-    "agent 'policy' needs a policy: write policy@PATH, where PATH is the folder of": lambda: make_agent(
-        "policy+step", scenario=PAPER
-    ),
+    "agent 'profile:0=3,1=5+step': a braking": lambda: make_agent("profile:0=3,1=5+step", scenario=PAPER),
+    "agent 'policy' needs a policy: write": lambda: make_agent("policy+step", scenario=PAPER),
 }
 
 
@@ -93,21 +78,13 @@ def test_agent__is_refused(message: str) -> None:
 
 
 SEARCHES: dict[str, Callable[[], object]] = {
-    "agent 'constant:7.5': brakes harder than the braking capacity of 7 m/s2": lambda: (
-        Asked(make_agent("constant:7.5")).begin(WORLDS, 1).act(WORLDS, 1)
-    ),
-    "agent 'constant:-7.5': drives harder than the driving capacity of 7": lambda: (
-        Asked(make_agent("constant:-7.5")).begin(WORLDS, 1).act(WORLDS, 1)
-    ),
-    "vehicle = 3: must be an index from 0 to 2": lambda: optimise_pairwise(WORLDS, 3),
-    "deceleration_mps2[0, 1] = -1: must be finite and >= 0": lambda: pairwise_harm(WORLDS.take([0]), [1.0, -1.0, 1.0]),
-    "team 't': key 'vehicle_2': must be the index of a vehicle, at least 0": lambda: Team({"vehicle_2": BRAKE}, "t"),
-    "team 't': vehicle_2 = 'coast': must be an agent, for instance": lambda: Team({1: "coast"}, "t"),
-    "team 't': drives vehicle_2; must drive exactly vehicle_2": lambda: Team.of(Team({1: BRAKE}, "t"), (1, 2)),
-    "scenario 'cooperation-3-pair': this function needs exactly one controlled vehicle; the controlled": lambda: (
-        eb.evaluate(PAIR.sample(2, 0), {"b": BRAKE}, scenario=PAIR).vehicle
-    ),
-    "agent 'coast' drives vehicle_3, but vehicle_2 of scenario 'cooperation-3-pair'": lambda: eb.evaluate(
+    "vehicle = 3: must be an index from 0 to": lambda: optimise_pairwise(WORLDS, 3),
+    "deceleration_mps2[0, 1] = -1: must be": lambda: pairwise_harm(WORLDS.take([0]), [1.0, -1.0, 1.0]),
+    "team 't': key 'vehicle_2': must be the": lambda: Team({"vehicle_2": BRAKE}, "t"),
+    "team 't': vehicle_2 = 'coast': must be": lambda: Team({1: "coast"}, "t"),
+    "team 't': drives vehicle_2; must drive": lambda: Team.of(Team({1: BRAKE}, "t"), (1, 2)),
+    "scenario 'cooperation-3-pair': this": lambda: eb.evaluate(PAIR.sample(2, 0), {"b": BRAKE}, scenario=PAIR).vehicle,
+    "agent 'coast' drives vehicle_3, but": lambda: eb.evaluate(
         PAIR.sample(2, 0), {"h": make_agent("coast+episode", scenario=PAIR.with_learners(["vehicle_2"]))}, scenario=PAIR
     ),
 }
@@ -120,35 +97,13 @@ def test_command_search_or_team__is_refused(message: str) -> None:
 
 
 OWN: dict[str, Callable[[], object]] = {
-    "agent 'own' of vehicle_2: act on 12 worlds at 0.50 s: ZeroDivisionError: division by zero": lambda: evaluated(
-        Own(lambda worlds: 1 / 0)
-    ),
-    "memory: act got a memory of the form None, but returned a memory of the form (dtype('float64'),);": lambda: (
-        evaluated(Remembers(lambda n: None, lambda m, n: np.zeros(n)))
-    ),
-    "but returned a memory of the form {'a': (dtype('float64'),), 'b': (dtype('float64'),)}": lambda: evaluated(
-        Remembers(lambda n: {"a": np.zeros(n)}, lambda m, n: m | {"b": np.zeros(n)})
-    ),
-    "but returned a memory of the form (dtype('int64'),); keys": lambda: evaluated(
-        Remembers(np.zeros, lambda m, n: np.zeros(n, np.int64))
-    ),
-    "but returned a memory of the form (dtype('float64'), 2); keys": lambda: evaluated(
-        Remembers(lambda n: np.zeros((n, 1)), lambda m, n: np.zeros((n, 2)))
-    ),
-    "agent 'mine' of vehicle_2: memory: key 'b.c': must be a Python identifier, for": lambda: evaluated(
+    "agent 'own' of vehicle_2: act on 12": lambda: evaluated(Own(lambda worlds: 1 / 0)),
+    "memory: act got a memory of the form": lambda: evaluated(Remembers(lambda n: None, lambda m, n: np.zeros(n))),
+    "agent 'mine' of vehicle_2: memory: key": lambda: evaluated(
         Remembers(lambda n: {"a": (np.zeros(n), {"b.c": np.zeros(n)})}, lambda m, n: m)
     ),
-    "agent 'mine' of vehicle_2: memory: key 0: must be a Python identifier, for": lambda: evaluated(
-        Remembers(lambda n: {0: np.zeros(n)}, lambda m, n: m)
-    ),
-    "agent 'mine' of vehicle_2: memory: contains an array of objects; arrays must contain numbers": lambda: evaluated(
+    "agent 'mine' of vehicle_2: memory:": lambda: evaluated(
         Remembers(lambda n: np.array([[]] * n + [[1]], object)[:n], lambda m, n: m)
-    ),
-    "the closed form of E-V2X-BM and planner: the result would not be exact, because brakes in world 0": lambda: (
-        evaluated(make_agent("e_v2x_bm:pairwise"), SLOW)
-    ),
-    "the closed form of E-V2X-BM and planner: a vehicle of world 0 follows a braking profile": lambda: evaluated(
-        make_agent("e_v2x_bm:pairwise"), PIECES
     ),
 }
 
@@ -160,30 +115,9 @@ def test_agent_of_a_user__is_refused(message: str) -> None:
 
 
 FAILED: dict[str, Callable[[], object]] = {
-    "agent 'own', world 0, vehicle_2 at 0.50 s: act returned float64 of shape (12, 1); must return one": lambda: (
-        evaluated(Own(lambda worlds: np.zeros((worlds.n, 1))))
-    ),
-    "agent 'own', world 0, vehicle_2 at 0.50 s: act returned float64 of shape ()": lambda: evaluated(
-        Own(lambda worlds: 1.0)
-    ),
-    "agent 'own', world 0, vehicle_2 at 0.50 s: act returned object of shape ()": lambda: evaluated(
-        Own(lambda worlds: None)
-    ),
-    "agent 'own', world 0, vehicle_2 at 0.50 s: act returned <U1 of shape (12,); must return one": lambda: evaluated(
-        Own(lambda worlds: ["x"] * worlds.n)
-    ),
-    "agent 'own', world 7, vehicle_2 at 0.50 s: act returned float64 of shape (7,); must return one number": lambda: (
-        evaluated(Own(lambda worlds: np.zeros(7)))
-    ),
-    "agent 'own', world 4, vehicle_2 at 0.50 s: command nan m/s2; must be in [-7, 7]": lambda: evaluated(
-        Own(lambda worlds: np.where(np.arange(worlds.n) == 4, np.nan, 0.0))
-    ),
-    "agent 'own', world 4, vehicle_2 at 0.50 s: command -99 m/s2; must be in [-7, 7]": lambda: evaluated(
-        Own(lambda worlds: np.where(np.arange(worlds.n) == 4, -99.0, 0.0))
-    ),
-    "agent 'own', world 0, step 1 (0.50 s): observations of shape (12, 27): returned a tuple of 2 values": lambda: (
-        evaluated(policy(lambda n: (np.zeros((n, 1)), None)))
-    ),
+    "agent 'own', world 0, vehicle_2 at 0.50": lambda: evaluated(Own(lambda worlds: np.zeros((worlds.n, 1)))),
+    "agent 'own', world 7, vehicle_2 at 0.50": lambda: evaluated(Own(lambda worlds: np.zeros(7))),
+    "agent 'own', world 0, step 1 (0.50 s):": lambda: evaluated(policy(lambda n: (np.zeros((n, 1)), None))),
 }
 
 
@@ -197,16 +131,8 @@ def test_agent__fails_with_its_world_and_step(message: str) -> None:
     ("answer", "world", "reason"),
     [
         (lambda n: np.zeros((n, 2)), 0, "; must return one number per world, shape (12, 1)"),
-        (lambda n: np.zeros(n), 0, "; must return one number per world, shape (12, 1)"),
-        (lambda n: np.zeros((n, 1))[:5], 5, "; must return one number per world, shape (12, 1)"),
-        (
-            lambda n: np.where(np.arange(n) == 3, np.nan, -1.0)[:, None],
-            3,
-            "; the action for this world is nan; must be in [-1, 1]",
-        ),
         (lambda n: 1.5 * np.eye(n)[:, 2:3], 2, "; the action for this world is 1.5; must be in [-1, 1]; clip=True"),
     ],
-    ids=["two columns", "no column", "too few", "nan", "beyond 1"],
 )
 def test_policy__fails_with_its_world_and_step(answer: Callable[[int], Any], world: int, reason: str) -> None:
     shape = answer(12).shape
@@ -216,19 +142,16 @@ def test_policy__fails_with_its_world_and_step(answer: Callable[[int], Any], wor
 
 
 POLICIES: dict[str, Callable[[], object]] = {
-    "agent 'int': policy = 3: must be a function of observations, an object": lambda: eb.policy_agent(3),
-    "agent 'none': policy = 'none.onnx': there is no such file": lambda: eb.policy_agent(Path("none.onnx")),
-    "agent 'ActorCriticPolicy': the policy was trained for observations of shape (27,), but would get": lambda: (
-        eb.policy_agent(PPO("MlpPolicy", eb.EthBrakeEnv()).policy, observation=eb.ObservationSpec(front=2))
+    "agent 'int': policy = 3: must be a": lambda: eb.policy_agent(3),
+    "agent 'none': policy = 'none.onnx':": lambda: eb.policy_agent(Path("none.onnx")),
+    "agent 'ActorCriticPolicy': the policy": lambda: eb.policy_agent(
+        PPO("MlpPolicy", eb.EthBrakeEnv()).policy, observation=eb.ObservationSpec(front=2)
     ),
-    "agent 'PPO': initial_state: can only be used with a function (observation,": lambda: eb.policy_agent(
+    "agent 'PPO': initial_state: can only be": lambda: eb.policy_agent(
         PPO("MlpPolicy", eb.EthBrakeEnv()), initial_state=lambda n: np.zeros((n, 1))
     ),
-    "agent 'Sequential': the layer Dropout is in training mode, in which results are random": lambda: eb.policy_agent(
+    "agent 'Sequential': the layer Dropout": lambda: eb.policy_agent(
         torch.nn.Sequential(torch.nn.Linear(27, 4), torch.nn.Dropout(0.5), torch.nn.Linear(4, 1))
-    ),
-    "agent 'Sequential': the layer BatchNorm1d is in training mode, in which results are random": lambda: (
-        eb.policy_agent(torch.nn.Sequential(torch.nn.Linear(27, 4), torch.nn.BatchNorm1d(4), torch.nn.Linear(4, 1)))
     ),
 }
 
@@ -240,13 +163,8 @@ def test_policy_of_another_library__is_refused(message: str) -> None:
 
 
 NAMES: dict[str, Callable[[], object]] = {
-    "unknown agent 'full_break'; did you mean 'full_brake'?": lambda: make_agent("full_break"),
-    "unknown agent 'ful_brake'; did you mean 'full_brake'?": lambda: make_agent("ful_brake+step", scenario=PAPER),
-    "unknown shield or search 'stpe'; did you mean 'step'?": lambda: make_agent("full_brake+stpe", scenario=PAPER),
-    "unknown shield or search ''": lambda: make_agent("full_brake+", scenario=PAPER),
-    "unknown scenario 'paper-randon'; did you mean 'paper-random'?": lambda: make_agent(
-        "coast+episode", scenario="paper-randon"
-    ),
+    "unknown agent 'full_break'; did you": lambda: make_agent("full_break"),
+    "unknown shield or search 'stpe'; did": lambda: make_agent("full_brake+stpe", scenario=PAPER),
 }
 
 
@@ -265,29 +183,17 @@ def raising(): raise KeyError("weights")"""
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
-        (
-            "My+File.py:",
-            "agent 'My+File.py:': an agent from a file must be FILE.py:FUNCTION, FILE.py:FUNCTION:ARGUMENT",
-        ),
-        ("My+File.py:make_agent+stpe", "unknown shield or search 'stpe'; did you mean 'step'?"),
-        ("My+File.py:make_agent:3", "make_agent has no parameters; write the name without an argument"),
-        ("My+File.py:wrong", "agent 'My+File.py:wrong': 'int' is not an agent, because it has no name and no act"),
-        ("My+File.py:raising", "agent 'My+File.py:raising': KeyError: 'weights' (My+File.py, line 4)"),
-        ("My+File.py:nobody", "file 'My+File.py': does not define 'nobody'; write FILE.py:NAME with a name"),
+        ("My+File.py:", "agent 'My+File.py:': an agent from a"),
+        ("My+File.py:make_agent:3", "make_agent has no parameters; write the"),
+        ("My+File.py:wrong", "agent 'My+File.py:wrong': 'int' is not"),
+        ("My+File.py:raising", "agent 'My+File.py:raising': KeyError:"),
+        ("My+File.py:nobody", "file 'My+File.py': does not define"),
     ],
 )
 def test_file_of_an_agent__is_refused(spec: str, message: str, empty_folder: Path) -> None:
     Path("My+File.py").write_text(FILE)
     with refused(message):
         make_agent(spec, scenario=PAPER)
-
-
-def test_file_of_an_agent__is_the_same_as_long_as_the_process_lives(empty_folder: Path) -> None:
-    Path("mine.py").write_text(FILE)
-    make_agent("mine.py:make_agent")
-    Path("mine.py").write_text(f"{FILE}# changed")
-    with refused("file 'mine.py': has changed since it was loaded; start a new Python process"):
-        make_agent("mine.py:make_agent")
 
 
 def test_file_of_an_agent__is_not_run_for_a_role(empty_folder: Path) -> None:
@@ -305,31 +211,11 @@ def test_agent_that_is_registered__takes_a_policy_only_if_it_says_so() -> None:
 
 
 @pytest.mark.parametrize(
-    ("drives", "third"),
-    [
-        (lambda: make_agent("e_v2x_bm").begin(WORLDS, 1, {2: Own(len, "steering")}), "steering"),
-        (lambda: eb.parallel_env(TWO_OPTIMISE), "e_v2x_bm"),
-    ],
-    ids=["own", "e_v2x_bm"],
+    ("drives", "third"), [(lambda: make_agent("e_v2x_bm").begin(WORLDS, 1, {2: Own(len, "steering")}), "steering")]
 )
 def test_looking_ahead__needs_commands_that_are_fixed_at_the_alert(drives: Callable[[], object], third: str) -> None:
     with refused(f"vehicle_3 is driven by '{third}', whose command is not fixed at the alert"):
         drives()
-
-
-TWO_OPTIMISE = FREE.replace(
-    obstacle_gap_m=42, roles={"vehicle_1": "learner", "vehicle_2": "e_v2x_bm", "vehicle_3": "e_v2x_bm"}
-)
-
-
-@pytest.mark.parametrize("knows", ["everything", ("messages", "gossip")])
-def test_knowledge__is_of_known_kinds(knows: Any) -> None:
-    agent = Own(len)
-    agent.knows = knows
-    with refused(
-        f"agent 'own': knows = {knows!r}: must be one or several of 'own sensors', 'messages', 'estimated model'"
-    ):
-        Knowledge.of(agent)
 
 
 def test_agent__has_a_name_and_its_act_takes_a_memory_if_it_begins_with_one() -> None:
@@ -344,28 +230,6 @@ def test_agent__has_a_name_and_its_act_takes_a_memory_if_it_begins_with_one() ->
 
     with refused("agent 'own' of vehicle_2: the agent has a method begin, but its method act has no argument memory;"):
         evaluated(Begins(len))
-
-
-def test_policy__gives_one_action_per_world_and_a_state_per_world() -> None:
-    class Fixed:
-        observation = eb.ObservationSpec()
-
-        def __call__(self, seen: Any) -> Any:
-            return np.zeros((len(seen), 2), np.float32)
-
-    class Shared:
-        def predict(self, seen: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False) -> Any:
-            return np.zeros((len(seen), 1)), np.zeros((1, 8))
-
-    with refused("learned: actions have shape (12, 2); must have shape (12, 1), one action per world"):
-        LearnedAgent(Fixed()).act(WORLDS, 1)
-    with refused("27 features: an array of the policy's state has shape (1, 8) for two worlds and (1, 8) for three"):
-        eb.policy_agent(Shared())
-    states = eb.policy_agent(lambda seen, state: (seen, state), name="mine", initial_state=lambda n: np.zeros(3))
-    with refused(
-        "initial_state(12): state: contains ndarray of shape (3,); must contain only arrays of length 12", AgentFailed
-    ):
-        states.begin(WORLDS, 1, {})
 
 
 @pytest.mark.parametrize("around", ["", "+episode", "+episode:pairwise", "+step"])
@@ -387,24 +251,3 @@ def check_failure(around: str) -> None:
         eb.evaluate(
             PAPER.sample(12, 7), {"mine": make_agent("theirs" + around, scenario=PAPER)}, scenario=PAPER, chunk=5
         )
-
-
-def test_failure__after_the_first_step_is_told_with_its_step() -> None:
-    once = iter([1, 1, 1, 1, 0] + [1] * 99)
-    tired = eb.policy_agent(lambda seen: np.zeros((len(seen), 1 // next(once))), name="tired")
-    with refused("agent 'own', step 5: observations of shape (12, 27): ZeroDivisionError", AgentFailed):
-        evaluated(tired)
-
-
-def test_model_of_stable_baselines3__was_trained_on_the_features_that_it_is_given() -> None:
-    rows = eb.make_sb3_vec_env(PAPER, 2, observation=eb.ObservationSpec(front=2, rear=0))
-    with refused("agent 'PPO': the model was trained with the observation ObservationSpec(front=2, rear=0"):
-        eb.policy_agent(PPO("MlpPolicy", rows), observation=eb.ObservationSpec())
-    numbered = PPO("MlpPolicy", eb.make_sb3_vec_env(PAIR, 2, appended="number")).policy
-    with refused(
-        "the policy was trained for observations of shape (28,), but would get observations of 27 features; pass the"
-    ):
-        eb.policy_agent(numbered, scenario=PAIR)
-    stated = PPO("MlpPolicy", eb.make_sb3_vec_env(PAIR, 2, appended="state")).policy
-    with refused("agent 'ActorCriticPolicy': appended = 'state' needs the scenario of the training; pass it"):
-        eb.policy_agent(stated, appended="state")

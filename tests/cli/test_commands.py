@@ -1,37 +1,26 @@
 """The frame of all commands: names, help, completion, streams, signals, exit statuses; and agents from a file."""
 
-import io
 import json
 import os
 import re
 import shlex
-import signal
 import subprocess
 import sys
-import time
-from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import pytest
 import typer
-from numba.core import event
-from rich.console import Console
 
-from ethbrake_marl import __version__, evaluation, parallel
+from ethbrake_marl import __version__, evaluation
 from ethbrake_marl.cli import app as frame
-from ethbrake_marl.cli.app import add_command, app, run_command, whole_command
+from ethbrake_marl.cli.app import run_command, whole_command
 from ethbrake_marl.cli.command import Out
-from ethbrake_marl.errors import AlreadyExists
 from ethbrake_marl.evaluation import evaluate, make_agents
-from ethbrake_marl.evaluation.identity import EPISODES, LIST_SEED
-from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.scenario import load_scenario
 from tests.fixtures.commands import Command, check_refused, told_json
 
-ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = [""]  # every one, groups too
 for name, found in whole_command().commands.items():
     COMMANDS += [name, *(f"{name} {each}" for each in getattr(found, "commands", ()))]
@@ -52,27 +41,6 @@ def test_help__has_examples_that_parse_and_a_short_name(
         arguments = shlex.split(example.partition(" >")[0])
         assert " ".join(arguments).startswith(words)
         assert ethbrake(*arguments, "--help").status == 0
-
-
-def test_command_line__is_small_enough_to_be_read() -> None:
-    leaves = [each for each in _leaves(whole_command())]
-    assert len(leaves) <= 24
-    for command in leaves:
-        options = {option for each in command.params for option in each.opts if option.startswith("--")}
-        assert len(options) <= 12, command.name
-
-
-def _leaves(command: Any) -> Iterator[Any]:
-    inside = getattr(command, "commands", None)
-    yield from [command] if inside is None else (leaf for each in inside.values() for leaf in _leaves(each))
-
-
-def test_help__says_the_list_that_the_package_has(ethbrake: Command) -> None:
-    told = " ".join(ethbrake("evaluate", "--help").out.split())
-    assert f"[default: ({EPISODES})]" in told and f"[default: ({LIST_SEED})]" in told
-    assert all(
-        f"[default: {each}]" in " ".join(ethbrake("run", "--help").out.split()) for each in (EPISODES, LIST_SEED)
-    )
 
 
 @pytest.mark.parametrize(
@@ -99,47 +67,6 @@ def test_completion__a_shell_that_asks_gets_what_can_follow(monkeypatch, capsys,
     assert (answered or f"ethbrake {__version__}\n") in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("loaded", "temporary", "told"),
-    [
-        (
-            [],
-            False,
-            "compiling the physics for the first time, which takes minutes; later commands use the stored result\n",
-        ),
-        (
-            ["advance-1"],
-            False,
-            "compiling parts of the physics for the first time; later commands use the stored result\n",
-        ),
-        ([], True, "no folder for compiled kernels is writable"),
-    ],
-)
-def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, loaded, temporary, told) -> None:
-    folder = tmp_path / ("ethbrake_marl-x" if temporary else "kept")
-    folder.mkdir()
-    monkeypatch.setattr("ethbrake_marl.kernel_store.cache_folder", lambda: folder)
-    monkeypatch.setattr("ethbrake_marl.physics.jit.cache_folder", lambda: folder)
-    monkeypatch.setattr("ethbrake_marl.physics.jit._loaded", loaded)
-    monkeypatch.setattr("ethbrake_marl.kernel_store._tellers", [])
-    monkeypatch.setitem(event._registered, "numba:compile", [])  # nobody listens any more after this test
-    monkeypatch.setattr("warnings.showwarning", None)
-    monkeypatch.setattr(frame, "EVERY_S", 0.001)
-    frame.prepare_streams()
-
-    @compiled
-    def next_number(x: int) -> int:
-        return x + 1
-
-    assert (next_number(1), next_number(1.5)) == (2, 2.5)
-    captured = capsys.readouterr()
-    first, *more = captured.err.splitlines()
-    assert captured.out == "" and told in f"{first}\n" and more  # each as long as it lasts
-    assert all(re.fullmatch(r"still compiling: \d+ kernels are done after \d+ s", line) for line in more)
-    time.sleep(0.1)
-    assert capsys.readouterr().err == ""  # nothing is compiled any more
-
-
 def test_results__stand_alone_on_stdout_whatever_a_file_of_the_users_prints(ethbrake: Command, tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(
         "import numpy as np, ethbrake_marl as eb\n"
@@ -154,12 +81,6 @@ def test_results__stand_alone_on_stdout_whatever_a_file_of_the_users_prints(ethb
     assert len(told_json(told)) == 2
     assert "noise of a file" in told.err and "noise of a policy" in told.err
     assert "noise" not in ethbrake("evaluate", *files, "--episodes", "3").out
-
-
-def test_a_command_of_a_program__prints_where_it_likes(ethbrake: Command, monkeypatch) -> None:
-    monkeypatch.setattr(app, "registered_commands", [*app.registered_commands])
-    app.command("my-words")(lambda: print("words"))
-    assert ethbrake("my-words").out == "words\n"
 
 
 def test_defect_of_the_program__keeps_its_traceback_and_missing_memory_is_one_line(ethbrake, monkeypatch) -> None:
@@ -208,18 +129,6 @@ def test_program__prints_a_table_on_a_narrow_stdout_and_needs_no_torch(encoding:
     assert out.endswith("loaded:\n"), out
 
 
-def test_kernels__a_temporary_cache_is_told_and_removed_at_the_end(tmp_path: Path) -> None:
-    _, out, _ = program(
-        "from ethbrake_marl.kernel_store import cache_folder; print(cache_folder(), cache_folder().is_dir())\n"
-        "from ethbrake_marl.cli.doctor import _kernel_cache; print(_kernel_cache()[1])",
-        NUMBA_CACHE_DIR="/dev/null/x",
-        TMPDIR=str(tmp_path),
-    )
-    where, told = out.splitlines()
-    assert where.startswith(str(tmp_path / "ethbrake_marl-")) and where.endswith(" True") and "temporary" in told
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_progress__without_a_terminal_is_lines_and_every_ten_seconds_the_time_that_is_left(capsys, monkeypatch) -> None:
     out = Out()
     out.progress("training", 0, 1000, "total harm 9.00")
@@ -238,26 +147,6 @@ def test_progress__without_a_terminal_is_lines_and_every_ten_seconds_the_time_th
         "ppo: 420 of 1,000, about 29 s left",
         "report: figures: 1 of 5",
     ]
-
-
-def test_progress__on_a_terminal_each_part_has_one_bar_above_what_comes_next(monkeypatch, capsys) -> None:
-    screen, out = io.StringIO(), Out()
-    monkeypatch.setattr(out, "_stderr", Console(file=screen, force_terminal=True, width=100))
-    for part, done, total, more in (
-        ("training", 10, 1000, {}),
-        ("training", 1024, 1000, {}),  # a training ends after the update in which its steps are reached
-        ("ppo", 5, 10, {"note": "said once"}),
-        ("report: figures", 1, 5, {}),
-        ("report: the page", 2, 5, {}),
-    ):
-        out.progress(part, done, total, **more)
-    bars = out._bars
-    assert bars is not None
-    tasks = [(task.description, task.completed, task.total) for task in bars.tasks]
-    assert tasks == [("training", 1000, 1000), ("ppo", 5, 10), ("report: the page", 2, 5)]
-    out.note("written")
-    assert screen.getvalue().count("said once") == 1 and not bars.live.is_started and out._bars is None
-    assert capsys.readouterr().err.endswith("written\n")
 
 
 def test_command__ctrl_c_is_one_line_and_the_status_of_an_interruption(capsys) -> None:
@@ -292,68 +181,6 @@ def test_agents_from_a_file__drive_on_the_command_line_behind_a_shield(ethbrake,
     assert ethbrake("shield", "--episodes", "10", "--agents", spec).status == 0
 
 
-@pytest.mark.parametrize(("content", "told"), [(b"x = 1\n\0\n", "null bytes"), (b"def f(:\n", "line 1: SyntaxError")])
-def test_file__that_is_no_python_names_no_line_that_is_not_there(ethbrake, tmp_path, content: bytes, told: str):
-    (tmp_path / "bad.py").write_bytes(content)
-    answer = ethbrake("evaluate", "--agents", f"{tmp_path / 'bad.py'}:make")
-    check_refused(answer, f"file '{tmp_path / 'bad.py'}'", told)
-    assert "None" not in answer.err
-
-
-def test_command__of_the_users_cannot_take_the_place_of_a_built_in_one(ethbrake, monkeypatch):
-    monkeypatch.setattr(app, "registered_commands", [*app.registered_commands])
-
-    @app.command()
-    def evaluate() -> None:
-        """Another one."""
-
-    answer = ethbrake("evaluate", "--episodes", "3")
-    check_refused(
-        answer, "command 'evaluate' already exists; give your command another name: app.command('my-evaluate')"
-    )
-
-
-def test_command_of_a_program__appears_runs_and_takes_no_other_place(ethbrake, monkeypatch):
-    monkeypatch.setattr(frame.COMMANDS, "loaded", dict(frame.COMMANDS.loaded))
-
-    def hello() -> None:
-        """Say hello."""
-        print("hello")
-
-    add_command("hello", hello)
-    assert "Say hello." in ethbrake("--help").out and ethbrake("hello").out == "hello\n"
-    for name in ("hello", "evaluate"):
-        with pytest.raises(AlreadyExists, match=f"command '{name}' is registered already"):
-            add_command(name, lambda: None)
-
-
-def test_measures__asked_for_wrongly_are_one_line(ethbrake):
-    check_refused(
-        ethbrake("evaluate", "--set", "measures="), "--set measures: must be one or more names of measures, with commas"
-    )
-    check_refused(
-        ethbrake("evaluate", "--scenario", "benchmark", "--set", "measures=injury"),
-        "--set measures: cannot be used with benchmark, a group",
-    )
-
-
-BAD = """
-class Leaves:
-    name = "leaves"
-
-    def act(self, worlds, vehicle):
-        raise GeneratorExit("enough")
-"""
-
-
-def test_agent__that_raises_no_exception_is_told_in_one_line(ethbrake: Command, tmp_path: Path) -> None:
-    (tmp_path / "bad.py").write_text(BAD)
-    check_refused(
-        ethbrake("evaluate", "--episodes", "2", "--agents", f"{tmp_path}/bad.py:Leaves"),
-        "your own code ended the process: GeneratorExit: enough (bad.py, line 6)",
-    )
-
-
 def test_stdout__has_results_alone_whatever_writes_past_python(capfd, monkeypatch) -> None:
     for owner, name in ((sys, "stdout"), (frame.warnings, "showwarning")):
         monkeypatch.setattr(owner, name, getattr(owner, name))
@@ -369,28 +196,6 @@ def test_stdout__has_results_alone_whatever_writes_past_python(capfd, monkeypatc
         os.dup2(before, 1)
         os.close(before)
     assert capfd.readouterr() == ("result\n", "raw")
-
-
-def test_sigterm__is_as_ctrl_c_while_processes_work_unless_somebody_else_answers(monkeypatch) -> None:
-    usual = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(KeyboardInterrupt), parallel._sigterm_as_ctrl_c():
-        signal.raise_signal(signal.SIGTERM)
-    assert signal.getsignal(signal.SIGTERM) is usual is signal.SIG_DFL
-    signal.signal(signal.SIGTERM, answered := Mock())
-    try:
-        with parallel._sigterm_as_ctrl_c():
-            signal.raise_signal(signal.SIGTERM)
-    finally:
-        signal.signal(signal.SIGTERM, usual)
-    assert answered.call_count == 1
-
-
-def test_evaluate__says_where_the_uncertainty_of_robust_is_given_and_keeps_no_place_for_it(ethbrake: Command) -> None:
-    assert "+robust needs the description of an uncertainty, which can be given only in Python" in " ".join(
-        ethbrake("evaluate", "--help").out.split()
-    )
-    (row,) = told_json(ethbrake("evaluate", "--episodes", "2", "--agents", "full_brake", "--json"))
-    assert row["agent_settings"] == {"harm_count": "first"}
 
 
 def test_evaluate__shows_whose_harm_an_objective_counts_in_lists_of_any_length(ethbrake: Command, monkeypatch) -> None:

@@ -10,7 +10,6 @@ from packaging.requirements import Requirement
 from ethbrake_marl.agents.e_v2x_bm import pairwise
 from ethbrake_marl.cli import doctor
 from ethbrake_marl.cli.doctor import Check, diagnose
-from ethbrake_marl.kernel_store import cache_folder
 from ethbrake_marl.physics import advance as advance_module
 from ethbrake_marl.scenario import catalogue
 from tests.fixtures.commands import Command, told_json
@@ -84,25 +83,3 @@ def test_compile__only_when_asked_and_says_how_far_it_is_and_what_failed(ethbrak
     monkeypatch.setattr(doctor, "_call", None)  # where nothing can be kept it does not begin
     answer = ethbrake("doctor", "--compile")
     assert answer.status == 1 and re.search("FAIL +compile +no folder .* NUMBA_CACHE_DIR", answer.out)
-
-
-def test_compile_ahead__for_a_run_alone_calls_one_command(monkeypatch) -> None:
-    called = []
-    monkeypatch.setattr(doctor, "_call", lambda door, folder: called.append(door) or "")
-    assert doctor.compile_ahead(training=False, run_alone=True)[0]
-    ((*_, agents),) = called
-    assert set(agents.split(",")) >= {"full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "ppo+episode"}
-
-
-@pytest.mark.long
-def test_compile__leaves_nothing_to_compile(ethbrake: Command) -> None:
-    answer = ethbrake("doctor", "--compile", "--json")
-    assert answer.status == 0 and '"name": "compile",\n    "ok": true' in answer.out
-    kernels = set(cache_folder().iterdir())
-    commands = [
-        ("evaluate", "--agents", "full_brake,e_v2x_bm,ppo,ppo+episode", "--episodes", "3"),
-        ("shield", "--agents", "full_brake", "--episodes", "3"),
-        ("evaluate", "--agents", "full_brake+step", "--episodes", "3"),
-    ]
-    assert [ethbrake(*command).status for command in commands] == [0, 0, 0]
-    assert set(cache_folder().iterdir()) == kernels

@@ -1,6 +1,5 @@
 """``ethbrake scenario`` and ``ethbrake recipe``, ``--set``, and the pages that show them."""
 
-import csv
 import json
 import re
 import runpy
@@ -9,18 +8,13 @@ from pathlib import Path
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation.trial import load_runnable
-from ethbrake_marl.files.yaml import flow_text, parse_yaml
-from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario, shipped_folder
-from ethbrake_marl.scenario.fields import QUANTITY
-from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.catalogue import load_scenario, shipped_folder
 from ethbrake_marl.scenario.tables import read_worlds
 from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
-from tests.fixtures.commands import Answer, Command, check_refused, rows_of, told_json
+from tests.fixtures.commands import Answer, Command, check_refused, told_json
 
 ROOT = Path(__file__).resolve().parents[2]
 TUTORIAL = (ROOT / "docs" / "first-ten-minutes.md").read_text("utf-8")
-OWN_DATA = (ROOT / "docs" / "scenarios.md").read_text("utf-8").partition("\n## Your own vehicle data\n")[2]
 
 
 SCRIPTS = """
@@ -65,31 +59,6 @@ def test_validate__drives_scripts_and_tells_what_refuses_them(ethbrake: Command,
     braked = fast - 0.8 * 6.0  # when Vehicle 3 may act
     assert greedy.status == 2 and greedy.out.startswith("NOT OK") and int(many) == (braked > 16.0).sum() > 0
     check_refused(tried("own_fails"), "of vehicle_3: act on 200 worlds at 1.", "ZeroDivisionError: no gap")
-
-
-def test_validate_and_explain__stay_short_where_each_vehicle_draws_alone(ethbrake: Command, tmp_path: Path) -> None:
-    each = [{"uniform": [4, 5 + 0.1 * i]} for i in range(40)]
-    drawn = dict.fromkeys(("braking_capacity_mps2", "driving_capacity_mps2", "mass_t"), each)
-    roles = {"vehicle_1": "coast", "vehicle_2": "learner", "vehicle_3": "coast"}
-    usual = {"vehicles": 40, "latency_s": 0.4, "early_impacts": "keep", "roles": roles}
-    declared = {**load_scenario("paper-random").declared(), "name": "long", **usual, **drawn}
-    (tmp_path / "long.yaml").write_text(json.dumps(declared))
-    lines = ethbrake("scenario", "validate", tmp_path / "long.yaml").out.splitlines()
-    assert 0 < len(lines) <= 24 and max(map(len, lines)) <= 80
-    sentences = told_json(ethbrake("scenario", "explain", tmp_path / "long.yaml", "--json"))["sentences"]
-    assert len(sentences) <= 20 and len(ethbrake("scenario", "explain", tmp_path / "long.yaml").out.splitlines()) <= 40
-
-
-def test_explain__tells_every_quantity_that_is_declared(ethbrake: Command) -> None:
-    for entry in list_scenarios():
-        told = " ".join(told_json(ethbrake("scenario", "explain", entry.name, "--json"))["sentences"])
-        scenario = load_scenario(entry.name)
-        keys = set(scenario.declared()) & set(QUANTITY.declared)
-        assert all(QUANTITY.declared[key].meaning in told for key in keys), entry.name
-        assert scenario.title in told and f"truncated after {scenario.horizon_s:g} s" in told
-    assert "Time gaps (s): 0.19 to 1.75 (normal, mean 0.97, sd 0.26), drawn for each pair" in " ".join(
-        ethbrake("scenario", "explain", "realistic-motorway").out.split()
-    )
 
 
 def test_show_and_new__are_the_files_and_force_replaces_one(ethbrake: Command, tmp_path: Path) -> None:
@@ -139,29 +108,6 @@ def test_set__is_noted_in_a_training(ethbrake: Command, tiny_recipe: Path, tmp_p
     assert told == (["seed=5", "restitution=0.2"], 5, 0.2)
 
 
-def test_tutorial__own_worlds_give_the_printed_harms(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    worlds, out = Path("mine.csv"), Path("worlds.csv")
-    worlds.write_text(
-        "gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps\n10,8,20,18,20\n5,9,22,18,20\n7,7,20,18,20\n"
-    )
-    (program,) = re.findall(r"```python\n([^`]*mine\.csv[^`]*)```", TUTORIAL)
-    exec(program, {})
-    assert worlds.read_text() in TUTORIAL
-    printed = re.search(r"\n(agent,world,[^`]+)```", TUTORIAL)
-    for old, new in zip(csv.DictReader(printed[1].splitlines()), rows_of(out), strict=True):
-        names, harms = ("agent", "world", "impacts"), ("total_harm", "first_impact_harm")
-        assert [old[name] for name in names] == [new[name] for name in names]
-        assert [float(old[harm]) for harm in harms] == pytest.approx([float(new[harm]) for harm in harms], rel=1e-9)
-
-
-def test_tutorial__its_program_prints_what_stands_below_it(capsys) -> None:
-    found = re.search(r"```python\n(import numpy.*?)```\n\n```\n(.*?)```", TUTORIAL, re.DOTALL)
-    exec(found[1], {})
-    now = [float(word) for word in capsys.readouterr().out.split()]
-    assert now == pytest.approx([float(word) for word in found[2].split()], rel=1e-9)
-
-
 def change_lines(path: str, page: str) -> None:
     """The lines of a scenario that the page's first YAML block changes."""
     block = re.search(r"```yaml\n(.*?)```", page, re.DOTALL)
@@ -170,26 +116,6 @@ def change_lines(path: str, page: str) -> None:
         text, count = re.subn(rf"(?m)^{line.partition(':')[0]}: .*$", line, text)
         assert count == 1
     Path(path).write_text(text)
-
-
-def test_how_to_own_data__its_table_is_read_and_its_distributions_are_valid(tmp_path: Path) -> None:
-    paper = load_runnable("paper-random")
-    table = re.search(r"```text\n(gap_1_m.*?)```", OWN_DATA, re.DOTALL)
-    (tmp_path / "mine.csv").write_text(table[1])
-    vehicles = read_worlds(paper, tmp_path / "mine.csv").vehicles
-    assert (vehicles.mass_t[:, 1].tolist(), vehicles.braking_capacity_mps2[:, 1].tolist()) == ([1.4, 12], [7.5, 5.5])
-    blocks = (parse_yaml(text, "page").content for text in re.findall(r"```yaml\n(.*?)```", OWN_DATA, re.DOTALL))
-    drawn, typed, rows = blocks
-    assert set(paper.replace(**drawn).sample(100, 7).worlds.vehicles.mass_t.flat) == {1.3, 1.5, 1.9, 2.4}
-    content = {key: value for key, value in paper.declared().items() if key not in typed["vehicle_types"]["car"]}
-    assert set(Scenario(**content, **typed).sample(100, 7).types.flat) == {"car", "truck"}
-    (tmp_path / "triples.csv").write_text(
-        "seconds,gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps\n2,10,9,20,19,18\n"
-    )
-    keys = {key: value for key, value in paper.declared().items() if key not in ("name", "gaps_m", "speeds_mps")}
-    text = "\n".join(f"{key}: {flow_text(value)}" for key, value in {"name": "mine", **keys, **rows}.items())
-    (tmp_path / "mine.yaml").write_text(text)
-    assert load_runnable(tmp_path / "mine.yaml").sample(2, 7).worlds.speeds_mps.tolist() == [[20, 19, 18]] * 2
 
 
 def test_new__on_a_table_has_its_rows_beside_it(ethbrake: Command, tmp_path: Path) -> None:

@@ -14,8 +14,6 @@ import onnx
 import pytest
 
 from ethbrake_marl.cli.command import Out
-from ethbrake_marl.progress import OnProgress
-from ethbrake_marl.training.experiment import Experiment, RunReport
 from tests.fixtures.commands import Command, check_refused, rows_of, told_json
 
 AGENTS = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "trained policy", "hybrid"]
@@ -64,24 +62,6 @@ def test_run__its_policy_evaluates_to_the_same_figures_afterwards(ethbrake: Comm
         assert row == {**then[names.get(row["agent"], row["agent"])], "agent": row["agent"]}
 
 
-@pytest.mark.slow
-def test_run__roles_choose_among_several_learners(ethbrake, tiny_recipe, scenario_file, tmp_path) -> None:
-    scenario = scenario_file("\n  vehicle_3: full_brake\n", "\n  vehicle_3: learner\n")
-    chosen = [
-        "--scenario",
-        scenario,
-        "--set",
-        "roles.vehicle_2=full_brake",
-        "--episodes",
-        "20",
-        "--output",
-        tmp_path / "new",
-    ]
-    rows = told_json(ethbrake("run", "--recipe", tiny_recipe, *chosen, "--json"))
-    assert {row["parameters"]["controlled_vehicle"] for row in rows} == {"vehicle_3"}
-    assert not (tmp_path / "new" / "other_tests.json").exists()  # not one of the three tests
-
-
 def test_run__interrupted_twice_stops_at_once_and_keeps_the_policy(ethbrake, tiny_recipe, tmp_path, monkeypatch):
     ctrl_c_when(monkeypatch, lambda shown: shown["done"] == 128, lambda shown: shown["name"] == "evaluation")
     folder = tmp_path / "stopped"
@@ -100,33 +80,6 @@ def test_run__failed_says_so_in_its_status(ethbrake, tiny_recipe, tmp_path, monk
     assert (status, stage) == ("failed", "evaluation") and "no space left" in reason
 
 
-@pytest.mark.slow
-def test_run__with_sac_all_minimise_the_harm_it_is_for(ethbrake, tiny_sac, tmp_path) -> None:
-    folder = tmp_path / "new"
-    total = ("--set", "reward.harm_count=total", "--episodes", "20", "--output", folder)
-    rows = told_json(ethbrake("run", "--recipe", tiny_sac, *total, "--json"))
-    assert [row["agent"] for row in rows][-2:] == ["trained policy", "hybrid"]
-    agents = f"full_brake,e_v2x_bm,sac@{folder}+episode"
-    asked = (
-        "--episodes",
-        "20",
-        "--set",
-        "harm_count=total",
-        "--output",
-        tmp_path / "w",
-        "--per-world",
-        "csv",
-        "--json",
-    )
-    for row, then in zip(
-        told_json(ethbrake("evaluate", "--agents", agents, *asked)), (rows[0], rows[1], rows[4]), strict=True
-    ):
-        assert row == {**then, "agent": row["agent"], "per_world": row["per_world"]}
-    assert json.loads((folder / "config.json").read_text())["update_ratio"] == 1 / 16
-    assert ethbrake("evaluate", "--episodes", "20", "--agents", f"sac@{folder}", "--json").status == 0
-    check_refused(ethbrake("evaluate", "--agents", f"ppo@{folder}"), "was trained by sac")
-
-
 def test_evaluate__interrupted_writes_nothing(ethbrake: Command, tmp_path: Path, monkeypatch) -> None:
     ctrl_c_when(monkeypatch, lambda shown: shown["name"] == "worlds")
     answer = ethbrake("evaluate", "--episodes", "5", "--agents", "coast", "--output", tmp_path / "new")
@@ -135,13 +88,6 @@ def test_evaluate__interrupted_writes_nothing(ethbrake: Command, tmp_path: Path,
 
 
 # A training
-
-
-@pytest.mark.parametrize("command", ["run", "train"])
-def test_existing_run__is_refused_and_left_alone(ethbrake, tiny_recipe, finished_run, command: str) -> None:
-    before = {path: path.read_bytes() for path in finished_run.rglob("*") if path.is_file()}
-    check_refused(ethbrake(command, "--recipe", tiny_recipe, "--output", finished_run), str(finished_run), "force")
-    assert {path: path.read_bytes() for path in finished_run.rglob("*") if path.is_file()} == before
 
 
 def test_train__names_its_folder_and_ends_at_the_number_that_it_announces(ethbrake, tiny_recipe, tmp_path, monkeypatch):
@@ -172,13 +118,6 @@ def test_train__ends_with_harm_beside_full_braking_and_a_command_that_measures_t
     for told, row in zip(figures["fixed_list"]["results"], rows, strict=True):
         assert told == {name: pytest.approx(row[name]) if name != "agent" else row[name] for name in told}
         assert f"{row['first_impact_harm']:.2f}" in answer.out and f"{row['total_harm']:.2f}" in answer.out
-
-
-def test_train__of_a_team_with_own_objectives_shows_them(ethbrake, tiny_recipe, tmp_path) -> None:
-    own = ("--scenario", "cooperation-3-pair", "--set", "reward.objective=own", "--output", tmp_path / "run")
-    answer = ethbrake("train", *own, "--recipe", tiny_recipe)
-    assert answer.status == 0 and f"The agent is team@{tmp_path / 'run'}." in answer.out
-    assert "First-impact harm (own)" in answer.out
 
 
 def test_train__by_a_scheme_leaves_a_team_that_evaluate_takes(ethbrake, tiny_recipe, tmp_path) -> None:
@@ -228,19 +167,6 @@ def test_resume__deletes_the_results_of_the_policy_before_and_nothing_else(
     there = {path.name for path in folder.iterdir()}
     assert not there & written and {"notes.txt", "policy", "config.json"} <= there
     assert (tmp_path / "precious.txt").exists()
-
-
-def test_run__whose_further_training_was_interrupted_ends_with_130(
-    ethbrake, tiny_recipe, tmp_path, monkeypatch
-) -> None:
-    def make(experiment: Experiment, tell: OnProgress) -> RunReport:
-        return RunReport(("a table",), "report: here", "the training alone/vehicle_3")
-
-    monkeypatch.setattr("ethbrake_marl.training.experiment.RUN_REPORTS", {"mine": make})
-    answer = ethbrake("run", "--recipe", tiny_recipe, "--episodes", "20", "--output", tmp_path / "run")
-    assert answer.status == 130 and "a table" in answer.out
-    told = "interrupted: the training alone/vehicle_3; the report does not include it: "
-    assert answer.err.splitlines()[-1].startswith(told)
 
 
 # Learning curves

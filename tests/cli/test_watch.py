@@ -2,10 +2,7 @@
 
 import hashlib
 import json
-import shutil
-import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,22 +18,16 @@ from ethbrake_marl.agents.registry import Entry
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.comparison import compare_results
-from ethbrake_marl.evaluation.lineup import check_agents, make_lineup
+from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.evaluation.per_world import read_result, write_per_world
 from ethbrake_marl.evaluation.statistics import mean, paired_difference, unpaired_difference
 from ethbrake_marl.files import python_file
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.policies.shipped import shipped_policies
 from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.tables import read_worlds
-from tests.failing_worlds import plant
 from tests.fixtures.commands import Command, check_refused, rows_of, told_json
 
-ROOT = Path(__file__).resolve().parents[2]
 SCENARIO = load_scenario("paper-random")
-PROGRAM = "import sys; from ethbrake_marl.cli.app import run_command; sys.exit(run_command(sys.argv[1:]))"
-LIST = ("evaluate", "--agents", "full_brake", "--episodes", "2300", "--seed", "11")
 
 
 def test_evaluate__the_harm_count_is_what_agents_lower(ethbrake: Command) -> None:
@@ -81,16 +72,6 @@ def test_standards__full_braking_passes_as_published_and_is_struck_by_a_follower
     )
 
 
-def test_evaluate__a_damaged_bundle_is_refused_by_file_whatever_is_around_it(ethbrake, tmp_path) -> None:
-    shutil.copytree(shipped_policies()["ppo"] / "policy", tmp_path / "policy")
-    weights = tmp_path / "policy" / "weights.safetensors"
-    data = weights.read_bytes()
-    weights.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
-    for around in ("", "+episode", "+step"):
-        spec = f"ppo@{tmp_path / 'policy'}{around}"
-        check_refused(ethbrake("evaluate", "--episodes", "5", "--agents", spec), str(weights), "SHA-256")
-
-
 def test_evaluate__one_agent_that_cannot_drive_is_refused_before_another_works(ethbrake, monkeypatch) -> None:
     monkeypatch.setattr("ethbrake_marl.evaluation.chunks.evaluate_held", lambda *args, **kwargs: pytest.fail("worked"))
     refused = ethbrake("evaluate", "--agents", "e_v2x_bm,constant:99", "--episodes", "5")
@@ -110,19 +91,6 @@ def test_lineup__a_team_goes_behind_the_step_shield_and_no_other(monkeypatch) ->
         InvalidInput, match=r"'team@run\+episode': \+episode works for one controlled vehicle only, not for a team"
     ):
         make_lineup(["team@run+episode"], scenario)
-
-
-def test_check_agents__a_constant_above_the_capacity_of_any_world_is_refused_and_nobody_is_changed() -> None:
-    scenario = SCENARIO.replace(braking_capacity_mps2={"uniform": [5, 7]})
-    worlds = scenario.sample(500, 7).worlds
-    lineup = make_lineup(["e_v2x_bm", "constant:5", "coast"], scenario)
-    before = dict(vars(lineup["e_v2x_bm"]))
-    check_agents(lineup, worlds, scenario)
-    assert vars(lineup["e_v2x_bm"]) == before
-    capacity = worlds.vehicles.braking_capacity_mps2[:, 1]
-    between = (capacity[0] + capacity.min()) / 2  # the first world could, another could not
-    with pytest.raises(InvalidInput, match="brakes harder than the braking capacity"):
-        check_agents(make_lineup([f"constant:{between}"], scenario), worlds, scenario)
 
 
 # Evaluations in several processes, and their folder
@@ -176,66 +144,12 @@ def test_compare__difference_is_paired_by_world_where_every_world_is_there(resul
     assert "alone.json was written without a file that has one row" in str(apart.unpaired_because)
 
 
-def test_compare__marks_who_exploits_what_harm_does_not_count(ethbrake: Command, results: Path) -> None:
-    rows = json.loads((results / "a/results.json").read_text())
-    for name, shoved, moving in (("before", 4.0, 0), ("after", 6.0, rows[0]["episodes"])):
-        told = [row | {"vehicle_1_shoved_m": shoved, "horizon_ends": moving} for row in rows[:1]] + rows[1:]
-        (results / f"{name}.json").write_text(json.dumps(told))
-    agent = rows[0]["agent"]
-    found = compare_results(read_result(results / "before.json"), read_result(results / "after.json"))
-    assert found.to_json()["agents"][0]["exploits"] == [[], ["shoves", "moving"]]
-    answer = ethbrake("compare", results / "before.json", results / "after.json")
-    assert f"{agent} ‡" in answer.out
-    sentence = f"{agent} in the second shoves Vehicle 1 by 6.0 m on average and runs past the horizon"
-    assert sentence in " ".join(answer.err.split()) and f"{agent} in the first" not in answer.err
-    same = ethbrake("compare", results / "before.json", results / "before.json")
-    assert f"{agent} ‡" not in same.out and f"{agent} in the" not in same.err
-
-
-@pytest.mark.parametrize(
-    ("wrong", "says"),
-    [
-        ({"horizon_ends": -1}, "horizon_ends = -1: must be the number of episodes"),
-        ({"horizon_ends": "3"}, "horizon_ends is missing or not of type int"),
-        ({"vehicle_1_shoved_m": "far"}, "vehicle_1_shoved_m = 'far': must be a number of metres, or null"),
-    ],
-)
-def test_compare__refuses_what_no_evaluation_wrote(results: Path, wrong: dict[str, Any], says: str) -> None:
-    rows = [row | wrong for row in json.loads((results / "a/results.json").read_text())]
-    (results / "wrong.json").write_text(json.dumps(rows))
-    with pytest.raises(InvalidInput, match=says):
-        read_result(results / "wrong.json")
-
-
 def test_compare__unpaired_interval_is_welchs() -> None:
     draw = np.random.default_rng(3)
     one, other = draw.normal(5.0, 2.0, 30), draw.normal(4.0, 1.0, 50)
     found = unpaired_difference(mean(one), 30, mean(other), 50)
     expected = ttest_ind(one, other, equal_var=False).confidence_interval(0.95)
     assert found.interval == pytest.approx(tuple(expected), rel=1e-12)
-
-
-@pytest.mark.slow
-def test_compare__sees_that_an_agents_file_was_edited(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Each evaluation is a process of its own, as a person's two commands are."""
-    file, read = tmp_path / "mine.py", {}
-    for name, deceleration in (("before", 2), ("after", 3)):
-        file.write_text(
-            f"import ethbrake_marl as eb\ndef make():\n    return eb.make_agent('constant:{deceleration}')\n"
-        )
-        answer = subprocess.run(
-            [sys.executable, "-c", PROGRAM, "evaluate", "--agents", f"{file}:make", "--episodes", "5", "--json"],
-            capture_output=True, text=True, check=True,
-        )  # fmt: skip
-        (tmp_path / f"{name}.json").write_text(answer.stdout)
-        read[name] = read_result(tmp_path / f"{name}.json")
-    before, after = read["before"], read["after"]
-    assert after.about["versions"]["mine.py"] == f"SHA-256 {hashlib.sha256(file.read_bytes()).hexdigest()}"
-    assert set(compare_results(before, after).other_versions) == {"mine.py"}
-    assert compare_results(after, after).other_versions == {}
-    assert run_command(["compare", str(tmp_path / "before.json"), str(tmp_path / "after.json")]) == 0
-    told = capsys.readouterr().err
-    assert "note: mine.py differs between the results\n" in told and "SHA-256" not in told
 
 
 def test_versions__tell_a_file_behind_the_at_by_its_hash(ethbrake: Command, tmp_path: Path) -> None:
@@ -289,20 +203,6 @@ def check_extra(ethbrake: Command, package: str, extra: str, line: str, monkeypa
 # Shields
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_shield__names_the_worlds_that_it_leaves_out(ethbrake: Command, monkeypatch) -> None:
-    sample = Scenario.sample
-
-    def planted(self, n, seed, **options):
-        drawn = sample(self, n, seed, **options)
-        return replace(drawn, worlds=plant(drawn.worlds, [2] if n == 4 else []))
-
-    monkeypatch.setattr(Scenario, "sample", planted)
-    answer = ethbrake("shield", "--agents", "full_brake", "--episodes", "4")
-    assert answer.status == 0 and "LEFT OUT for every agent: 1 of 4 worlds" in answer.err
-    assert "world 2 of seed 7 (a contact was missed" in answer.err
-
-
 def test_shield__of_several_learners_tells_its_policies_and_can_be_compared(ethbrake: Command) -> None:
     words = ("--scenario", "cooperation-3-pair", "--agents", "full_brake,vine-pair", "--episodes", "12", "--json")
     answer = ethbrake("shield", *words)
@@ -314,3 +214,11 @@ def test_shield__of_several_learners_tells_its_policies_and_can_be_compared(ethb
     Path("shield.json").write_text(answer.out)
     compared = ethbrake("compare", "shield.json", "shield.json")
     assert compared.status == 0 and "step-cap" in compared.out
+
+
+def test_evaluate__deletes_the_files_of_earlier_results_and_nothing_else(ethbrake: Command, tmp_path: Path) -> None:
+    line = ("evaluate", "--agents", "coast", "--episodes", "2", "--output", tmp_path / "out", "--force")
+    assert ethbrake(*line, "--per-world", "csv").status == 0
+    (tmp_path / "out" / "notes.txt").write_text("mine")
+    assert ethbrake(*line).status == 0
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"results.json", "notes.txt"}

@@ -1,4 +1,4 @@
-"""The parts of the site's extension that need no Sphinx, loaded from docs/extension/."""
+"""Loads the scripts of docs/studies."""
 
 import sys
 from importlib.util import module_from_spec, spec_from_file_location
@@ -10,8 +10,8 @@ sys.path.append(str(DOCS / "studies"))  # which import one another
 
 
 def load(name: str) -> ModuleType:
-    """The module ``docs/extension/NAME.py``."""
-    spec = spec_from_file_location(f"site_{name}", DOCS / "extension" / f"{name}.py")
+    """The module ``docs/studies/NAME.py``."""
+    spec = spec_from_file_location(f"study_{Path(name).name}", DOCS / "studies" / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = module_from_spec(spec)
     sys.modules[spec.name] = module  # where its data classes look for it

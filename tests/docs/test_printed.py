@@ -1,12 +1,9 @@
-"""What the pages show is what is printed, each with its place; the pages and the reference of the site."""
+"""What the pages show is what is printed, and their links lead somewhere."""
 
 import json
-import os
 import re
-import subprocess
-import sys
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,112 +13,36 @@ import yaml
 import ethbrake_marl as eb
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_harm
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario, new_scenario_text
+from ethbrake_marl.scenario.catalogue import load_scenario, new_scenario_text
 from ethbrake_marl.scenario.tables import worlds_from_table
-from tests.docs.printed import (
-    BLOCKS,
-    EXACT,
-    MEASURED,
-    PICTURES,
-    ROOT,
-    TABLES,
-    How,
-    Shown,
-    agrees,
-    commands_of,
-    how,
-    missing_figures,
-    pages,
-    pictures,
-    printed_blocks,
-    results,
-    tables_of_figures,
-)
+from tests.docs.printed import BLOCK, PICTURES, ROOT, TABLES, missing_figures, pictures, rows, tables
 from tests.docs.site import DOCS, load
 from tests.programmes.libraries import harm_of_programs
 
-Run = Callable[..., tuple[str, str]]
+
+def test_everything_compared__is_still_on_a_page() -> None:
+    assert {each.begin for each in pictures()} == PICTURES.keys()
+    assert {each.begin for each in tables()} >= TABLES.keys()
+    assert [each.begin for each in tables() if not each.commands] == []
 
 
-KINDS = [
-    pytest.param(printed_blocks, BLOCKS, id="blocks"),
-    pytest.param(tables_of_figures, TABLES, id="tables"),
-    pytest.param(pictures, PICTURES, id="pictures"),
-]
-
-
-@pytest.mark.parametrize(("shown", "table"), KINDS)
-def test_everything_shown__has_its_place(shown: Callable[[], Iterator[Shown]], table: dict[str, How]) -> None:
-    found = [(each, how(table, each.begin)) for each in shown()]
-    assert [f"{each.page}: {each.begin}" for each, place in found if place is None] == []
-    used = {place[0] for _, place in found if place is not None}
-    assert [key for key in table if key not in used] == []
-
-
-def test_everything_shown__names_tests_and_programs_that_are_there() -> None:
-    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE))
-    for place in (*BLOCKS.values(), *TABLES.values(), *PICTURES.values(), *(place for _, place in results())):
-        for by in place.by:
-            assert not by.startswith("tests/") or (ROOT / by).exists(), by
-            assert not by.startswith("make ") or by.split()[1] in targets, by
-
-
-def test_results__are_linked_where_they_are_and_written_row_by_row() -> None:
-    anchors = [(Path(each.page).stem, each.begin) for each, _ in results()]
-    text = "".join(page.read_text("utf-8") for page in pages())
-    again = [("reproduction", each["name"]) for each in json.loads((DOCS / "reproduction.json").read_text("utf-8"))]
-    assert set(re.findall(r"results/([a-z-]+)\.md#([a-z0-9-]+)\)", text)) <= {*anchors, *again}
-    assert len({anchor for _, anchor in anchors}) == len(anchors)
-    for path in MEASURED.RESULTS.glob("*.json"):
-        assert MEASURED.text_of(MEASURED.read_tables(path.stem)) == path.read_text("utf-8")
-        with pytest.raises(ValueError, match="notes"):
-            MEASURED.TABLES.validate_json(path.read_bytes().replace(b'"note"', b'"notes"'))
-
-
-@pytest.fixture
-def told(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
-    """Runs a command line in this process in an empty folder; stderr and stdout."""
-    monkeypatch.setenv("COLUMNS", "100")
-    monkeypatch.chdir(tmp_path)
-
-    def call(command: str) -> tuple[str, str]:
-        capsys.readouterr()
-        run_command(command.split()[1:])
-        captured = capsys.readouterr()
-        return captured.err, captured.out
-
-    return call
-
-
-def _blocks() -> list[Shown]:
-    places = [(each, how(BLOCKS, each.begin)) for each in printed_blocks()]
-    own = [each for each, place in places if place is not None and place[1] == EXACT and "ethbrake" in each.begin]
-    return [each for each in own if "first-ten-minutes" not in each.page]  # see tests/cli/test_scenarios.py
-
-
-@pytest.mark.parametrize("block", _blocks(), ids=lambda block: block.begin[:60])
-def test_block__is_what_its_commands_print(block: Shown, told: Run) -> None:
-    if block.begin == "ethbrake scenario validate rainy.yaml":  # whose mistake the page tells
-        told("ethbrake scenario new rainy")
-        text = Path("rainy.yaml").read_text("utf-8")
-        Path("rainy.yaml").write_text(text.replace("\nmass_t:", "\nmass_kg:"))
-    for command, shown in commands_of(block.text):
-        assert agrees(shown, "".join(told(command)).splitlines()), command
+def test_error__on_the_page_of_commands_is_what_the_command_prints(capsys: pytest.CaptureFixture[str]) -> None:
+    page = (DOCS / "reference" / "cli.md").read_text("utf-8")
+    shown = page.partition("$ ethbrake evaluate --agents ful_brake\n")[2].partition("```")[0]
+    assert run_command(["evaluate", "--agents", "ful_brake"]) == 2
+    assert capsys.readouterr().err == shown
 
 
 @pytest.mark.slow
 def test_table_of_shipped_lists__is_printed_by_its_command(capsys: pytest.CaptureFixture[str]) -> None:
-    (table,) = (each for each in MEASURED.read_tables("best-harm") if each.id == "proven-and-found")
-    load("../studies/best_harm").main(["--shipped"])
+    load("best_harm").main(["--shipped"])
     printed = capsys.readouterr().out.splitlines()
-    for row in (table.columns, *table.rows):
+    for row in rows("results/best-harm", "## Proven and best known harm"):
         assert any(one.startswith(f"| {' | '.join(row)}") for one in printed), row
 
 
 def test_reference_values__are_those_of_the_closed_form() -> None:
-    (table,) = (each for each in MEASURED.read_tables("baselines") if each.id == "closed-form-values")
-    for row in table.rows:
-        world, ends, optimum, full = row
+    for world, *ends in rows("results/baselines", "## Values of the closed form")[1:]:
         gaps, speeds, latency = ([float(word) for word in part.split(",")] for part in world.split(";"))
         scenario = load_scenario("paper-random").replace(latency_s=[0.0, *latency])
         start = {f"gap_{k}_m": [gap] for k, gap in enumerate(gaps, 1)}
@@ -130,28 +51,7 @@ def test_reference_values__are_those_of_the_closed_form() -> None:
         found = optimise_pairwise(worlds, 1)
         told = [found.spares_front_mps2, found.spares_rear_mps2, found.deceleration_mps2, found.harm]
         told.append(pairwise_harm(worlds, [6, 7, 6]).sum(axis=1))
-        assert missing_figures(f"{ends} {optimum} {full}", " ".join(repr(float(each[0])) for each in told)) == [], row
-
-
-@pytest.mark.parametrize(
-    ("shown", "printed", "same"),
-    [
-        ("a", "a", True),
-        ("a", "b", False),
-        ("a\n...\nd", "a\nb\nc\nd", True),
-        ("a\n...\nd", "a\nd", True),
-        ("a\n...", "a\nb", True),
-        ("a\n  ...\nc", "a\nb", False),
-        ("...\na", "b\na\n\n", True),
-        ("a", "a\nb", False),
-        ("", "a", False),
-        ("a ...", "a b c", True),
-        ("a ...", "b", False),
-        ("a...", "ab", False),
-    ],
-)
-def test_agrees__where_dots_stand_for_any_lines(shown: str, printed: str, same: bool) -> None:
-    assert agrees(shown.splitlines(), printed.splitlines()) == same
+        assert missing_figures(" ".join(ends), " ".join(repr(float(each[0])) for each in told)) == [], world
 
 
 @pytest.mark.parametrize(
@@ -210,129 +110,30 @@ def test_notebook__is_committed_with_its_outputs(notebook: Path) -> None:
     assert [cell for cell in cells if any(each["output_type"] == "error" for each in cell["outputs"])] == []
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebook__runs_from_its_first_cell_to_its_last(notebook: Path, tmp_path: Path) -> None:
-    cells = ["".join(cell["source"]) for cell in code_cells(notebook)]
-    done = subprocess.run(
-        [sys.executable, "-c", "\n".join(cells)],
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
+# ---------------------------------------------------------------- pages
+
+PAGES = [
+    ROOT / "README.md",
+    *sorted(ROOT.glob(".github/*.md")),
+    *sorted(page for page in DOCS.rglob("*.md") if "_build" not in page.parts),
+    *sorted((ROOT / "ethbrake_marl" / "_policies").glob("*/card.md")),
+]
 
 
-# ---------------------------------------------------------------- the site
+def anchors(page: Path) -> set[str]:
+    """The anchors that GitHub gives to the headings of a page."""
+    headings = re.findall(r"(?m)^#+ (.*)$", BLOCK.sub("", page.read_text("utf-8")))
+    texts = [re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).lower() for heading in headings]
+    return {re.sub(r"[^\w\- ]", "", text).strip().replace(" ", "-") for text in texts}
 
 
-site_pages = load("pages")
-
-
-def test_list_of_pages__has_every_page_once() -> None:
-    sections = site_pages.read_sections((DOCS / "README.md").read_text("utf-8"))
-    assert list(sections) == ["Start", "Guides", "Notebooks", "Extensions", "Reference", "More"]
-    listed = [page for each in sections.values() for page in each]
-    for page in (page for page in listed.copy() if page.endswith("/README.md")):
-        listed += _inside(page)
-    files = [*DOCS.rglob("*.md"), *DOCS.rglob("*.ipynb")]
-    there = {
-        path.relative_to(DOCS).as_posix() for path in files if not {"_build", ".ipynb_checkpoints"} & set(path.parts)
-    }
-    assert len(listed) == len(set(listed))
-    assert set(listed) == {page for page in there if "/api/" not in page} - {"README.md", "index.md"}
-
-
-def _inside(page: str) -> list[str]:
-    """The pages that the navigation has below the page of a folder."""
-    folder = page.removesuffix("README.md")
-    made = site_pages.list_folder((DOCS / page).read_text("utf-8"), page.removesuffix(".md"))
-    inside = [folder + each for each in made.rpartition("```{toctree}")[2].split() if each.endswith(".md")]
-    return inside + [page for each in inside if each.endswith("/README.md") for page in _inside(each)]
-
-
-@pytest.mark.parametrize(
-    ("link", "docname", "written_in", "led"),
-    [
-        ("[a](docs/shield.md#how)", "index", ROOT, "[a](shield.md#how)"),
-        ("[a](CHANGELOG.md)", "index", ROOT, "[a](changelog.md)"),
-        ("[a](../CHANGELOG.md)", "README", None, "[a](changelog.md)"),
-        ("[a](../../README.md)", "internals/model", None, "[a](../index.md)"),
-        ("[a](../README.md#x)", "internals/model", None, "[a](../index.md#x)"),
-        ("[a](../train/ppo.yaml)", "train", None, "[a](../train/ppo.yaml)"),
-        ("[a](../ethbrake_marl/_policies/ppo/card.md)", "train", None, "[a](reference/policies.md#ppo)"),
-        ("[a](nowhere.md) [b](https://x.org/y) [c](#here)", "index", ROOT, None),
-    ],
-)
-def test_links__of_a_page_lead_to_the_page_on_the_site(
-    link: str, docname: str, written_in: Path | None, led: str | None
-) -> None:
-    assert site_pages.relink(link, docname, written_in) == (led or link)
-
-
-def test_extra__brings_what_the_configuration_loads() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    brought = {re.split(r"[<>=]", line)[0] for line in project["optional-dependencies"]["docs"]}
-    extensions = re.search(r"^extensions = \[(.*)\]$", (DOCS / "conf.py").read_text("utf-8"), re.MULTILINE)
-    assert extensions is not None
-    named = re.findall(r'"([a-z_]+)[".]', extensions[1])
-    loaded = {name.replace("_", "-") for name in named if name != "extension"}
-    assert loaded | {"sphinx", "furo", "ethbrake-marl[notebook]"} == brought
-
-
-QUESTIONS = {
-    "train ppo": "train",
-    "add scenario": "scenarios",
-    "cooperation level": "cooperation",
-    "shield my policy": "shield",
-    "own vehicle data": "scenarios",
-    "train a team": "train",
-    "add my own reward": "environments",
-    "whose harm counts": "extensions/fronts",
-    "compare agents": "evaluate",
-    "units of harm": "game",
-    "install without torch": "installing",
-    "what is harm": "game",
-    "E-V2X-BM": "evaluate",
-    "reward": "environments",
-    "pettingzoo wrapper": "environments",
-}
-
-
-@pytest.mark.parametrize("question", QUESTIONS)
-def test_search__is_told_the_page_that_answers_a_question_of_somebody_new(question: str) -> None:
-    asked = set(re.findall(r"\w+", question.lower())) - {"is", "of"}  # words that the search passes over
-    sought = load("sought").SOUGHT
-    assert all((DOCS / f"{page}.md").exists() for page in sought)
-
-    def words(text: str) -> int:
-        return len(asked.intersection(re.findall(r"\w+", text.lower())))
-
-    titles = {page: (DOCS / f"{page}.md").read_text("utf-8").partition("\n")[0] for page in sought}
-    told = {page: (words(f"{titles[page]} {text}"), words(text)) for page, text in sought.items()}
-    assert [page for page, count in told.items() if count == max(told.values())] == [QUESTIONS[question]]
-    assert max(told.values())[0] == len(asked)
-
-
-def test_demonstration__plays_the_picture_of_the_first_page_and_says_it_in_words(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    demo = load("demo")
-    monkeypatch.setattr(demo, "WORLDS", (0,))
-    monkeypatch.setattr(demo, "AGENTS", {"Full braking": "full_brake", demo.OWN: "universal"})
-    monkeypatch.setattr(demo, "TESTS", {"Main test": demo.TESTS["Main test"]})
-    page = demo.add_demonstration((ROOT / "README.md").read_text("utf-8"))
-    assert (
-        "Vehicle 2 strikes Vehicle 1 after 2.17 s at 2.4 m/s; Vehicle 3 strikes Vehicle 2 after 3.30 s at 5.3" in page
-    )
-    assert page.index('class="demo"') < page.index("## Quick start") and page.count('"pieces":') == 2
-    with pytest.raises(ValueError, match="no heading 'Quick start'"):
-        demo.add_demonstration("# Another README")
-
-
-GUIDES = ("CONTRIBUTING.md", "CODE_OF_CONDUCT.md", "SECURITY.md", "PULL_REQUEST_TEMPLATE.md")
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_links__lead_to_files_and_headings_that_are_there(page: Path) -> None:
+    text = BLOCK.sub("", page.read_text("utf-8"))
+    for path, anchor in re.findall(r"\]\((?!https?:|mailto:)([^)\s#]*)#?([^)\s]*)\)", text):
+        target = page.parent / path if path else page
+        assert target.exists(), path
+        assert not anchor or anchor in anchors(target), f"{path}#{anchor}"
 
 
 def test_version__is_the_same_wherever_it_stands() -> None:
@@ -345,64 +146,15 @@ def test_version__is_the_same_wherever_it_stands() -> None:
 
 
 @pytest.mark.parametrize(
-    ("command", "file"),
+    ("command", "file", "template"),
     [
-        ("scenario schema", "scenarios/scenario"),
-        ("train --schema", "train/recipe"),
-        ("study sweep --schema", "docs/sweep"),
-        ("study tune --schema", "docs/tuning"),
+        ("scenario schema", "scenarios/scenario", lambda: new_scenario_text("mine")),
+        ("train --schema", "train/recipe", lambda: eb.load_recipe("ppo").new_text("mine")),
     ],
 )
-def test_schema__that_ships_is_printed_by_the_command_and_named_by_templates_and_examples(
-    command: str, file: str, capsys: pytest.CaptureFixture[str]
+def test_schema__that_ships_is_printed_by_the_command_and_named_by_templates(
+    command: str, file: str, template: Callable[[], str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run_command(command.split()) == 0
     assert (ROOT / f"{file}.schema.json").read_text("utf-8") == capsys.readouterr().out
-    texts = {"scenarios": [new_scenario_text("mine")], "train": [eb.load_recipe("ppo").new_text("mine")]}
-    texts["docs"] = [each.read_text("utf-8") for each in ROOT.glob(f"{file}-*.yaml")]
-    named = f"# yaml-language-server: $schema={Path(file).name}.schema.json\n"
-    assert [text for text in texts[Path(file).parent.name] if named not in text] == []
-
-
-def test_schemas__are_no_scenario_and_no_recipe() -> None:
-    assert all(
-        path.suffix == ".yaml" for path in (*eb.TrainingRecipe.shipped().values(), *(e.path for e in list_scenarios()))
-    )
-
-
-@pytest.mark.parametrize("name", GUIDES)
-def test_guide__has_links_that_lead_somewhere(name: str) -> None:
-    text = (ROOT / ".github" / name).read_text("utf-8")
-    links = re.findall(r"\]\((?!https?:)([^)#\s]+)", text)
-    assert [link for link in links if not (ROOT / ".github" / link).exists()] == []
-
-
-def test_hooks__run_tools_of_the_environment_and_download_nothing() -> None:
-    hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text("utf-8"))["repos"]
-    assert [repo["repo"] for repo in hooks] == ["local"]
-    assert all(hook["entry"].startswith(".venv/bin/") for repo in hooks for hook in repo["hooks"])
-
-
-MOST_CHARACTERS = 100
-PAGES = sorted([ROOT / "README.md", *ROOT.glob(".github/*.md"), *DOCS.glob("*.md"), *DOCS.glob("[einrt]*/**/*.md")])
-CODE = re.compile(r"^\s*(```+|~~~+|:::+).*?^\s*\1\s*$", re.DOTALL | re.MULTILINE)
-FREE = re.compile(r"\s*(\||#|<|!\[)|    |\[[\w-]+\]: |\s*([-*] )?\S+$")  # tables, headings, HTML, code, one word
-
-
-@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.relative_to(ROOT).as_posix())
-def test_page__has_short_lines_and_code_blocks_on_lines_of_their_own(path: Path) -> None:
-    text = path.read_text("utf-8")
-    prose = CODE.sub("", text).splitlines()
-    assert [line for line in prose if len(line) > MOST_CHARACTERS and not FREE.match(line)] == []
-    assert [line for line in prose if line.startswith("%")] == []  # the site takes it for a comment
-    broken = re.compile(r"\S.*```|```\S+ .*\S *```")
-    assert [line for line in text.splitlines() if broken.search(line) and "````" not in line] == []
-
-
-def test_readme__is_short_and_begins_with_a_moving_picture_of_less_than_300_kb() -> None:
-    text = (ROOT / "README.md").read_text("utf-8")
-    assert len(text.splitlines()) <= 120
-    found = re.search(r"!\[[^\]]*\]\(([^)]*\.svg)\)", text)
-    assert found is not None and found.start() < text.index("\n## ")
-    picture = (ROOT / found[1]).read_bytes()
-    assert b"<animate" in picture and len(picture) < 300_000
+    assert f"# yaml-language-server: $schema={Path(file).name}.schema.json\n" in template()

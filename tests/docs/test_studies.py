@@ -19,8 +19,8 @@ from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.report.paper_rows import PAPER_NOTE, PAPER_ROWS
 from ethbrake_marl.extensions.report.style import picture_bytes
-from ethbrake_marl.extensions.reproduction import pages, strategies, tables as tables_module, verdicts
-from ethbrake_marl.extensions.reproduction.folder import Reproduction, Result, checked_result
+from ethbrake_marl.extensions.reproduction import strategies, tables as tables_module, verdicts
+from ethbrake_marl.extensions.reproduction.folder import Reproduction
 from ethbrake_marl.extensions.reproduction.items import ITEMS
 from ethbrake_marl.extensions.reproduction.making import choose_items
 from ethbrake_marl.extensions.reproduction.open_quantities import GAPS
@@ -32,6 +32,7 @@ from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.tables import worlds_from_table
 from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.training.recipe import Scheme
+from tests.docs.printed import rows as table_of
 from tests.docs.site import DOCS, load
 
 sampling, price, equal_time, message_contents, team_curves, equilibria = (
@@ -41,9 +42,6 @@ sampling, price, equal_time, message_contents, team_curves, equilibria = (
 
 
 PAPER = load_scenario("paper-random")
-
-
-BASELINES = load("results").read_tables("baselines")
 
 
 BASE = load_scenario("cooperation-2-paper")
@@ -56,11 +54,11 @@ PNG = b"\x89PNG"
 
 
 @pytest.mark.parametrize("agent", sampling.CONTROLS)
-def test_sampling__the_table_in_the_docs_is_the_one_that_it_prints(agent):
-    (table,) = (each for each in load("results").read_tables("sampled") if f"`{agent}`" in each.note)
+def test_sampling__prints_the_errors_that_the_page_tells(agent):
     study = sampling.convergence(PAPER.sample(2000, 7).worlds, agent, steps_s=(0.2, 0.1, 0.05, 0.02))
-    note, _, head, _, *rows, _ = sampling.table(study).splitlines()
-    assert (note, [head, *rows]) == (table.note, [f"| {' | '.join(row)} |" for row in (table.columns, *table.rows[:4])])
+    exact, *_, coarse = sampling.table(study).partition("| 0.05 |")[0].split("| 0.1 | ")
+    told = [re.search(r"mean harm (\S+)", exact)[1], coarse.split(" | ")[0]]
+    assert [figure for figure in told if figure not in MADE_AGAIN] == []
     assert picture_bytes(sampling.draw([study]), "study.png").startswith(PNG)
 
 
@@ -83,10 +81,9 @@ def test_price__is_paired_by_world_and_told_of_both_counts():
         told = price.price(found["sensors-only"], "e_v2x_bm:estimated", count)
         difference = harm["e_v2x_bm:estimated"].world_harm(count) - harm["e_v2x_bm"].world_harm(count)
         assert told.value == pytest.approx(difference.mean(), abs=1e-9)
-    heads = [line for line in price.tables(found).splitlines() if line.startswith("| channel")]
-    tables = [table for table in BASELINES if table.columns[0] == "channel"]
-    assert heads == [f"| {' | '.join(table.columns)} |" for table in tables] and len(heads) == 5
-    assert all([row[0] for row in table.rows] == list(price.channels()) for table in tables)
+    told = table_of("results/baselines", "## The price of not knowing, E-V2X-BM")
+    assert f"| {' | '.join(told[0])} |" in price.tables(found)
+    assert [row[0] for row in told[1:]] == list(price.channels())
     assert picture_bytes(price.draw(found), "price.png").startswith(PNG)
 
 
@@ -109,20 +106,15 @@ def test_equal_time__tells_the_harm_of_an_evaluation_in_the_columns_of_the_page(
     assert rows["`e_v2x_bm`"][1] == "true model" and rows["`full_brake`"][5] == ""
     assert rows["`coast`"][3] == f"{coast.mean():.3f}"
     assert rows["`coast`"][5].startswith(f"{(coast - full).mean():+.3f} [")
-    assert list(equal_time.HEAD) in [table.columns for table in BASELINES]
+    assert list(equal_time.HEAD) == table_of("results/baselines", "## Harm at equal processor time")[0]
     worlds = PAPER.sample(equal_time.WORLDS, equal_time.SEED).worlds  # which no table holds
     assert not np.isfinite(best_known(worlds, Task(PAPER, PAPER.learners))["first"]).any()
 
 
-def test_equilibria__have_a_row_for_each_level_objective_and_start() -> None:
-    prices, borne, learned = load("results").read_tables("equilibria")
+def test_equilibria__have_a_row_for_each_objective() -> None:
     level = equilibria.search("cooperation-2-paper", 2)
-    made = equilibria.price_rows(level), equilibria.bearing_rows(level)
-    for table, rows, words in ((prices, made[0], 2), (borne, made[1], 3)):
-        shown = [row for row in table.rows if row[0] == "`cooperation-2-paper`"]
-        assert [row[:words] for row in rows] == [row[:words] for row in shown] and len(rows[0]) == len(table.columns)
-        assert {row[0].strip("`") for row in table.rows} == set(equilibria.LEVELS)
-    assert [row[0].strip("`") for row in learned.rows] == [name for name in equilibria.TRAINED for _ in range(4)]
+    found = [row[:2] for row in equilibria.price_rows(level)]
+    assert found == [["`cooperation-2-paper`", objective] for objective in equilibria.OBJECTIVES]
 
 
 def test_team_curves__show_the_middle_three_of_five_seeds_and_what_they_compare_with() -> None:
@@ -148,9 +140,10 @@ def test_team_curves__show_the_middle_three_of_five_seeds_and_what_they_compare_
 
 
 def test_team_curves__the_table_in_the_docs_is_made_from_the_numbers_beside_the_script() -> None:
-    (shown,) = (each for each in load("results").read_tables("cooperation") if each.id == "team-curves")
     found = json.loads(team_curves.NUMBERS.read_bytes())
-    assert [shown.columns, shown.rows] == [team_curves.HEAD, team_curves.table(found)]
+    assert table_of("results/cooperation", "## Five algorithms at 45 processor seconds each") == [
+        team_curves.HEAD, *team_curves.table(found),
+    ]  # fmt: skip
     assert team_curves.NUMBERS.read_text("utf-8") == team_curves.text_of(found)
     assert len(found["curves"]) == len(team_curves.LEVELS) * len(team_curves.ALGORITHMS) * 5
 
@@ -226,7 +219,6 @@ def text_of(*names: str) -> list[str]:
 ABLATION = text_of("extensions/cooperation")[0].partition("\n## Ablate")[2].partition("\n## ")[0]
 PAPER_PAGES = text_of("internals/model", "internals/paper", "extensions/reproduction")
 PAPER_TEXT = "".join(PAPER_PAGES)
-SITE = load("results")
 
 # Every \label of an equation, algorithm, figure or table in the paper's source, by the heading of the pages.
 LABELS = {
@@ -270,16 +262,13 @@ def test_paper__says_how_the_report_and_the_code_differ_from_it() -> None:
     assert "docs/internals/paper.md" in PAPER_NOTE and [each for each in sentences if each not in PAPER_TEXT] == []
 
 
-# docs/extensions/reproduction.md is what its committed data say, and the data are what the worlds give.
+# docs/results/reproduction.md says what the worlds give.
 
 
-def result_of(content: dict) -> Result:
-    """A result as the folder of a reproduction keeps it: each cell with its interval."""
-    tables = [table | {"rows": [[[cell] for cell in row] for row in table["rows"]]} for table in content["tables"]]
-    return checked_result(content | {"tables": tables}, "docs", content["name"])
-
-
-RESULTS = {each["name"]: result_of(each) for each in json.loads((DOCS / "reproduction.json").read_text("utf-8"))}
+def committed(heading: str, agent: str) -> list[str]:
+    """An agent's row in the table below a heading of the results page, without intervals."""
+    (row,) = (row for row in table_of("results/reproduction", heading) if row[0] == agent)
+    return [cell.split(" [")[0] for cell in row[1:]]
 
 
 def test_paper__its_5000_worlds_cannot_come_from_the_speeds_of_the_figure_of_distances() -> None:
@@ -289,22 +278,21 @@ def test_paper__its_5000_worlds_cannot_come_from_the_speeds_of_the_figure_of_dis
         for name in ("paper-distance", "paper-random")
     )
     assert (f"{at_figure:.2f}", f"{at_random:.2f}") == ("3.07", "9.38") and printed > 3.0 * at_figure
-    told = {table.title: table.rows[0] for table in RESULTS["hybrid-table"].tables}
-    for title, cells in {"speeds 20, 18, 20 m/s": ("67.7 %", "12.88", "3.07"),
-                         "speeds 18 to 22 m/s": ("65.5 %", "19.13", "9.38")}.items():  # fmt: skip
-        row = [cell.value for cell in told[f"{title}, as stated"]]
-        assert [row[column].split(" [")[0] for column in (1, 2, 4)] == list(cells)
+    for heading, cells in {"### Speeds 20, 18, 20 m/s, as stated": ("67.7 %", "12.88", "3.07"),
+                           "### Speeds 18 to 22 m/s, as stated": ("65.5 %", "19.13", "9.38")}.items():  # fmt: skip
+        row = committed(heading, "E-V2X-BM, realised")
+        assert [row[column] for column in (0, 1, 3)] == list(cells)
 
 
 @pytest.mark.parametrize(("spec", "name"), [("full_brake", "Non-ethical (full braking)"), ("ppo", "PPO")])
 def test_paper__harms_at_three_delays_are_as_committed(spec: str, name: str) -> None:
-    (row,) = (row for row in RESULTS["harm-delays"].tables[0].rows if row[0].value == name)
+    row = committed("### Gaps of 7 m, speeds of 20, 18 and 20 m/s", name)
     state = {"gap_1_m": [7], "gap_2_m": [7], "speed_1_mps": [20], "speed_2_mps": [18], "speed_3_mps": [20]}
-    for told, delay in zip(row[1:], ("low", "middle", "high"), strict=True):
+    for told, delay in zip(row, ("low", "middle", "high"), strict=True):
         scenario = load_scenario(f"paper-delay-{delay}")
         worlds = worlds_from_table(scenario, state)
         outcome = eb.evaluate(worlds, make_lineup([spec], scenario), scenario=scenario).outcome(spec)
-        assert told.value == f"{outcome.first_impact_harm.mean():.2f}"
+        assert told == f"{outcome.first_impact_harm.mean():.2f}"
 
 
 def test_paper__full_braking_over_the_total_distance_is_as_committed() -> None:
@@ -312,42 +300,34 @@ def test_paper__full_braking_over_the_total_distance_is_as_committed() -> None:
     result = eb.evaluate(scenario.sample(5_000, 7), make_lineup(["full_brake"], scenario), scenario=scenario)
     groups = np.digitize(result.worlds.gaps_m.sum(axis=1), (12.0, 14.0, 16.0, 18.0))
     harm = result.outcome("full_brake").first_impact_harm
-    told = [cell.value.split(" [")[0] for cell in RESULTS["harm-distance"].tables[0].rows[0][1:]]
+    told = committed("### Harm by total distance, as stated", NAMES[FULL_BRAKE])
     assert told == [f"{harm[groups == group].mean():.2f}" for group in range(5)]
 
 
-def test_reproduction__is_made_of_the_committed_data_of_every_item_and_gap() -> None:
+def test_reproduction__has_a_section_for_every_item_and_a_row_for_every_gap() -> None:
+    page = (DOCS / "results" / "reproduction.md").read_text("utf-8")
+    outcomes = dict(re.findall(r"(?ms)^## (.*?)$.*?^\*\*(.*?)\*\*: ", page))
+    assert [*outcomes] == [item.title for item in ITEMS]
     text = " ".join(MADE_AGAIN.split())
-    assert list(RESULTS) == [item.name for item in ITEMS]
-    assert [row[0].value for row in RESULTS["gaps"].tables[0].rows] == [gap.name for gap in GAPS]
-    for name, result in RESULTS.items():
-        assert verdicts.summarise_verdicts(result.comparisons) == result.verdict, name
-        assert f"- **{result.title}: {result.verdict.outcome}" in text, name
+    assert [title for title, outcome in outcomes.items() if f"- **{title}: {outcome}" not in text] == []
+    moved = {row[0].replace("\\", "") for row in table_of("results/reproduction", "### How far the headline moves")[1:]}
+    assert moved <= {gap.name for gap in GAPS}
     assert [label for item in ITEMS for label in item.labels if f"`{label}`" not in PAPER_TEXT] == []
-
-
-def test_reproduction__every_figure_is_there_and_no_other() -> None:
-    folder, prefix = pages.FIGURES, pages.PREFIX
-    shown = set(re.findall(rf"\]\(\.\./{folder}/({prefix}[a-z0-9-]+\.svg)\)", SITE.add_reproduction("")))
-    assert shown == {path.name for path in (DOCS / folder).glob(f"{prefix}*")}
-    assert shown == {f"{prefix}{each.stem}.svg" for result in RESULTS.values() for each in result.figures}
+    shown = set(re.findall(r"figures/(reproduction-[a-z0-9-]+\.svg)", page))
+    assert shown == {path.name for path in (DOCS / "figures").glob("reproduction-*")}
 
 
 def test_reproduction__trajectories_and_full_braking_are_as_committed(tmp_path: Path) -> None:
     (item,) = choose_items(["trajectories"])
-    made, committed = item.make(Reproduction("quick", tmp_path)), RESULTS["trajectories"]
-    assert made.verdicts == committed.comparisons
-    (table,), (kept,) = made.tables, committed.tables
-    told = [[cell.in_words for cell in row] for row in table.shown()]
-    assert told == [[cell.value for cell in row] for row in kept.rows]
-    tables = {table.title: table for table in RESULTS["random-table"].tables}
-    for reading in strategies.READINGS:
+    (table,) = item.make(Reproduction("quick", tmp_path)).tables
+    told = [[cell.in_words for cell in row[1:]] for row in table.shown() if row[0].in_words == "as stated"]
+    assert told == table_of("results/reproduction", "### How the episodes end")[1:]
+    for reading, heading in zip(strategies.READINGS, ("### As stated", "### Vehicle 2 acts at 0.2 s"), strict=True):
         scenario = reading.scenario("paper-random")
         agents = strategies.lineup(scenario, FULL_BRAKE)
         found = strategies.drive_list(scenario, agents, 10_000, Reproduction("quick", tmp_path))
         rate = tables_module.collision_rate(found.outcome(NAMES[FULL_BRAKE]).collided)
-        (row,) = (row for row in tables[reading.name].rows if row[0].value == NAMES[FULL_BRAKE])
-        assert row[1].value == verdicts.PERCENT.show(rate).in_words
+        assert committed(heading, NAMES[FULL_BRAKE])[0] == verdicts.PERCENT.show(rate).in_words.split(" [")[0]
 
 
 # docs/cooperation.md, and the methods for several learners in docs/train.md
@@ -393,4 +373,4 @@ def test_ablate_cooperation__its_file_and_commands_make_what_it_says(tmp_path: P
         )
         assert done.returncode == 0, command
     made = {path.name for path in (tmp_path / "runs" / "mine").iterdir()}
-    assert {"ablation.html", "ablation.md", "ablation.csv", "settings.json", "trainings", "optimum"} <= made
+    assert {"ablation.json", "ablation.csv", "ablation.png", "settings.json", "trainings", "optimum"} <= made

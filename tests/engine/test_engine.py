@@ -156,16 +156,6 @@ def test_script__of_which_a_row_is_renewed_remembers_the_others_as_they_were() -
     assert np.array_equal(running.packed.state[others], packed[others])
 
 
-def test_script__that_never_changes_its_mind_changes_no_bit() -> None:
-    runs = []
-    for third in (Counting(adds=0.0), eb.make_agent("constant:5")):
-        running = Engine(OWN_GRID, 20, learners=(1,), scripts={0: eb.make_agent("full_brake"), 2: third}, seed=5)
-        rng = np.random.default_rng(0)
-        runs.append([running.step(rng.uniform(-1.0, 1.0, (20, 1))).reward for _ in range(20)])
-        runs[-1] += [running.worlds.gaps_m, running.worlds.speeds_mps, running.ledger.total_harm]
-    assert all(np.array_equal(a, b) for a, b in zip(*runs, strict=True))
-
-
 def test_jerk__of_a_learner_is_counted_over_the_step_though_a_script_decides_within_it() -> None:
     runs = []
     for first in (Counting(), eb.make_agent("full_brake")):
@@ -200,33 +190,6 @@ def test_engine__steps_as_advance_does_and_its_ledger_counts_the_obstacle() -> N
     struck = running.ledger.obstacle_count > 0
     assert struck.sum() > 20 and not struck.all() and running.ledger.collided[struck].all()
     np.testing.assert_allclose(rewards, -running.ledger.world_harm("total"), rtol=1e-12)
-
-
-def test_infos__tell_the_same_shares_as_the_ledger() -> None:
-    env = eb.parallel_env(NEAR)
-    env.reset(seed=11)
-    while env.agents:
-        infos = env.step({f"vehicle_{i + 1}": np.array([-0.1], np.float32) for i in env.engine.learners})[4]
-    ledger = env.engine.ledger
-    assert ledger.obstacle_count[0] > 0
-    for count, key in (("first", "first_impact_harm"), ("total", "total_harm")):
-        assert [infos[f"vehicle_{i + 1}"][key] for i in range(3)] == ledger.vehicle_harm(count)[0].tolist()
-        assert infos["vehicle_3"][f"world_{key}"] == ledger.world_harm(count)[0]
-    assert env.state()[-2:].tolist() == [np.float32(env.engine.worlds.obstacle_gap_m[0] / 10.0), 1.0]
-    assert env.state_space.contains(env.state()) and len(env.state()) == 28
-
-
-def test_engine__worlds_that_are_given_may_have_an_obstacle_or_none_whatever_the_scenario_says() -> None:
-    plain = eb.load_scenario("cooperation-3-pair")
-    for scenario in (plain, ALL.with_learners([1, 2])):
-        running = make_engine(scenario, 4, seed=1)
-        running.reset(worlds=eb.Worlds.concatenate([NEAR.sample(2, 1).worlds, plain.sample(2, 1).worlds]))
-        for _ in range(30):
-            running.step(np.zeros((4, 2)))
-        assert np.isfinite(running.worlds.obstacle_gap_m).tolist() == [True, True, False, False]
-        running.renew(np.array([0, 3]))
-        own = scenario.obstacle_gap_m is not None
-        assert np.isfinite(running.worlds.obstacle_gap_m).tolist() == [own, True, False, own]
 
 
 # ---------------------------------------------------------------- snapshots

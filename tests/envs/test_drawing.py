@@ -2,10 +2,7 @@
 
 import sys
 from hashlib import sha256
-from importlib import import_module
 from importlib.metadata import version
-from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -13,13 +10,12 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.envs.rendering import BODY_M, HEIGHT, WIDTH, View, follow
+from ethbrake_marl.envs.rendering import BODY_M, HEIGHT, WIDTH
 from ethbrake_marl.envs.trace import Trace
 from ethbrake_marl.errors import InvalidInput
-from tests.contract.interfaces import CRASH, REST
+from tests.contract.interfaces import CRASH
 
 near = pytest.approx
-SHAPE = (HEIGHT, WIDTH, 3)
 FLASH = (255, 214, 10)
 COAST = np.zeros(1, np.float32)
 
@@ -45,20 +41,6 @@ def flashes(frame: Any, colour: tuple[int, int, int] = FLASH) -> int:
     return int((frame == np.array(colour, np.uint8)).all(axis=2).sum())
 
 
-def test_frame__is_a_picture_of_the_state_alone_in_its_own_memory() -> None:
-    environment, other = crash(), crash()
-    before = environment.render()
-    assert (before.shape, before.dtype) == (SHAPE, np.uint8)
-    for _ in range(3):
-        environment.step(-1.0 + COAST), other.step(-1.0 + COAST)
-        frame, again = environment.render(), environment.render()
-        assert np.array_equal(frame, again) and np.array_equal(frame, other.render())
-        assert (frame != before).any()
-        before = again
-        frame[:] = 0
-        assert np.array_equal(environment.render(), again)
-
-
 @pytest.mark.skipif(version("pillow") != "13.0.0", reason="another Pillow draws letters otherwise")
 @pytest.mark.parametrize(
     ("scenario", "learners", "pixels"),
@@ -76,21 +58,6 @@ def test_frames__are_the_same_pixels_as_ever(scenario: str, learners: list[str] 
         environment.step({f"vehicle_{i + 1}": [-0.4] for i in environment.engine.learners})
         told.update(environment.render())
     assert told.hexdigest()[:12] == pixels
-
-
-@pytest.mark.parametrize(("sign", "colour"), [(1.0, (42, 127, 63)), (-1.0, (193, 18, 31))])
-def test_bar__is_as_long_as_the_share_of_the_capacity(sign: float, colour: tuple[int, int, int]) -> None:
-    drawn = []
-    for share in (0.0, 0.25, 0.5, 1.0):  # of Vehicle 2; Vehicle 1 brakes
-        environment = crash()
-        environment.step(np.full(1, sign * share, np.float32))
-        drawn.append(flashes(environment.render(), colour))
-    assert np.diff(drawn) / (drawn[3] - drawn[0]) == near([0.25, 0.25, 0.5], abs=0.02) and drawn[3] > drawn[0] + 500
-
-
-def test_impact__is_shown_where_it_happens_and_then_fades() -> None:
-    seen = {time: flashes(frame) for time, frame in to_its_end(crash())}  # coasting, an impact at 1 s with 6 m/s
-    assert [time for time, count in seen.items() if count and time < 0.999] == [] and seen[1.0] > 50
 
 
 def test_step_frames__show_an_impact_inside_a_step_from_its_moment_on() -> None:
@@ -125,35 +92,6 @@ def test_scene__has_the_numbers_of_the_infos_and_the_places_of_the_physics() -> 
     assert -np.diff(last.front_m) == near(last.gaps_m + BODY_M)
     for scene in shown:
         assert scene.view.left_m < scene.front_m[-1] - BODY_M and scene.front_m[0] < scene.view.right_m
-
-
-@pytest.mark.parametrize(
-    ("ends", "view"),
-    [
-        ((44.0, -20.0), View(-30.0, 50.0)),
-        ((55.0, 0.0), View(-20.0, 60.0)),
-        ((55.0, -25.0), View(-32.5, 60.0)),
-        ((0.0, -40.0), View(-47.5, 50.0)),
-    ],
-)
-def test_view__stands_still_until_the_line_would_leave_it(ends: tuple[float, float], view: View) -> None:
-    assert follow(View(-30.0, 50.0), np.array(ends)) == view
-
-
-@pytest.mark.parametrize("make", [gymnasium.make, eb.EthBrakeEnv])
-def test_list__has_the_beginning_and_each_step_once(make: Any) -> None:
-    name = ("EthBrake-v1",) if make is gymnasium.make else ()
-    environment = make(*name, scenario=CRASH, render_mode="rgb_array_list")
-    environment.reset(seed=0)
-    for _ in range(3):
-        environment.step(COAST)
-    frames = environment.render()
-    assert [frame.shape for frame in frames] == [SHAPE] * 4 and environment.render() == []
-    environment.step(COAST)
-    assert len(environment.render()) == 1
-    environment.reset(seed=0)
-    (first,) = environment.render()
-    assert np.array_equal(first, frames[0])
 
 
 CRASHED = """\
@@ -192,19 +130,6 @@ def test_vector__gives_the_frame_of_each_world() -> None:
         assert np.array_equal(frames[k], single.render())
 
 
-@pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
-def test_vector__goes_on_through_automatic_resets(mode: str) -> None:
-    batch = eb.EthBrakeVectorEnv(3, REST.replace(gaps_m={"uniform": [1, 50]}), render_mode="ansi", autoreset_mode=mode)
-    batch.reset(seed=0)
-    ends = 0
-    for _ in range(30):
-        *_, terminated, _truncated, infos = batch.step(np.full((3, 1), -1.0, np.float32))
-        ends += int(terminated.sum())
-        for time, text in zip(infos["time_s"], batch.render(), strict=True):
-            assert f"  {time:.2f} s after the alert" in text
-    assert ends > 3
-
-
 def test_human__shows_each_step_in_real_time_and_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
     pygame = pytest.importorskip("pygame", reason="needs the extra: pip install 'ethbrake-marl[render]'")
     environment = gymnasium.make("EthBrake-v1", scenario=CRASH, render_mode="human")
@@ -222,17 +147,6 @@ def test_human__shows_each_step_in_real_time_and_says_what_it_needs(monkeypatch:
     monkeypatch.setitem(sys.modules, "pygame", None)
     with pytest.raises(eb.MissingExtra, match=r"^[^\n]*pip install 'ethbrake-marl\[render\]'[^\n]*$"):
         eb.parallel_env(render_mode="human")
-
-
-@pytest.mark.skipif(find_spec("moviepy") is None, reason="moviepy is not installed; RecordVideo needs it")
-def test_record_video__writes_a_film_of_the_episode(tmp_path: Path) -> None:
-    environment = gymnasium.wrappers.RecordVideo(crash(), str(tmp_path / "films"), episode_trigger=lambda _: True)
-    environment.reset(seed=0)
-    to_its_end(environment)
-    environment.close()
-    (path,) = (tmp_path / "films").glob("*.mp4")
-    # from 0.5 s to 1.3 s, one frame per step of 0.1 s
-    assert import_module("imageio_ffmpeg").count_frames_and_secs(str(path)) == (9, near(0.9, abs=0.02))
 
 
 def test_shields__are_looked_through_and_their_interventions_shown() -> None:

@@ -26,28 +26,13 @@ def in_turn(env: Any) -> None:
         env.step(COAST)
 
 
-def vector_of(env: Any, copies: int = 1) -> Any:
-    """SuperSuit's way to Stable-Baselines3: one policy for all agents of some copies."""
-    supersuit = pytest.importorskip("supersuit")
-    rows = supersuit.pettingzoo_env_to_vec_env_v1(env)
-    return supersuit.concat_vec_envs_v1(rows, copies, base_class="stable_baselines3") if copies > 1 else rows
-
-
-def all_rows(env: Any) -> None:
-    """One step of every row of SuperSuit's."""
-    env.step(np.zeros((env.num_envs, 1), np.float32))
-
-
 Ways = dict[str, tuple[Callable[..., Any], Callable[[Any], None]]]
 WAYS: Ways = {
     "parallel": (eb.parallel_env, together),
     "shielded parallel": (lambda **settings: eb.shield(eb.parallel_env(**settings)), together),
     "in turn": (eb.env, in_turn),
-    "in turn, raw": (eb.raw_env, in_turn),
     "shielded in turn": (lambda **settings: eb.shield(eb.env(**settings)), in_turn),
     "in turn and back": (lambda **settings: aec_to_parallel(eb.env(**settings)), together),
-    "supersuit": (lambda **settings: vector_of(eb.parallel_env(**settings)), all_rows),
-    "supersuit, copies": (lambda **settings: vector_of(eb.parallel_env(**settings), 3), all_rows),
 }
 each_way = pytest.mark.parametrize("way", WAYS)
 

@@ -1,9 +1,6 @@
 """What is special to one interface; what all promise: ``tests/contract``."""
 
-import json
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
@@ -13,9 +10,8 @@ import gymnasium
 import numpy as np
 import pettingzoo
 import pytest
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode
 from pettingzoo.utils.conversions import aec_to_parallel
-from stable_baselines3.common.monitor import Monitor
 
 import ethbrake_marl as eb
 from ethbrake_marl import ethbrake_v1
@@ -111,20 +107,6 @@ def test_learners_only__are_the_agents_and_nothing_else_changes() -> None:
     assert not whole.agents and np.array_equal(learners.state(), whole.state())
 
 
-def test_supersuit__frame_skip_draws_from_the_seed_of_the_reset() -> None:
-    supersuit = pytest.importorskip("supersuit")
-
-    def played() -> list[float]:
-        env = supersuit.frame_skip_v0(eb.parallel_env(scenario="cooperation-3-pair", agents="learners"), (1, 4))
-        env.reset(seed=5)
-        times = []
-        while env.agents:
-            times.append(env.step({agent: BRAKE for agent in env.agents})[4]["vehicle_2"]["time_s"])
-        return times
-
-    assert played() == played() and len(set(np.diff(played()).round(6))) > 1
-
-
 # ---------------------------------------------------------------- PettingZoo: one agent after the other
 
 
@@ -148,37 +130,9 @@ def test_aec__plays_the_same_episode_in_turns(make: Any) -> None:
 # ---------------------------------------------------------------- Gymnasium: one world
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"scenario": REST, "reward": "paper"},
-        {"scenario": json.loads(json.dumps(eb.load_scenario("paper-random").declared()))},
-        {"observation": eb.ObservationSpec(2, 0)},
-        {"observation": eb.choose_observation(["own", "front_1.gap"])},
-        {"scenario": FIVE, "reward": eb.RewardParams(harm=0.5, terminal=2.0), "learners": ["vehicle_3"]},
-    ],
-)
-def test_make__passes_settings_which_survive_the_json_of_a_spec(settings: dict[str, Any]) -> None:
-    made, alone = gymnasium.make("EthBrake-v1", **settings), eb.EthBrakeEnv(**settings)
-    assert made.spec is not None and alone.spec is None
-    again = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(made.spec.to_json()))
-    engines = [environment.unwrapped.engine for environment in (made, again, alone)]
-    for name in ("scenario", "reward", "observation", "learners"):
-        assert [getattr(engine, name) for engine in engines] == [getattr(alone.engine, name)] * 3
-    assert getattr(alone.engine, "observation", None) == settings.get("observation", alone.engine.observation)
-    starts = [environment.reset(seed=5)[0].tobytes() for environment in (made, again, alone)]
-    assert len(set(starts)) == 1 and alone.observation_space.shape == (alone.engine.observation.size,)
-
-
-def test_make__the_scenario_may_be_a_path(tmp_path: Path) -> None:
-    (tmp_path / "mine.yaml").write_text(json.dumps({**REST.declared(), "name": "mine", "latency_s": 0.25}))
-    assert eb.EthBrakeEnv(f"{tmp_path}/mine.yaml").reset(seed=0)[1]["time_s"] == 0.25
-
-
 # ---------------------------------------------------------------- Gymnasium: many worlds
 
 SHORT = REST.replace(name="short", gaps_m={"uniform": [1, 8]}, horizon_s=2)  # some rest before, others do not
-MODES = ("NextStep", "SameStep")
 
 
 class FromOneStream(gymnasium.Wrapper):
@@ -209,37 +163,6 @@ def assert_same_infos(ours: dict[str, Any], theirs: dict[str, Any], alone: bool)
             assert np.array_equal(ours[name][row], column[row]), (name, row)
 
 
-@pytest.mark.parametrize("n", [1, 3])
-@pytest.mark.parametrize("mode", MODES)
-def test_step__is_that_of_gymnasiums_own_vector_environment(mode: str, n: int) -> None:
-    worlds = SHORT.sample(90, 5, channel="training").worlds
-    listed = (initial_state(worlds, k) for k in range(90))
-    rows = [lambda: eb.EthBrakeEnv(SHORT)] if n == 1 else [lambda: FromOneStream(listed)] * n
-    native, own = eb.EthBrakeVectorEnv(n, SHORT, autoreset_mode=mode), SyncVectorEnv(rows, autoreset_mode=mode)
-    (ours, told), (theirs, told_own) = (environment.reset(seed=5) for environment in (native, own))
-    assert np.array_equal(ours, theirs)
-    assert_same_infos(told, told_own, n == 1)
-    endings, ended = [], np.zeros(n, bool)
-    for action in actions(11, 300, n):
-        action[ended & (mode == "NextStep")] = (np.nan, 5.0)[len(endings) % 2]  # the step of a reset takes no action
-        (ours, *ending, told), (theirs, *ending_own, told_own) = native.step(action), own.step(action)
-        assert np.array_equal(ours, theirs)
-        assert all(np.array_equal(a, b) for a, b in zip(ending, ending_own, strict=True))
-        assert_same_infos(told, told_own, n == 1)
-        endings.append([ending[0] < -0.1, *ending[1:]])
-        ended = ending[1] | ending[2]
-    assert (np.sum(endings, axis=0) >= 2).all()  # in every row: struck, at rest, cut off
-
-
-@pytest.mark.parametrize("mode", [*list(AutoresetMode)[:2], *MODES])
-def test_mode__can_be_chosen_in_every_way_and_is_stated(mode: Any) -> None:
-    native = gymnasium.make_vec("EthBrake-v1", num_envs=2, autoreset_mode=mode)
-    kwargs = {"autoreset_mode": AutoresetMode(mode)}
-    sync = gymnasium.make_vec("EthBrake-v1", num_envs=2, vectorization_mode="sync", vector_kwargs=kwargs)
-    assert native.metadata["autoreset_mode"] is sync.metadata["autoreset_mode"] is AutoresetMode(mode)
-    assert eb.EthBrakeVectorEnv(2).autoreset_mode is AutoresetMode.NEXT_STEP
-
-
 @pytest.mark.parametrize("way", [None, "vector_entry_point", "sync", "async"])
 def test_make_vec__makes_it_in_every_way(way: str | None) -> None:
     environment = gymnasium.make_vec("EthBrake-v1", num_envs=2, vectorization_mode=way, scenario=PAPER)
@@ -251,19 +174,6 @@ def test_make_vec__makes_it_in_every_way(way: str | None) -> None:
     seeded = eb.EthBrakeEnv(PAPER).reset(seed=8)[0]  # Gymnasium gives world k the seed 7 + k
     assert np.array_equal(observation[1], seeded) != native
     environment.close()
-
-
-def test_wrappers__which_of_gymnasiums_take_same_step_is_what_the_page_says() -> None:
-    wrappers = gymnasium.wrappers.vector
-    for wrap in (wrappers.NormalizeReward, wrappers.RecordEpisodeStatistics, wrappers.ClipAction):
-        wrap(eb.EthBrakeVectorEnv(2, autoreset_mode="SameStep")).reset(seed=1)
-    for wrap in (wrappers.NormalizeObservation, wrappers.FlattenObservation):
-        assert f"`{wrap.__name__}`" in PAGE
-        wrapped = wrap(eb.EthBrakeVectorEnv(2))
-        wrapped.reset(seed=1)
-        assert all(np.isfinite(wrapped.step(action)[0]).all() for action in actions(2, 90, 2))
-        with pytest.raises((ValueError, AssertionError)):  # Gymnasium 1.1 asserts, without a word
-            wrap(eb.EthBrakeVectorEnv(2, autoreset_mode="SameStep"))
 
 
 # ---------------------------------------------------------------- by id, and what the page shows
@@ -284,43 +194,11 @@ def test_registration__by_id_twice_and_with_the_projects_name() -> None:
     assert ethbrake_v1.parallel_env is eb.parallel_env and {"env", "raw_env"} <= set(dir(ethbrake_v1))
 
 
-def test_import__stays_light_until_a_name_is_used_and_lets_gymnasium_make_it_by_id() -> None:
-    program = (
-        "import sys, ethbrake_marl as eb\n"
-        "heavy = lambda: sorted({'torch', 'numba', 'stable_baselines3', 'matplotlib', 'pydantic'} & set(sys.modules))\n"
-        "print(heavy()); p = eb.parallel_env(); p.reset(seed=0); print(heavy())\n"
-        "import gymnasium; e = gymnasium.make('ethbrake_marl:EthBrake-v1'); print(type(e.unwrapped).__name__)\n"
-        "e.reset(seed=0); e.step(e.action_space.sample())\n"
-        "a = eb.EthBrakeEnv(render_mode='ansi'); a.reset(seed=0); a.render()\n"
-        "watched = e.unwrapped.engine._now.watched, p.engine._now.watched\n"
-        "print(*watched, *{'PIL', 'pygame', 'matplotlib'} & set(sys.modules))"
-    )
-    command = [sys.executable, "-W", "error", "-c", program]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert result.stdout.splitlines() == ["[]", "['numba', 'pydantic']", "EthBrakeEnv", "{} {}"], result.stderr
-
-
 def test_page__its_examples_run() -> None:
     names: dict[str, object] = {}
     for code in re.findall("```python\n(.*?)```", PAGE, re.DOTALL):
         exec(code.replace("4096", "4").replace("512", "4"), names)
     assert {"many", "frame", "smooth"} <= set(names)
-
-
-@pytest.mark.parametrize("scenario", [PAPER, FIVE], ids=lambda scenario: scenario.name)
-def test_state__has_its_features_and_owns_its_memory(scenario: eb.Scenario) -> None:
-    worlds, N = scenario.sample(3, 0).worlds, scenario.vehicles
-    names = [feature.name for feature in state_features(scenario)]
-    assert len(set(names)) == len(names) == 7 * N + 2 * (N - 1) + 1
-    column = dict(zip(names, full_state(worlds, scenario).T, strict=True))
-    for i in range(N - 1):
-        assert column[f"pair_{i + 1}.gap"] == near(worlds.gaps_m[:, i] / 10.0)
-        assert column[f"vehicle_{i + 2}.speed"] == near(worlds.speeds_mps[:, i + 1] / 20.0)
-    environment = started(scenario)
-    state = environment.state()
-    kept = state.copy()
-    environment.step({environment.possible_agents[environment.engine.learners[0]]: BRAKE})
-    assert np.array_equal(state, kept) and state.dtype == np.float32
 
 
 # ---------------------------------------------------------------- Stable-Baselines3
@@ -418,24 +296,6 @@ def test_reset_infos__belong_to_the_running_episodes_and_tell_the_news_of_each_l
     assert told == [known[k, i].tolist() for k in range(3) for i in range(4)]
 
 
-def test_attributes__belong_to_the_whole_batch() -> None:
-    env = make_sb3_vec_env(CRASH, 3)
-    assert isinstance(env, EthBrakeVecEnv) and env.get_attr("render_mode") == [None] * 3
-    assert [engine is env.engine for engine in env.get_attr("engine", indices=[0, 2])] == [True, True]
-    env.set_attr("label", 7)
-    assert (env.get_attr("label"), env.env_method("seed", 4)) == ([7] * 3, [[4] * 3] * 3)
-    assert (env.has_attr("engine"), env.has_attr("nothing")) == (True, False)
-    assert env.env_is_wrapped(Monitor) == [False] * 3
-
-
-def test_video__shows_every_world_of_the_batch() -> None:
-    env = make_sb3_vec_env("paper-random", 3, render_mode="rgb_array")
-    env.reset()
-    env.step(np.zeros((3, 1)))
-    assert env.metadata["render_fps"] == 10 and [image.shape for image in env.get_images()] == [(304, 800, 3)] * 3
-    assert (env.render() != 0).any()
-
-
 def test_step_async__keeps_its_own_copy_of_the_actions() -> None:
     env, untouched = begun(PAPER, 2, seed=0), begun(PAPER, 2, seed=0)
     action = np.full((1, 2), -0.5, np.float32)  # lying: the only row of a batch of columns
@@ -480,26 +340,6 @@ def test_appended__stands_behind_the_own_observation_in_every_row(appended: Any)
             assert appended == "state" or last[own] == row % 3
             ended += 1
     assert ended > 0
-
-
-def test_agents__are_all_vehicles_until_the_collective_end() -> None:
-    environment = started(REST)
-    both = ["vehicle_1", "vehicle_2"]
-    assert environment.possible_agents == both
-    assert eb.parallel_env(REST).agents == []
-    for step in range(10):
-        assert environment.agents == both
-        *results, _ = environment.step({"vehicle_2": BRAKE})
-        assert [list(part) for part in results] == [both] * 4
-        assert [set(part.values()) for part in results[2:]] == [{step == 9}, {False}]
-    assert environment.agents == []
-
-
-def test_agents__that_are_given_out_are_not_the_list_of_the_environment() -> None:
-    environment = started(REST)
-    environment.agents.clear()
-    environment.reset()
-    assert environment.agents == ["vehicle_1", "vehicle_2"]
 
 
 def test_episode__starts_when_a_learner_may_act_first() -> None:
@@ -610,46 +450,6 @@ def test_max_cycles__truncate_unless_the_episode_is_over_before() -> None:
     assert truncated == {"vehicle_1": False, "vehicle_2": False}
 
 
-def test_seed__of_an_environment_without_one_can_be_read() -> None:
-    environment = eb.EthBrakeEnv()
-    start, _ = environment.reset()
-    assert np.array_equal(eb.EthBrakeEnv().reset(seed=environment.np_random_seed)[0], start)
-    environment = eb.EthBrakeEnv()
-    environment.np_random = np.random.default_rng(7)
-    info = environment.reset()[1]
-    assert info["world_seed"] == 5765488047046174021
-    assert info["world"] == 0
-    assert int(environment.np_random.integers(10**6)) == 684179
-
-
-def test_worlds_that_are_given__are_described_until_others_take_their_places() -> None:
-    start = {"gaps_m": [7, 8], "speeds_mps": [20, 18, 20], "mass_t": [1, 2, 3], "braking_capacity_mps2": 6}
-    start |= {"driving_capacity_mps2": 1, "latency_s": [0, 0.5, 0.8], "speed_limit_mps": 40}
-    mixed = eb.load_scenario("realistic-mixed")
-    environment = eb.EthBrakeVectorEnv(num_envs=2, scenario=mixed)
-    environment.reset(seed=3, options={"initial_state": start})
-    assert [environment.describe_worlds()[name].tolist() for name in ("gap_2_m", "mass_3_t", "world")] == [
-        [8.0, 8.0],
-        [3.0, 3.0],
-        [-1, -1],
-    ]
-    environment.engine.renew(np.array([1]))
-    told, kinds = environment.describe_worlds(), mixed.sample(1, 3, channel="training").types
-    assert float(told["gap_2_m"][0]) == 8.0
-    assert told["vehicle_2_type"].tolist() == ["", kinds[0, 1]]
-    environment.reset()
-    environment.engine.restore(environment.engine.snapshot())
-    assert environment.describe_worlds()["world"].min() >= 1
-
-
-@pytest.mark.parametrize("make", [eb.EthBrakeEnv, eb.parallel_env, lambda slow: eb.env(scenario=slow)])
-def test_drawing__plays_in_real_time(make) -> None:
-    metadata = make(CRASH.replace(time_step_s=0.05)).metadata
-    assert metadata["render_modes"] == ["human", "rgb_array", "rgb_array_list", "ansi"]
-    assert metadata["render_fps"] == 20
-    assert eb.EthBrakeVectorEnv(2).metadata["render_modes"] == ["rgb_array", "ansi"]
-
-
 @pytest.mark.parametrize(
     ("obstacle", "count", "harms", "world"),
     [
@@ -686,25 +486,6 @@ def test_features__each_learner_may_observe_its_own(said) -> None:
     assert eb.observation_for(pair, "vehicle_2").size == 27
     assert eb.Scenario(**declared.declared()) == declared
     assert declared.replace(observation=["own"]).observation == ("own",)
-
-
-def test_shares_of_the_steps__add_up_to_those_of_the_episode() -> None:
-    pair = eb.load_scenario("cooperation-3-pair")
-    engine = eb.make_engine(pair, 6, seed=7)
-    shares = {"first": np.zeros((6, 3)), "total": np.zeros((6, 3))}
-    begun, cost = engine.ledger, np.zeros(6)
-    while not engine.ended.all():
-        before = engine.ledger
-        step = engine.step(np.full((6, 2), -1.0))
-        cost += step.counted_harm
-        for count, share in shares.items():
-            share += engine.ledger.since(before).vehicle_harm(count)
-    assert engine.observe_all().shape == (6, 2, 27)
-    assert step.reward.shape == (6, 3)
-    assert shares["first"].any()
-    for count, share in shares.items():
-        assert np.allclose(share, engine.ledger.since(begun).vehicle_harm(count))
-    assert np.allclose(cost, shares["first"].sum(axis=1))
 
 
 def test_stream__gives_every_world_of_its_list_once_and_in_order() -> None:

@@ -125,38 +125,3 @@ def test_numbers__of_every_other_make_are_taken(good: str) -> None:
     rows, plain = (started(eb.make_sb3_vec_env("paper-random", 2, seed=1)) for _ in range(2))
     given = [[make(-0.5)], [make(0.5)]]
     assert np.array_equal(rows.step(given)[0], plain.step(np.array([[-0.5], [0.5]]))[0])
-
-
-def test_ignored_row__of_an_automatic_reset_may_be_masked() -> None:
-    env = started(eb.EthBrakeVectorEnv(2, max_episode_steps=1))
-    env.step(np.zeros((2, 1)))
-    assert not env.step(np.ma.array(np.zeros((2, 1)), mask=True))[3].any()
-
-
-def test_row__beside_one_that_is_reset_must_be_a_number() -> None:
-    env = eb.EthBrakeVectorEnv(2)
-    env.reset(seed=0)
-    env.engine.cut(env.engine.step(np.zeros((2, 1))), 1)
-    env.reset(options={"reset_mask": np.array([True, False])})
-    for bad in (np.ma.array([[0.5], [0.5]], mask=[[True], [False]]), [[torch.tensor(0.5, requires_grad=True)], [0.5]]):
-        with pytest.raises(InvalidInput, match=r"action of the learners: (?s:.*)is masked|requires gradients"):
-            env.step(bad)
-    assert env.step(np.array([[0.5], [np.nan]]))[4]["chosen_action"][:, 0].tolist() == [0.5, 0.0]
-
-
-@pytest.mark.parametrize(
-    "wrong", [np.ma.array([0.0, -1.0, -1.0], mask=[0, 1, 0]), [False] * 3, torch.zeros(3, requires_grad=True)]
-)
-def test_advance__refuses_commands_and_times_that_are_no_numbers(wrong: Any) -> None:
-    worlds = eb.load_scenario("paper-random").sample(1, 0).worlds
-    with pytest.raises(InvalidInput, match=r"^command_mps2: (?s:.*)(is masked|is a boolean|requires gradients)"):
-        eb.advance(worlds, wrong, 0.1)
-    for time in ({"duration_s": True}, {"until_s": True}):
-        with pytest.raises(InvalidInput, match=r"^(duration|until)_s: True is a boolean"):
-            eb.advance(worlds, 0.0, **time)
-
-
-def test_reset_mask__may_not_be_masked_itself() -> None:
-    env = started(eb.EthBrakeVectorEnv(2))
-    with pytest.raises(InvalidInput, match="reset_mask"):
-        env.reset(options={"reset_mask": np.ma.array([True, True], mask=[False, True])})

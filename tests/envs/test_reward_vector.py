@@ -93,12 +93,6 @@ def test_interfaces__give_the_same_vectors() -> None:
     assert vector.unwrapped.reward_space == made[0].unwrapped.reward_space
 
 
-def test_vector__behind_a_shield_takes_no_penalty() -> None:
-    for env in (eb.EthBrakeEnv(reward_vector="vehicles"), eb.parallel_env(reward_vector="vehicles")):
-        with pytest.raises(InvalidInput, match=r"intervention_penalty = 0\.5: cannot be subtracted, because"):
-            eb.shield(env, mode="step", intervention_penalty=0.5)
-
-
 @pytest.mark.parametrize(
     "given", ["harm", [], ["harm_1", "harm_1"], 3, "vehicle", [["harm_1"]], np.array(["harm_1", "harm_2"])]
 )
@@ -151,11 +145,3 @@ def test_turns__before_the_first_step_and_between_steps_give_vectors_of_zeros() 
         turns.step(np.zeros(1) if agent == "vehicle_2" and not over else None)
     assert [each.tolist() for each in collected.values()] == [collected["vehicle_1"].tolist()] * 3
     assert collected["vehicle_1"][:2] == pytest.approx([-8.8, -7.2])
-
-
-def test_turns__with_numbers_have_no_space_of_vectors() -> None:
-    turns = eb.env()
-    turns.reset(seed=1)
-    assert turns.rewards["vehicle_1"] == 0 and not hasattr(turns, "reward_spaces")
-    with pytest.raises(InvalidInput, match="reward_space: the rewards of this environment are numbers"):
-        turns.reward_space("vehicle_1")

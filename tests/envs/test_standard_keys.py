@@ -1,7 +1,5 @@
 """What Gymnasium and its wrappers name, works here as there: reset_mask, max_episode_steps, settings in a spec."""
 
-import json
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -9,8 +7,6 @@ import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from gymnasium.wrappers import TimeAwareObservation
-from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 import ethbrake_marl as eb
 from ethbrake_marl.envs.making import UnknownResetOption
@@ -77,21 +73,6 @@ def test_reset_mask__of_all_rows_is_a_reset() -> None:
     assert np.array_equal(env.reset(seed=9, options=every)[0], other.reset(seed=9)[0])
     given = {"initial_state": {"gaps_m": 7, "speeds_mps": 20}}
     assert np.array_equal(env.reset(options=every | given)[0], other.reset(options=given)[0])
-
-
-def test_reset_mask__works_through_gymnasiums_wrappers_and_a_shield() -> None:
-    env = RecordEpisodeStatistics(ran())
-    env.reset(seed=5)
-    for action in actions(3, 3, 4):
-        env.step(action)
-    env.reset(options={"reset_mask": MASK.copy()})
-    assert env.episode_lengths.tolist() == [3, 0, 0, 3]
-    shielded = eb.shield(eb.EthBrakeVectorEnv(4))
-    shielded.reset(seed=5)
-    shielded.step(np.ones((4, 1), np.float32))
-    _, infos = shielded.reset(options={"reset_mask": MASK.copy()})
-    assert infos["_world"].tolist() == MASK.tolist()
-    assert not shielded.step(np.zeros((4, 1), np.float32))[2].any()
 
 
 REFUSED_MASKS: list[tuple[dict[str, Any], str]] = [
@@ -186,14 +167,6 @@ def test_max_episode_steps__means_the_same_in_every_way_and_goes_into_the_spec(w
     assert type(again.unwrapped) is type(env.unwrapped) and spec == again.spec
 
 
-def test_max_episode_steps__behind_a_shield_ends_the_row() -> None:
-    env = eb.shield(eb.EthBrakeVectorEnv(2, max_episode_steps=2))
-    env.reset(seed=1)
-    ends = [env.step(np.zeros((2, 1), np.float32)) for _ in range(6)]
-    assert [bool(end[3].all()) for end in ends] == [False, True, False, False, True, False]
-    assert [end[4]["world"][0] for end in ends] == [0, 0, 2, 2, 2, 4]  # the third and the last step are resets
-
-
 @pytest.mark.parametrize("steps", [0, 1.5, True, "3"])
 def test_max_episode_steps__must_be_a_whole_number(steps: Any) -> None:
     with pytest.raises(InvalidInput, match=r"max_episode_steps = .*: must be a whole number, at least 1"):
@@ -216,24 +189,10 @@ def test_spec__holds_the_most_steps_of_an_episode(scenario: Scenario, most: int,
     assert steps == taken
 
 
-@pytest.mark.parametrize("settings", [{}, {"flatten": False}, {"normalize_time": True}], ids=str)
-def test_time_aware_observation__works_on_what_make_gives(settings: dict[str, Any]) -> None:
-    env = TimeAwareObservation(gymnasium.make("EthBrake-v1"), **settings)
-    state = {"gaps_m": 7, "speeds_mps": 30, "latency_s": 0}
-    for options in (None, {"initial_state": state}):
-        seen, _ = env.reset(seed=0, options=options)
-        over = False
-        while not over:
-            assert seen in env.observation_space
-            seen, _, terminated, truncated, _ = env.step(np.ones(1, np.float32))
-            over = terminated or truncated
-        assert seen in env.observation_space
-
-
 # ---------------------------------------------------------------- settings that survive a spec's JSON
 
 LEARNERS: list[Any] = [
-    np.array([1]), np.array(["vehicle_2"]), [np.int64(1)], (np.str_("vehicle_2"),), range(1, 2), {1}, {1: None}.keys(),
+    np.array([1]), np.array(["vehicle_2"]), range(1, 2), {1},
 ]  # fmt: skip
 
 
@@ -259,12 +218,3 @@ def test_spec__survives_json_whatever_the_settings_are_made_of(settings: dict[st
     for name in ("scenario", "reward", "observation", "learners"):
         assert getattr(again.unwrapped.engine, name) == getattr(made.unwrapped.engine, name)
     assert np.array_equal(again.reset(seed=5)[0], made.reset(seed=5)[0])
-
-
-def test_spec__survives_json_with_a_path_and_a_mode(tmp_path: Path) -> None:
-    (tmp_path / "mine.yaml").write_text(json.dumps({**REST.declared(), "name": "mine"}))
-    settings = {"scenario": tmp_path / "mine.yaml", "autoreset_mode": AutoresetMode.SAME_STEP}
-    made = gymnasium.make_vec("EthBrake-v1", np.int64(2), **settings)
-    again = gymnasium.make_vec(EnvSpec.from_json(made.spec.to_json()))
-    assert again.unwrapped.engine.scenario == made.unwrapped.engine.scenario and again.num_envs == 2
-    assert again.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP

@@ -10,13 +10,10 @@ import pytest
 from scipy import stats
 
 import ethbrake_marl as eb
-from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.chunks import Lineup, evaluate_held, summarise_tally, tally_list
 from ethbrake_marl.evaluation.comparison import compare_results
 from ethbrake_marl.evaluation.per_world import read_result, results_to_json, write_per_world
-from ethbrake_marl.evaluation.seeds import mean_over_seeds, share_over_seeds
-from ethbrake_marl.evaluation.shield_modes import compare_modes
 from ethbrake_marl.evaluation.statistics import (
     Moments,
     mean,
@@ -28,7 +25,6 @@ from ethbrake_marl.evaluation.statistics import (
     wilson,
 )
 from ethbrake_marl.scenario.sample import clusters_of
-from ethbrake_marl.scenario.task import Task
 from tests.refused import refused
 
 T_2 = 4.302652729911275  # quantile of Student's t with 2 degrees of freedom at 97.5 %
@@ -85,22 +81,6 @@ def test_rows_that_are_repeated_in_one_cluster__tell_no_more_than_one_of_them(k:
     few = share_of(again > 4.0, names).interval
     factor = (stats.norm.ppf(0.975) / stats.t.ppf(0.975, 39)) ** 2
     assert few == pytest.approx(wilson(float((x > 4.0).mean()), 40 * factor), rel=1e-9)
-
-
-@pytest.mark.parametrize("k", [1, 2, 10])
-def test_rows_that_are_repeated_in_one_cluster__tell_no_more_over_seeds_either(k: int) -> None:
-    x, y, z = np.random.default_rng(5).exponential(3.0, (3, 2, 40))
-    names = np.repeat([f"drive {number:02}" for number in range(40)], k)
-    again, other, best = (np.repeat(each, k, axis=1) for each in (x, y, z * 0.1))
-    for found, once in (
-        (mean_over_seeds(again, clusters=names), mean_over_seeds(x)),
-        (mean_over_seeds(again, other, clusters=names), mean_over_seeds(x, y)),
-        (share_over_seeds(again, other + 3.0, best, clusters=names), share_over_seeds(x, y + 3.0, z * 0.1)),
-    ):
-        assert found.value == pytest.approx(once.value) and found.interval == pytest.approx(once.interval)
-    hit = mean_over_seeds(np.zeros((2, 40 * k), np.bool_), clusters=names).interval
-    assert hit == pytest.approx(share_of(np.zeros(40, np.bool_), np.arange(40).astype(str)).interval)
-    assert mean_over_seeds(again, clusters=np.repeat("a", 40 * k)).interval is None
 
 
 def test_intervals__of_one_cluster_are_unknown() -> None:
@@ -184,11 +164,6 @@ def test_evaluation__has_the_recording_of_each_world_and_intervals_by_it(found) 
     assert found.take(column == column[0]).recordings == 1
 
 
-def test_evaluation__without_recordings_says_nothing_of_them() -> None:
-    rows = eb.summarise(eb.evaluate(PAPER.sample(20, 7), AGENTS, scenario=PAPER))
-    assert "recording" not in str(rows) and "recordings" not in rows[0].parameters
-
-
 def test_long_list__has_the_same_intervals_by_recording() -> None:
     scenario = recorded(8, latency_s=[0, {"uniform": [0.3, 1.5]}, 1.6])
     lineup = Lineup.of(["full_brake", "coast"], scenario)
@@ -215,19 +190,6 @@ def test_single_recording__has_no_interval_and_the_table_says_so() -> None:
     assert "All worlds come from one recording, so nothing is known about other recordings." in text
 
 
-def test_rejected_rows__are_counted_below_the_table() -> None:
-    # Every fifth row is hit 0.25 s after the alert, before vehicle_2 may act at 0.5 s.
-    rows = [[5.0 if k == 0 else 30.0, 0.0, 20.0, f"drive_{k}"] for k in range(5)]
-    table = {"columns": ["gap_1_m", "speed_1_mps", "speed_2_mps", "recording"], "rows": rows}
-    scenario = recorded(1, latency_s=[0, 0.5, 0.8], table=table)
-    sample = scenario.sample(400, 7)
-    again = f"{sample.rejected} of {sample.rejected + 400} drawn worlds ("
-    text = in_one_line(eb.summarise(eb.evaluate(sample, AGENTS, scenario=scenario)))
-    assert again in text and 60 < sample.rejected < 140
-    kept = scenario.replace(early_impacts="keep")
-    assert "drawn again" not in str(eb.summarise(eb.evaluate(kept.sample(50, 7), AGENTS, scenario=kept)))
-
-
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
 def test_comparison__of_results_that_were_read_again_is_by_recording(found, ending: str, tmp_path: Path) -> None:
     if ending == "parquet":
@@ -250,49 +212,8 @@ def test_comparison__of_results_that_were_read_again_is_by_recording(found, endi
     assert unpaired == unpaired_difference(both[0], 8, both[1], 8)
 
 
-def test_result__with_an_impossible_number_of_recordings_is_refused(found, tmp_path: Path) -> None:
-    told = results_to_json(eb.summarise(found))
-    for number, message in ((401, "recordings = 401: must be the number"), ("x", "recordings = x: must be the number")):
-        for row in told:
-            row["parameters"]["recordings"] = number
-        (tmp_path / "results.json").write_text(json.dumps(told))
-        with refused(message):
-            read_result(tmp_path / "results.json")
-
-
-def test_shield__is_compared_by_recording(found) -> None:
-    some = found.take(np.arange(60))
-    task = Task(some.scenario, (1,))
-    agents = {"full_brake": AGENTS["full_brake"]}
-    rows = compare_modes(agents, some.worlds, task, clusters=some.clusters)
-    assert rows[0].harm == mean(some.outcome("full_brake").first_impact_harm, some.kinds["recording"])
-    assert rows.to_json(some.scenario.sample(60, 7), task)[0]["recordings"] == some.recordings
-
-
 def test_mixture__counts_a_world_without_recording_as_a_cluster_of_its_own() -> None:
     mixed = eb.Scenario(name="mixed", mixture=[{"scenario": PAPER}, {"scenario": recorded(4)}])
     sample = mixed.sample(60, 7)
     alone = int((sample.scenarios == "paper-random").sum())
     assert len(set(sample.clusters.tolist())) == alone + 4
-
-
-def test_command__says_how_many_recordings_and_how_many_draws_were_refused(
-    empty_folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    rows = [[5.0 if k == 0 else 30.0, 0.0, 20.0, f"drive_{k}"] for k in range(5)]
-    table = {"columns": ["gap_1_m", "speed_1_mps", "speed_2_mps", "recording"], "rows": rows}
-    scenario = recorded(1, latency_s=[0, 0.5, 0.8], table=table)
-    Path("recorded.yaml").write_text(json.dumps(scenario.declared()))
-    rejected = scenario.sample(200, 7).rejected
-    share = f"{rejected} of {200 + rejected} draws ({100 * rejected / (200 + rejected):.1f} %)"
-    assert run_command(["scenario", "explain", "recorded.yaml"]) == 0
-    told = in_one_line(capsys.readouterr().out)
-    assert f"is rejected and drawn again: {share}." in told
-    assert "one of the 5 rows of a table" in told and "The rows come from 5 recordings; confidence intervals" in told
-    assert run_command(["scenario", "validate", "recorded.yaml"]) == 0
-    told = in_one_line(capsys.readouterr().out)
-    assert f"{share} rejected" in told and "recording: 4 different" in told
-    assert run_command(["scenario", "sample", "recorded.yaml", "--episodes", "200"]) == 0
-    assert f"drawn again because of an impact before a learner can act: {share}" in in_one_line(capsys.readouterr().err)
-    assert run_command(["scenario", "sample", "paper-random", "--episodes", "200"]) == 0
-    assert "drawn again" not in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Single episodes: recorded, as exact motion, as a film; and datasets of them, Parquet and Minari."""
+"""Single episodes: recorded, and as exact motion."""
 
 from typing import Any
 
@@ -112,19 +112,6 @@ def test_motion__is_exact_at_every_moment(name: str, spec: str, pair: eb.Scenari
         assert motion.at_rest and motion.stepped_in_s.size == 0
 
 
-def test_motion__counts_what_the_evaluation_counts(evaluation: Evaluation) -> None:
-    motions = follow_episodes(evaluation.worlds.take(np.arange(60)), make_agent("constant:4.5"), evaluation.scenario)
-    o = evaluation.outcome("constant:4.5")
-    expected = zip(o.first_impact_harm, o.total_harm, o.impacts, o.final.time_s, strict=True)
-    assert [(*each.harm, len(each.impacts.time_s), each.end_s) for each in motions] == list(expected)[:60]
-
-
-def test_motion__tells_where_a_shield_stepped_in(paper_random: eb.Scenario) -> None:
-    agent = make_agent("constant:3+episode", scenario=paper_random)
-    times = [each.stepped_in_s for each in follow_episodes(paper_random.sample(4, 7).worlds, agent, paper_random)]
-    assert any(each.size for each in times) and min(np.concatenate(times)) >= 0.5  # Vehicle 2 acts from then on
-
-
 def test_motion__tells_where_the_shield_of_a_team_stepped_in_as_its_log_does() -> None:
     scenario = eb.load_scenario("cooperation-3-pair")
     worlds = scenario.sample(6, 7).worlds
@@ -141,24 +128,6 @@ def test_motion__cascade_of_bounces_stays_small_and_ends_right(pair: eb.Scenario
     (motion,) = follow_episodes(bouncy.sample(1, 0).worlds, make_agent("coast"), bouncy)
     assert len(motion.impacts.time_s) > 10 and (np.diff(motion.pieces[:, 0]) > 0.0).all()
     np.testing.assert_allclose(at(motion, motion.end_s)[1], motion.final.gaps_m[0, 0], atol=1e-6)
-
-
-# ---------------------------------------------------------------- films
-
-
-# ---------------------------------------------------------------- datasets
-
-
-# ---------------------------------------------------------------- recording
-
-
-# ---------------------------------------------------------------- Parquet
-
-
-# ---------------------------------------------------------------- Minari
-
-
-# ---------------------------------------------------------------- writing
 
 
 def test_record__a_vehicle_pushed_above_its_speed_limit_goes_on() -> None:

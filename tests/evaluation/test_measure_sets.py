@@ -2,7 +2,6 @@
 
 import csv
 import io
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation.chunks import Lineup, summarise_tally, tally_list
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.measure_sets import MEASURE_SETS, Measure, MeasureSet, Silent, register_measure_set
-from ethbrake_marl.evaluation.per_world import results_to_json, write_per_world
+from ethbrake_marl.evaluation.per_world import write_per_world
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.evaluation.summary_row import SummaryRow
 
@@ -39,24 +38,6 @@ def driven(core_alone: None) -> Evaluation:
 def rows_of(folder: Path, evaluation: Evaluation) -> list[dict[str, str]]:
     write_per_world(folder / "worlds.csv", evaluation)
     return list(csv.DictReader(io.StringIO((folder / "worlds.csv").read_text())))
-
-
-def test_core__alone_shows_the_episode_in_table_json_and_files(driven: Evaluation, tmp_path: Path) -> None:
-    table = summarise(driven)
-    assert [row.agent for row in table] == AGENTS and table[0].more == {} and table[0].bounds == frozenset()
-    for text in (str(table), table.markdown(), table._repr_html_()):
-        assert "coast" in text and "otal" in text and "egret" not in text and "best known" not in text
-    assert "Decrease" in str(table)  # also in a narrow terminal
-    (row, _) = json.loads(json.dumps(results_to_json(table), allow_nan=False))
-    assert row["total_harm"] == driven.outcome("full_brake").total_harm.mean()
-    assert not [key for key in row if "regret" in key or "best_known" in key or "proven" in key]
-    assert "no_limits_because" not in row["parameters"] and row["parameters"]["seed"] == 7
-    lines = rows_of(tmp_path, driven)
-    assert len(lines) == 40 and float(lines[0]["total_harm"]) == driven.outcome("full_brake").total_harm[0]
-    assert not {"avoidable", "proven_harm", "regret_total_harm"} & lines[0].keys()
-    lineup = Lineup.of(AGENTS, PAPER)
-    long = summarise_tally(lineup, tally_list(lineup, 20, 7), 7)
-    assert [each.to_json() for each in long] == [each.to_json() for each in table]
 
 
 class Hardest(MeasureSet):
@@ -118,14 +99,6 @@ def test_set__is_silent_with_its_reason(driven: Evaluation, tmp_path: Path) -> N
     lineup = Lineup.of(["coast"], PAPER)
     (long,) = summarise_tally(lineup, tally_list(lineup, 20, 7), 7)
     assert long.parameters["no_hardest_because"] == "the hardest is not asked there"
-
-
-def test_set__whose_comparison_does_not_hold_everywhere_gives_bounds(driven: Evaluation) -> None:
-    register_measure_set("hardest", Hardest())
-    table = summarise(driven.take(driven.outcome("coast").first_impact_harm > 0.0))
-    hard = table[0].more["hardest"]["hard_share"]
-    assert hard is not None and hard < 1.0 and table[0].bounds == {"share_of_hardest"}
-    assert table[0]["hardest_decrease"] is None and "≥ " in table.markdown()
 
 
 def test_set__that_is_none_or_has_a_name_twice_is_refused(core_alone: None) -> None:

@@ -4,7 +4,6 @@ import csv
 import io
 import json
 import math
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ from ethbrake_marl.evaluation.own_measures import load_measures
 from ethbrake_marl.evaluation.per_world import read_harms, write_per_world
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise
-from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.game.harm import HARM_COUNTS, injury_probability
 from ethbrake_marl.game.objectives import STANDARD, parse_objective, scored
 from ethbrake_marl.scenario.catalogue import load_scenario
@@ -95,36 +93,7 @@ def test_summarise__without_full_braking_there_is_no_decrease_and_of_one_world_n
     assert {told[name] for name in names} == {None} and told["collision_rate_interval"] is not None
 
 
-def test_parameters__say_under_which_conditions(evaluation: Evaluation) -> None:
-    expected = {
-        "scenario": "paper-random",
-        "seed": 7,
-        "count": 200,
-        "controlled_vehicle": "vehicle_2",
-        "scripts": {"vehicle_1": "full_brake", "vehicle_3": "full_brake"},
-        "restitution": 0.1,
-        "latency_s": [0.0, 0.5, 0.8],
-        "mass_t": [4.5, 5.5, 5.9],
-    }
-    found = evaluation.conditions
-    assert {name: found[name] for name in expected} == expected
-    assert found["gaps_m"][1] == [evaluation.worlds.gaps_m[:, 1].min(), evaluation.worlds.gaps_m[:, 1].max()]
-    line = found.line.replace("\u00a0", " ")
-    assert line.startswith("paper-random: 200 worlds, seed 7; d = ")
-    assert line.endswith("τ = (0, 0.5, 0.8) s; m = (4.5, 5.5, 5.9) t; e = 0.1")
-
-
 # ---------------------------------------------------------------- its tables
-
-
-def test_table__of_another_line_has_no_limit_and_none_of_the_papers_rows_and_names_are_text(pair: Scenario) -> None:
-    agents = {"full_brake": BRAKE["full_brake"], "ppo@[red]x|b": eb.make_agent("coast")}
-    rows = summarise(evaluate(pair.sample(2, 0), agents, scenario=pair))
-    text = printed(rows, 160)
-    assert text.count("Decrease") == 2 and "≥" not in text and "ppo@[red]x|b" in text
-    assert "x\\|b ‡ |" in rows.markdown()  # a bar makes no column
-    assert "paper" not in text.lower() and "paper" not in rows.markdown().lower()
-    assert "Agent" in SummaryTable().markdown() and "Agent" in printed(SummaryTable())
 
 
 def test_html__escapes_hostile_names_and_shows_every_agent_with_its_figures() -> None:
@@ -178,29 +147,7 @@ def test_exploits__mark_the_row_and_are_one_sentence_below(shoved_m: float, movi
         assert sentence in " ".join(str(rows).split()) and sentence in rows.markdown()
 
 
-def test_exploits__where_shoving_is_not_measured_nobody_is_marked_for_it(pair: Scenario) -> None:
-    rows = summarise(evaluate(pair.sample(3, 0), {"coast": eb.make_agent("coast")}, scenario=pair, aftermath=False))
-    assert rows[0]["vehicle_1_shoved_m"] is None and "shoves" not in rows[0].exploits.names
-
-
 # ---------------------------------------------------------------- harm that was not seen
-
-
-def test_summarise__where_nobody_collided_a_bound_of_the_share_is_said_and_none_of_the_harm() -> None:
-    scenario = load_scenario("paper-random").replace(gaps_m=300.0)
-    rows = summarise(evaluate(scenario.sample(500, 7), {**BRAKE, "coast": eb.make_agent("coast")}, scenario=scenario))
-    assert [row.collisions > 0 for row in rows] == [False, False]
-    for row in rows:
-        assert row.first_impact_harm == row.total_harm == Estimate(0.0, None)
-        assert row.collision_rate.interval[1] >= 1.0 - 0.025 ** (1.0 / 500)  # Clopper-Pearson's
-    assert rows.markdown().count("| 0.00 | 0.00 |") == 2
-    sentence = "No impact in 500 worlds: full_brake, coast. With 95 % confidence, at most 0.76 % of all such worlds"
-    assert sentence in rows.markdown() and sentence in " ".join(str(rows).split())
-    first = summarise(evaluate(load_scenario("paper-random").sample(500, 7), BRAKE, scenario="paper-random"))
-    assert "No impact" not in first.markdown()
-
-
-# ---------------------------------------------------------------- the paper's rows
 
 
 # ---------------------------------------------------------------- who knows what
@@ -266,15 +213,6 @@ def check_unmarked(text: str) -> None:
 
 
 # ---------------------------------------------------------------- other objectives
-
-
-def test_rescored__breaks_no_name_in_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    line, name = load_scenario("cooperation-4-five"), "policy@runs/a-long-name-of-a-run-of-mine"
-    shown = str(evaluate(line.sample(20, 7), {name: eb.make_agent("full_brake")}, scenario=line).rescore(["own"]))
-    assert shown.count(f"{name}   own ") == 2
-    words = shown.replace("\n", " ").split()
-    assert "(injury:CURVE:" in words and {"Agent", "Objective", name} <= {*words}
 
 
 def test_rescored__one_impact_by_hand_in_json_and_as_columns(pair: Scenario, tmp_path: Path) -> None:
@@ -370,27 +308,6 @@ def test_frame__has_a_row_per_agent_and_world(evaluation: Evaluation) -> None:
     assert harms.to_dict() == pytest.approx({name: o.total_harm.sum() for name, o in evaluation.outcomes.items()})
 
 
-def test_frame__of_a_table_has_a_row_per_agent_with_the_ends_of_each_interval(evaluation: Evaluation) -> None:
-    pytest.importorskip("pandas")
-    rows = summarise(evaluation)
-    frame = rows.to_pandas()
-    assert frame.index.name == "agent" and list(frame.index) == [row.agent for row in rows]
-    assert {str(kind) for kind in frame.dtypes} == {"float64"} and len(frame.columns) == 3 * len(rows[0].estimates)
-    for row in rows:
-        got = frame.loc[row.agent, ["total_harm", "total_harm_low", "total_harm_high"]]
-        assert got.tolist() == [row.total_harm.value, *row.total_harm.ends]
-    alone = summarise(evaluation.take(np.array([0])), baseline="nobody").to_pandas()  # no interval, no comparison
-    missing = alone.columns[alone.loc["full_brake"].isna()]
-    assert {"total_harm_low", "total_harm_high", "harm_decrease_total"} <= {*missing} and "total_harm" not in missing
-
-
-def test_frame__names_the_extra_without_pandas(evaluation: Evaluation, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    for make in (evaluation.to_pandas, summarise(evaluation).to_pandas):
-        with pytest.raises(eb.MissingExtra, match=r"the package pandas.*pip install 'ethbrake-marl\[data\]'"):
-            make()
-
-
 def test_parquet_and_columns__hold_what_the_csv_file_holds(evaluation: Evaluation, tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     rows, columns = per_world(evaluation, tmp_path), evaluation.arrays()
@@ -403,15 +320,6 @@ def test_parquet_and_columns__hold_what_the_csv_file_holds(evaluation: Evaluatio
     for name, kind in (("agent", str), ("total_harm", float), ("world", int)):
         assert columns[name].tolist() == [kind(row[name]) for row in rows] == table.column(name).to_pylist()
     assert np.isnan(columns["predicted_harm"][:400]).all()
-
-
-# ---------------------------------------------------------------- regret
-
-
-# ---------------------------------------------------------------- lists with and without limits
-
-
-# ---------------------------------------------------------------- proven and best known harm beside each other
 
 
 def injuries(agent, scenario):

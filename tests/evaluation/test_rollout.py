@@ -1,7 +1,5 @@
 """Rollouts and whole lists, by hand and chunk by chunk: the same bits for any chunks and processes."""
 
-import csv
-import json
 import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -17,24 +15,19 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl import registry
 from ethbrake_marl.agents.protocol import policy_sha256
-from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput, PhysicsError, Unfamiliar
 from ethbrake_marl.evaluation import chunks, identity
 from ethbrake_marl.evaluation.aftermath import ShovedFront
 from ethbrake_marl.evaluation.chunks import Lineup, evaluate_held, summarise_tally, tally_list
 from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.exploits import FAR_M
 from ethbrake_marl.evaluation.identity import scenario_sha256, worlds_sha256
 from ethbrake_marl.evaluation.lineup import make_agents, make_lineup
 from ethbrake_marl.evaluation.measure_sets import measures
 from ethbrake_marl.evaluation.outcome import Outcome
-from ethbrake_marl.evaluation.per_world import write_per_world
-from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.evaluation.tally import Tally
 from ethbrake_marl.files import python_file
-from ethbrake_marl.game.measures import REPORTED
 from ethbrake_marl.physics.paper_map import advance_sampled
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario.catalogue import load_scenario
@@ -83,18 +76,6 @@ def test_evaluate__full_braking_on_the_papers_random_test() -> None:
     assert outcome.first_impact_harm.mean() == pytest.approx(24.0, abs=1.2)
     assert outcome.total_harm.mean() == pytest.approx(25.6, abs=1.3)
     assert outcome.at_rest.all()
-
-
-def test_evaluate__takes_names_for_scenario_agents_and_worlds_and_prints_a_table() -> None:
-    named = evaluate(scenario="paper-random", agents="full_brake,coast", episodes=4)
-    agents = {name: eb.make_agent(name) for name in ("full_brake", "coast")}
-    given = evaluate(PAPER.sample(4, seed=7), agents, scenario=PAPER, seed=7)
-    for name in agents:
-        assert_same(named.outcome(name), given.outcome(name))
-    assert summarise(named) == summarise(given)
-    table = summarise(named)
-    assert repr(table) == "SummaryTable(full_brake, coast)" and str(table).startswith("Agent,")
-    assert f"{table[0].total_harm.value:.2f}" in str(table)
 
 
 @pytest.mark.parametrize(("chunk", "n"), [(1, 12), (7, 200), (199, 200)])
@@ -168,18 +149,6 @@ def test_aftermath__by_hand(scenario: Scenario, spec: str, shoved: float | None,
     assert (told["vehicle_1_shoved_m"] is None, told["sampled_harm"] is None) == (shoved is None, sampled is None)
 
 
-def test_shoved__is_where_the_record_ends(evaluation: Evaluation, gap_agent: Any) -> None:
-    shoved = evaluation.outcome("gap").shoved_m
-    for k in (int(np.argmax(shoved)), 0):
-        record = record_episode(evaluation.worlds.take([k]), gap_agent, scenario=evaluation.scenario)
-        own = evaluation.worlds.speeds_mps[k, 0] ** 2 / 12.0
-        assert shoved[k] == pytest.approx(record.positions_m[-1, 0] - own, abs=1e-10)
-    assert shoved.max() > 1.0
-    told = summarise(evaluation)[2].to_json()
-    assert told["vehicle_1_shoved_m"] == pytest.approx(shoved.mean())
-    assert told["vehicle_1_shoved_far_rate"] == (shoved > FAR_M).mean() > 0.0
-
-
 @pytest.mark.parametrize(("spec", "command"), [("full_brake", -7.0), ("constant:4.5", -4.5)])
 def test_sampled__of_a_constant_is_that_of_the_map(evaluation: Evaluation, spec: str, command: float) -> None:
     commands = -evaluation.worlds.vehicles.braking_capacity_mps2
@@ -245,29 +214,6 @@ def check_left_out(found: Evaluation) -> None:
         evaluate(planted_list(PAPER, 2, SEED, [0, 1]), BRAKE, scenario=PAPER)  # nothing is left
 
 
-def test_left_out__the_other_worlds_are_as_if_those_were_not_in_the_list(found: Evaluation) -> None:
-    well = PAPER.sample(N, SEED).worlds.take(without(N, [3, 7, 10]))
-    alone = evaluate(well, {"e_v2x_bm": eb.make_agent("e_v2x_bm")}, scenario=PAPER)
-    assert_same(found.outcome("e_v2x_bm"), alone.outcome("e_v2x_bm"))
-    assert alone.left_out == () and alone.complete() is alone
-
-
-def test_left_out__table_json_and_csv_say_how_many_and_which(found: Evaluation, tmp_path: Path) -> None:
-    rows = summarise(found)
-    for row in (row.to_json() for row in rows):
-        assert (row["episodes"], [left["world"] for left in row["left_out"]]) == (9, [3, 7, 10])
-        assert row["left_out"][2] == {"world": 10, "seed": SEED, "agent": "failing", "reason": "planted"}
-    text = rows.markdown()
-    assert "LEFT OUT for every agent: 3 of 12 worlds" in text and "world 10 of seed 7 (failing: planted)" in text
-    assert "LEFT OUT" not in summarise(replace(found, left_out=())).markdown()
-    write_per_world(tmp_path / "worlds.csv", found)
-    lines = list(csv.DictReader((tmp_path / "worlds.csv").read_text("utf-8").splitlines()))
-    lost = [line for line in lines if line["ended"].startswith("left out")]
-    assert len(lines) == 5 * N and [line["world"] for line in lost] == 5 * ["3", "7", "10"]
-    assert lost[2]["ended"] == "left out: failing: planted"
-    assert [line for line in lines if line["total_harm"] == ""] == lost
-
-
 # ---------------------------------------------------------------- by which hashes a result is recognised
 
 SAMPLE = PAPER.sample(60, seed=7)
@@ -312,20 +258,6 @@ def test_results__say_worlds_scenario_policy_and_versions() -> None:
 
 
 ABOUT = {"worlds_sha256": worlds_sha256(SAMPLE.worlds, SAMPLE.index), "scenario_sha256": scenario_sha256(PAPER)}
-
-
-@pytest.mark.parametrize(
-    ("kind", "command"), [("evaluate", "evaluate --agents full_brake"), ("shield", "shield --agents full_brake")]
-)
-def test_every_results_file__says_its_kind_worlds_scenario_and_versions(
-    kind: str, command: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert run_command([*command.split(), "--episodes", "60", "--json"]) == 0
-    content = json.loads(capsys.readouterr().out)
-    for part in content if isinstance(content, list) else [content]:
-        assert part["kind"] == kind and {key: part[key] for key in ABOUT} == ABOUT
-        assert part["versions"]["numpy"] == version("numpy")
 
 
 @pytest.mark.parametrize(
@@ -420,29 +352,6 @@ def test_figures__are_the_same_bits_from_two_processes(paper_random: Scenario) -
     assert one == two
 
 
-@pytest.mark.slow
-def test_worker__of_other_measures_is_refused(paper_random: Scenario, monkeypatch) -> None:
-    monkeypatch.setitem(REPORTED, "here_alone", REPORTED.get("here_alone"))
-    lineup = Lineup.of(("full_brake",), paper_random)
-    with pytest.raises(InvalidInput, match="a worker process has other policies, measures or package"):
-        tally_list(lineup, 6_000, 5, jobs=2)
-
-
-def test_lineup__tells_the_measures_of_its_time_in_every_process(paper_random: Scenario, monkeypatch) -> None:
-    before = Lineup.of(("full_brake",), paper_random)
-    after = Lineup.of(("full_brake",), paper_random, measures=("injury",)), Lineup.of(("full_brake",), paper_random)
-
-    def told(lineup: Lineup) -> set[str]:
-        return set(evaluate_held(lineup, paper_random.sample(3, 7), 7).outcome("full_brake").metrics)
-
-    found = [told(each) for each in (before, *after)]
-    assert found[0] == set() and found[1] == found[2] and "injury_lr4s" in found[1]
-    REPORTED.clear()  # as in a worker, which makes them in whatever order
-    for lineup, expected in zip((before, *after, before), (*found, found[0]), strict=True):
-        monkeypatch.setattr(chunks, "_BUILT", {})
-        assert told(lineup) == expected
-
-
 @pytest.mark.parametrize("other", ["", "version", "package", "file"])
 def test_worker__needs_the_packages_and_files_of_the_process_that_asks_and_no_others(
     paper_random: Scenario, failing: Callable[[float], str], tmp_path: Path, monkeypatch, other: str
@@ -485,68 +394,17 @@ def failing(tmp_path: Path) -> Callable[[float], str]:
     return lambda below: f"{file}:make:{below}"
 
 
-def test_worlds_that_fail__are_left_out_for_all_agents(failing, paper_random: Scenario, monkeypatch) -> None:
-    lineup, sample = Lineup.of(("full_brake", failing(5.01)), paper_random), paper_random.sample(1_100, 7)
-    whole = tally_list(lineup, 1_100, 7)
-    monkeypatch.setattr(chunks, "CHUNK", 100)
-    assert replace(tally_list(lineup, 1_100, 7), worlds_hash=whole.worlds_hash) == whole
-    bad = sample.worlds.gaps_m[:, 0] < 5.01
-    assert whole.worlds == 1_100 - bad.sum() < 1_100
-    told = [(left.world, left.seed, left.reason) for left in whole.left_out]
-    assert told == [(k, 7, "planted") for k in np.flatnonzero(bad).tolist()]
-    row, braking = summarise_tally(lineup, whole, 7)[0], make_lineup(["full_brake"], paper_random)
-    without = evaluate(sample.worlds.take(np.flatnonzero(~bad)), braking, scenario=paper_random)
-    assert row.first_impact_harm == summarise(without)[0].first_impact_harm and len(row.left_out) == bad.sum()
-    held = evaluate(sample, lineup.make(), scenario=paper_random, seed=7, chunk=10)  # of some chunks nothing is left
-    assert held.left_out == whole.left_out and np.array_equal(held.index, np.flatnonzero(~bad))
-
-
-def test_a_list_of_which_every_world_fails__is_refused(failing, paper_random: Scenario) -> None:
-    lineup = Lineup.of((failing(1e9),), paper_random)
-    with pytest.raises(PhysicsError, match="planted"):
-        summarise_tally(lineup, tally_list(lineup, 1_500, 7), 7)
-    with pytest.raises(PhysicsError, match="planted"):
-        evaluate_held(lineup, paper_random.sample(150, 7), 7)
-
-
 # ---------------------------------------------------------------- recorded before search and loop were made faster
 
 
 def test_aftermath__has_no_meaning_where_vehicle_1_reacts_or_another_than_vehicle_2_is_driven() -> None:
-    reacts = PUSH.replace(roles={"vehicle_1": "planner", "vehicle_2": "learner"})
+    reacts = PUSH.replace(roles={"vehicle_1": "ppo", "vehicle_2": "learner"})
     assert ShovedFront.of(reacts.sample(1, 7).worlds, Task(reacts, (1,))) is None
     third = PAPER.with_learners(["vehicle_3"])
     assert evaluate(third.sample(1, 7), BRAKE, scenario=third).outcome("full_brake").sampled_harm is None
 
 
 COAST = eb.make_agent("coast")
-
-
-def test_objects__say_what_they_are_in_a_line() -> None:
-    sample = PAPER.sample(20, 7)
-    agents = {"full_brake": eb.make_agent("full_brake"), "coast": COAST}
-    evaluation = eb.evaluate(sample, agents, scenario=PAPER, seed=7)
-    outcome, worlds = evaluation.outcome("full_brake"), evaluation.worlds
-    record = eb.record_episode(worlds.take([0]), agents["full_brake"], scenario=PAPER)
-    lines = "20 worlds of 3 vehicles: gaps 5.11 to 9.85 m, speeds 18.1 to 22 m/s, at 0 s"
-    for value, text in (
-        (evaluation, "Evaluation('paper-random', 20 worlds of seed 7, vehicle_2 controlled by 'full_brake', 'coast')"),
-        (sample, f"Sample(Worlds({lines}), numbers 0 to 19, 0 rejected)"),
-        (worlds.vehicles, "Vehicles(20 worlds of 3, masses 4.5 to 5.9 t)"),
-        (worlds.take(np.zeros(0, int)), "Worlds(0 worlds of 3 vehicles: gaps none m, speeds none m/s, at none s)"),
-        (outcome, "Outcome(20 worlds, 16 collided, harm 22.90 first-impact, 23.74 total)"),
-        (outcome.ledger, "Ledger(20 worlds, 41 impacts)"),
-    ):
-        assert str(value) == text
-    assert str(record).startswith("EpisodeRecord('full_brake' on 'paper-random', 196 samples to 3.9 s, 2 impacts, harm")
-    assert str(eb.load_shipped("ppo")).startswith("Policy('ppo', 27 observations, 19,660,800 steps on 'paper-random'")
-
-
-def test_objects__are_short_whatever_they_hold() -> None:
-    many = {f"{k}{200 * 'x'}": COAST for k in range(30)}
-    much = eb.evaluate(PAPER.sample(1, 7).worlds, many, scenario=PAPER, aftermath=False)
-    assert repr(much).startswith("Evaluation(") and len(repr(much)) <= 400
-    assert len(repr(PAPER.sample(5000, 7))) <= 400
 
 
 def test_commands__are_applied_unrounded() -> None:

@@ -1,14 +1,10 @@
 """What each mode of the shield makes of an agent: the same figures as driving it by hand, in one table."""
 
-from dataclasses import replace
-
-import numpy as np
 import pytest
 
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.evaluation.shield_modes import ShieldModes, compare_modes
 from ethbrake_marl.evaluation.statistics import mean, paired_difference
 from ethbrake_marl.scenario.catalogue import load_scenario
@@ -16,7 +12,6 @@ from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.shields.drivers import ShieldedDriver
 from ethbrake_marl.shields.evidence import review
 from ethbrake_marl.shields.paper_hybrid import HybridAgent
-from tests.failing_worlds import plant, without
 
 PAPER, PAIR = (load_scenario(name) for name in ("paper-random", "cooperation-3-pair"))
 WORLDS = PAPER.sample(60, 3).worlds
@@ -50,22 +45,6 @@ def test_rows__do_not_depend_on_the_size_of_a_chunk(rows: ShieldModes, monkeypat
     done: list[tuple[str, int]] = []
     assert compare_modes(BRAKE, WORLDS, Task(PAPER, (1,)), on_progress=lambda *a: done.append(a)) == rows
     assert done == [("full_brake", 25), ("full_brake", 50), ("full_brake", 60)]
-
-
-def test_worlds_that_cannot_be_advanced__are_out_for_all_modes_and_named(
-    rows: ShieldModes, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("ethbrake_marl.evaluation.shield_modes.CHUNK", 8)
-    task, agents = Task(PAPER, (1,)), {"full_brake": make_agent("full_brake"), "coast": make_agent("coast")}
-    worlds = WORLDS.take(np.arange(12))
-    found = compare_modes(agents, plant(worlds, [2, 9]), task)
-    assert [[world for world, _ in row.left_out] for row in found] == [[2, 9]] * 8
-    assert "contact was missed" in found[0].left_out[0][1]
-    expected = compare_modes(agents, worlds.take(without(12, [2, 9])), task)
-    assert [replace(row, left_out=()) for row in found] == expected
-    assert found[0].to_json()["left_out"][1]["world"] == 9 and rows[0].to_json()["left_out"] == []
-    with pytest.raises(PhysicsError):
-        compare_modes(agents, plant(worlds, list(range(12))), task)
 
 
 @pytest.fixture(scope="module")
@@ -113,15 +92,6 @@ def test_team__an_intervention_is_simulated_again_without_it_for_the_whole_team(
     first = {world: k for k, world in reversed(list(enumerate(found.world.tolist())))}
     assert all(found.unshielded_harm[k] == alone[world] for world, k in first.items()) and len(first) > 20
     assert found.share("needed") > 0.5
-
-
-def test_team__tables_show_bound_and_shares(team_rows: ShieldModes) -> None:
-    modes, shares = team_rows.sheets()
-    assert (len(modes.rows), len(shares.rows)) == (10, 6 * 3)
-    assert modes.headings[2:4] == ["minus no shield", "bound"]
-    told = team_rows[1].to_json()
-    assert told["vehicles"][0] == {**told["vehicles"][0], "vehicle": "vehicle_1", "replaced": None}
-    assert "coast, step-cap, vehicle_3" in shares.markdown()
 
 
 def test_team__what_is_behind_a_shield_is_compared_without_it() -> None:

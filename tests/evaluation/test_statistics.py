@@ -1,6 +1,5 @@
 """Statistics: exact sums, intervals of rates, means and ratios, and what is told over seeds."""
 
-import csv
 import math
 from fractions import Fraction
 
@@ -9,8 +8,6 @@ import pytest
 from hypothesis import given, strategies as st
 from scipy.stats import bootstrap
 
-import ethbrake_marl as eb
-from ethbrake_marl.evaluation import seeds as seeds_module
 from ethbrake_marl.evaluation.seeds import interquartile_mean, mean_over_seeds, share_over_seeds
 from ethbrake_marl.evaluation.statistics import (
     Moments,
@@ -22,7 +19,6 @@ from ethbrake_marl.evaluation.statistics import (
     root,
 )
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.training.experiment import results_csv
 
 # ---------------------------------------------------------------- exact sums
 
@@ -126,13 +122,6 @@ def test_mean_over_seeds__worlds_of_both_sides_are_drawn_together() -> None:
     half = 1.96 * difference.std(ddof=1) / 500**0.5
     expected = (difference.mean() - half, difference.mean() + half)
     assert mean_over_seeds(worlds + difference, worlds).interval == pytest.approx(expected, abs=0.02)
-
-
-@pytest.mark.parametrize("resamples", [1, 2, 3])
-def test_resamples__are_as_many_as_asked_for(resamples: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(seeds_module, "_AT_ONCE", 4)  # two at a time
-    sides = (np.arange(4.0).reshape(2, 2),)
-    assert seeds_module._resample_means(sides, np.arange(2), resamples, 0).shape == (resamples, 1)
 
 
 def rounded(estimate):
@@ -253,17 +242,3 @@ def test_difference_and_ratio__are_those_of_the_pairs() -> None:
     residual = x - x.mean() / y.mean() * y
     expected = residual.std(ddof=1) / math.sqrt(500) / y.mean()
     assert Moments.of(x).ratio_error(Moments.of(y), both) == pytest.approx(expected, rel=1e-10)
-
-
-def test_intervals__are_two_columns_in_the_table_of_results() -> None:
-    paper = eb.load_scenario("paper-random")
-    agents = {name: eb.make_agent(name) for name in ("coast", "e_v2x_bm")}
-    rows = eb.summarise(eb.evaluate(paper.sample(3, 1), agents, scenario=paper))
-    lines = list(csv.DictReader(results_csv(rows).splitlines()))
-    for line, row in zip(lines, rows, strict=True):
-        assert [float(line[f"first_impact_harm_{end}"]) for end in ("low", "high")] == [*row.first_impact_harm.interval]
-        assert "parameters" not in line
-        assert line["harm_decrease_first"] == ""  # full braking was not evaluated
-    assert [line["agent"] for line in lines] == ["coast", "e_v2x_bm"]
-    assert lines[0]["predicted_harm"] == ""
-    assert float(lines[1]["predicted_harm"]) == rows[1]["predicted_harm"].value

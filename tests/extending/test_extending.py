@@ -7,21 +7,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet
 import pytest
 import yaml
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.statistics import mean, rate
-from ethbrake_marl.game.measures import BUILT_IN, REPORTED
+from ethbrake_marl.evaluation.statistics import mean
+from ethbrake_marl.game.measures import REPORTED
 from ethbrake_marl.game.objectives import standard_objectives
 from ethbrake_marl.game.observations import observe
 from ethbrake_marl.game.step_outcome import StepOutcome
 from ethbrake_marl.scenario.catalogue import new_scenario_text
 from ethbrake_marl.scenario.channel import CHANNELS
-from ethbrake_marl.scenario.schema import scenario_json_schema
 from tests.contract.interfaces import BARE
 from tests.learning.tiny import TINY_PPO
 
@@ -180,14 +178,6 @@ def test_term__per_learner_leaves_the_others_out() -> None:
     assert list(env.step({"vehicle_2": [0.0], "vehicle_3": [0.0]})[1].values()) == [0.0, 1.0, 2.0]
 
 
-@pytest.mark.parametrize("name", BUILT_IN)
-def test_term__built_in_is_counted_as_soon_as_it_has_a_weight(name: str) -> None:
-    env = eb.parallel_env(scenario=PAPER, reward={"harm": 0.0, name: 1.0})
-    env.reset(seed=1)
-    *_, infos = env.step({"vehicle_2": [0.0]})
-    assert [told for told in infos["vehicle_2"] if told.startswith("reward_")] == [f"reward_{name}"]
-
-
 @pytest.mark.parametrize(
     ("later", "message"),
     [
@@ -212,21 +202,6 @@ def test_term__that_is_wrong_is_named_and_the_step_is_not_made(later: Any, messa
     with pytest.raises(InvalidInput, match=message):
         engine.step(np.zeros((3, 1)))
     assert engine.packed.state.tobytes() == before.tobytes()
-
-
-def test_term__counts_in_running_worlds_only() -> None:
-    moving = changed(lambda step: np.where(step.speeds_mps.max(axis=1) > 0.0, 1.0, np.nan))
-    eb.register_measure("mine", moving, by="step")
-    engine = engine_of(1, reward={"harm": 1.0, "mine": 2.0})
-    with pytest.raises(InvalidInput, match="at step"):
-        for _ in range(90):
-            engine.step(-np.ones((1, 1)))
-    eb.register_measure("calm", one, by="step")
-    ending = engine_of(2, reward={"harm": 1.0, "mine": 0.0, "calm": 1.0})
-    while not ending.ended.all():
-        last = ending.step(-np.ones((2, 1)))
-    again = ending.step(-np.ones((2, 1))).further["calm"]
-    assert (last.further["calm"][~last.ended] == 0.0).all() and not again.any()
 
 
 # ---------------------------------------------------------------- presets, objectives, schemas
@@ -258,17 +233,6 @@ def test_objective__is_paid_by_hand_and_stands_in_tables() -> None:
         total += engine.step(np.zeros((3, 1))).reward
     harm = engine.ledger.vehicle_harm("first")
     assert harm[:, 0].all() and total == near(-(harm[:, :1] + harm))
-
-
-@pytest.mark.usefixtures("mine")
-def test_schemas__know_what_is_registered() -> None:
-    schema = scenario_json_schema()
-    parts, weights = schema["properties"], eb.TrainingRecipe.json_schema()["$defs"]["RewardParams"]["properties"]
-    assert {"urgency", "front_1.load", "own"} <= set(parts["observation"]["anyOf"][0]["items"]["anyOf"][0]["enum"])
-    assert "rural" in json.dumps([parts["v2x"], schema.get("$defs", {})])
-    assert "front-first" in json.dumps(parts["objective"])
-    assert weights["calm"]["type"] == "number" and weights["harm"]["minimum"] == 0
-    assert "observation" not in PAPER.model_dump() and "observation" not in TINY_PPO.model_dump()
 
 
 # ---------------------------------------------------------------- measures
@@ -325,35 +289,6 @@ def measured_by_vehicle() -> Any:
     struck = changed(lambda each: np.isin(np.arange(each.worlds.n), each.rows.world[each.rows.pair == 1]))
     eb.register_measure("rear_ended", struck, unit="1")  # whether Vehicle 3 hit Vehicle 2
     return evaluated()
-
-
-def test_measure__one_function_and_it_stands_in_every_output(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    rear = changed(lambda episodes: episodes.largest_speed_change_mps[:, 2])
-    eb.register_measure("change_of_rear", rear, unit="m/s")
-    eb.register_measure("hit_hard", changed(lambda episodes: rear(episodes) > 2.0), unit="1")
-    names, agents = ("metric_change_of_rear", "metric_hit_hard"), ["--agents", "full_brake,coast", "--seed", "7"]
-
-    def told(*words: str) -> str:
-        assert run_command(["evaluate", *agents, *words]) == 0
-        return capsys.readouterr().out
-
-    text = " ".join(told("--episodes", "40", "--output", "out", "--per-world", "csv").split())
-    rows = list(csv.DictReader(Path("out/worlds.csv").read_text().splitlines()))[:40]
-    change, hit = (np.array([float(row[name]) for row in rows]) for name in names)
-    assert np.ptp(change) > 1.0 and set(hit) == {0.0, 1.0} and ((change > 2.0) == hit).all()
-    assert "change_of_rear (m/s)" in text and f"{change.mean():.2f}" in text and "hit_hard (1)" in text
-    results = json.loads(Path("out/results.json").read_text())[0]
-    expected = [mean(change), rate(int(hit.sum()), 40)]
-    assert [(results[n], tuple(results[f"{n}_interval"])) for n in names] == [(e.value, e.interval) for e in expected]
-    told("--episodes", "40", "--output", "other", "--per-world", "parquet")
-    table = pyarrow.parquet.read_table("other/worlds.parquet")
-    assert [table[name].to_pylist()[:40] for name in names] == [change.tolist(), hit.tolist()]
-    monkeypatch.setattr("ethbrake_marl.evaluation.identity.HELD", 30)
-    flat = json.loads(told("--episodes", "40", "--json"))
-    assert [flat[0][name] for name in names] == [results[name] for name in names]
 
 
 # ---------------------------------------------------------------- folders, the command line, the page

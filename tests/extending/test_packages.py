@@ -195,23 +195,6 @@ def test_entry_point__that_fails_is_named_and_breaks_nothing_else(
     assert capsys.readouterr().err.count("left out: ") == 2
 
 
-@pytest.mark.parametrize(
-    ("given", "told"),
-    [
-        ("hills:no_such_thing", "cannot be imported: AttributeError"),
-        ("hills:worst", "must be a plain name|has no|needs|gave|unknown"),
-        ("hills:WORST", "unexpected keyword argument 'unit'"),
-    ],
-)
-def test_entry_point__that_does_not_fit_is_named(install: Install, given: str, told: str) -> None:
-    install("hills", HILLS, agents={"gentle": given}, features={"gentle": given})
-    with pytest.raises(InvalidInput, match=f"feature 'gentle', {given} of the installed package hills"):
-        eb.choose_observation(["gentle"])
-    if "unit" in told:
-        with pytest.raises(InvalidInput, match=told):
-            eb.make_agent("gentle")
-
-
 def test_entry_point__without_a_part_of_its_name_is_named(install: Install) -> None:
     more = "\nSEVERAL = {'other': make_gentle}\n"
     install("hills", HILLS + more, agents={"hills": "hills:SEVERAL", "itself": "circle:make"})
@@ -283,9 +266,3 @@ def test_scenario_recipe_and_bundle__run_no_file_that_they_name(tmp_path: Path) 
         with pytest.raises(InvalidInput):
             use()
     assert [path.name for path in tmp_path.iterdir()] == ["evil.py"]
-
-
-def test_metadata__that_is_missing_is_what_an_unknown_name_tells(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ethbrake_marl.registry.points", lambda group: {})
-    with pytest.raises(UnknownName, match="unknown agent 'mine': no entry points of the package ethbrake-marl are"):
-        eb.make_agent("mine")

@@ -8,12 +8,8 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.errors import InvalidInput, UncertifiedStep
 from ethbrake_marl.evaluation.own_measures import load_measures
-from ethbrake_marl.game.measures import MEASURES, REPORTED, SETTINGS
-from ethbrake_marl.game.rewards import RewardParams, reward_params
 from tests.contract.interfaces import CRASH
 from tests.learning.tiny import TINY_PPO
 from tests.refused import refused
@@ -92,14 +88,6 @@ def test_impacts__before_the_first_decision_are_known_but_not_paid() -> None:
     assert (engine.state.impacts.largest_speed_change_mps > 0.0).all()  # a later impact must exceed these
 
 
-def test_rewards__without_such_a_measure_keep_no_impacts() -> None:
-    for reward in ("harm", "paper", {"harm": 1.0, "injury_lr4s": 0.0}):
-        engine = eb.make_engine(CRASH, 2, reward=reward)
-        engine.step(np.zeros((2, 1)))
-        assert engine.state.impacts is None
-        assert not [name for name in engine.snapshot() if "impacts" in name]
-
-
 def mixed(seed: int = 3, n: int = 6) -> Engine:
     """A vehicle that may be hit several times, scripts that decide on the way, and impacts in each reward."""
     roles = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "e_v2x_bm:pairwise"}
@@ -153,67 +141,6 @@ def test_renewed_rows__are_paid_as_rows_of_their_own() -> None:
         running.renew(np.flatnonzero(step.ended))
 
 
-def test_branch__goes_on_with_the_impacts_of_its_rows() -> None:
-    running, rng = mixed(), np.random.default_rng(0)
-    moments = [running.moment()]
-    for _ in range(40):
-        running.step(rng.uniform(-1.0, 1.0, (6, 1)))
-        moments.append(running.moment())
-    joined = type(moments[0]).join([moments[40].take(np.array([5, 5, 2])), moments[0].take(np.array([1]))])
-    branch, brake = running.branch(joined), -np.ones((4, 1))
-    twin, start = running.branch(moments[40]), running.branch(moments[0])
-    for _ in range(60):
-        paid = branch.step(brake).reward
-        assert paid[:3].tobytes() == twin.step(-np.ones((6, 1))).reward[[5, 5, 2]].tobytes()
-        assert paid[3].tobytes() == start.step(-np.ones((6, 1))).reward[1].tobytes()
-    alert, first = running.first_moments(3)
-    assert first.impacts.worlds.gaps_m.tolist() == alert.gaps_m.tolist()
-
-
-class Refusing:
-    """A guard that lets everything pass, or rolls the step back."""
-
-    def __init__(self) -> None:
-        self.refuses = False
-
-    def begin(self, memory: Any, alert: eb.Worlds, rows: Any) -> Any:
-        return "begun"
-
-    def decide(self, running: Engine, memory: Any, proposed: Any) -> Any:
-        from ethbrake_marl.engine.engine import Ruling
-
-        return Ruling(proposed, proposed, np.zeros(len(proposed), bool), np.ones(len(proposed), bool), None, memory)
-
-    def check(self, ruling: Any, after: Engine) -> Any:
-        if self.refuses:
-            raise UncertifiedStep("refused")
-        return ruling.memory
-
-    def report(self, running: Engine) -> dict[str, Any]:
-        return {}
-
-
-def test_step__that_a_guard_rolls_back_leaves_the_impacts_as_they_were() -> None:
-    world, guard = CRASH.sample(1, 7).worlds, Refusing()
-    guarded, free = (eb.make_engine(CRASH, 1, reward=INJURY) for _ in range(2))
-    guarded.protect(guard)
-    for one in (guarded, free):
-        one.reset(worlds=world)
-    while not free.ended.all():
-        before, guard.refuses = guarded.state, True
-        with pytest.raises(UncertifiedStep):
-            guarded.step(np.zeros((1, 1)))
-        assert guarded.state is before
-        guard.refuses = False
-        assert guarded.step(np.zeros((1, 1))).reward.tobytes() == free.step(np.zeros((1, 1))).reward.tobytes()
-
-
-def test_place__is_refused_as_nobody_knows_the_impacts() -> None:
-    engine = eb.make_engine(CRASH, 1, reward=INJURY)
-    with refused("place: the reward needs all impacts of an episode (for injury_lr4s)"):
-        engine.place(engine.worlds)
-
-
 # ---------------------------------------------------------------- by step
 
 
@@ -245,22 +172,6 @@ def test_built_in__in_parts_and_behind_a_shield_and_with_an_objective() -> None:
         assert all((parts.outcome(name).metrics[n] == column).all() for n, column in metrics.items())
         borne = whole.outcome(name).ledger.vehicle_harm("first")
         assert -np.stack([metrics[f"harm_{i}"] for i in (1, 2, 3)], axis=1) == pytest.approx(borne)
-
-
-def test_evaluation__shows_what_is_asked_for_alone(capsys: pytest.CaptureFixture[str]) -> None:
-    eb.make_engine(PAPER, 1, reward=INJURY | {"risk": 1.0})  # a reward asks for no column
-    assert "injury_lr4s" in MEASURES.loaded and not REPORTED
-    assert measured(PAPER, "full_brake", PAPER.sample(3, 7).worlds) == {}
-    words = ["evaluate", "--episodes", "5", "--agents", "full_brake", "--json", "--set", "measures=jerk,injury_gidas"]
-    assert run_command(words) == 0
-    (row,) = json.loads(capsys.readouterr().out)
-    shown = [name for name in row if name.startswith("metric_") and not name.endswith("_interval")]
-    assert shown == ["metric_jerk_1", "metric_jerk_2", "metric_jerk_3", "metric_injury_gidas"]
-    assert row["metric_jerk_2"] < 0.0 and row["metrics"]["jerk_2"] == "jerk, vehicle 2 (m2/s6)"
-
-
-def test_names_of_settings__are_taken() -> None:
-    assert {*BUILT_IN, *SETTINGS} == {*RewardParams.model_fields}
 
 
 # ---------------------------------------------------------------- of the user's own
@@ -307,68 +218,6 @@ def test_step_measure__of_the_learners_is_zero_for_the_others() -> None:
     found = measured(PAPER, "full_brake", worlds)
     assert 0.5 * found["gentle_2"] == pytest.approx(total[:, 1]) and total[:, 1].all()
     assert not (found["gentle_1"].any() or found["gentle_3"].any() or total[:, [0, 2]].any())
-
-
-def test_truth__of_impacts_is_a_rate_and_a_reward() -> None:
-    def struck(episodes: Any) -> Any:
-        """Whether Vehicle 3 hit Vehicle 2."""
-        return np.isin(np.arange(episodes.worlds.n), episodes.rows.world[episodes.rows.pair == 1])
-
-    eb.register_measure("struck", struck, unit="1")
-    worlds = PAPER.sample(20, 7).worlds
-    found = measured(PAPER, "full_brake", worlds)["struck"]
-    assert found.dtype == np.bool_ and 0 < found.sum() < 20
-    total, _ = episode(PAPER, {"harm": 0.0, "struck": -3.0}, -1.0, worlds)
-    assert total[:, 1].tolist() == (-3.0 * found).tolist()
-
-
-def test_weights__of_measures_may_be_negative_and_of_built_in_terms_not() -> None:
-    params = reward_params(INJURY)
-    assert params.terms == {"injury_lr4s": -1.0} and params.counted == ("injury_lr4s",)
-    assert RewardParams(**params.model_dump()) == params
-    with refused("reward: jerk = -1.0: must be greater than or equal to 0"):
-        reward_params({"harm": 1.0, "jerk": -1.0})
-    with refused("reward: injury_lr4s = nan: must be a finite number"):
-        reward_params({"harm": 1.0, "injury_lr4s": float("nan")})
-    with refused(
-        "reward: harm: must be given together with injury_lr4s, because its default weight is 1; write harm: 1"
-    ):
-        reward_params({"injury_lr4s": -1.0})
-    with refused("measure 'injury' is an entry point that defines parts with other names"):
-        reward_params({"harm": 1.0, "injury": -1.0})
-
-
-@pytest.mark.parametrize(
-    ("later", "message"),
-    [
-        (
-            lambda n: np.zeros((n, 4)),
-            "its function returned float64 of shape (1, 4); must return numbers of shape (1,), one per world or (1, 2)",
-        ),
-        (lambda n: np.full(n, np.nan), "is nan in world 0 at step"),
-        (lambda n: np.zeros((n, 2)), "its function returned a number per vehicle, but a number per world when it was"),
-        (lambda n: 1 / 0, "its function fails: ZeroDivisionError"),
-    ],
-    ids=["shape", "nan", "form", "error"],
-)
-def test_measure_of_impacts__that_is_wrong_is_named_and_the_step_is_not_made(later: Any, message: str) -> None:
-    def mine(episodes: Any) -> Any:
-        """For a test."""
-        return later(1) if episodes.worlds.n == 1 and len(episodes.rows.world) else np.zeros(episodes.worlds.n)
-
-    eb.register_measure("mine", mine)
-    engine = eb.make_engine(CRASH, 1, reward={"harm": 1.0, "mine": 2.0})
-    with pytest.raises(InvalidInput) as error:
-        while True:
-            before = engine.state.motion.copy(), engine.state.impacts
-            engine.step(np.zeros((1, 1)))
-    assert str(error.value).startswith("measure 'mine'") and message in str(error.value)
-    assert engine.state.motion.tobytes() == before[0].tobytes() and engine.state.impacts is before[1]
-
-
-def test_by__is_step_or_impacts() -> None:
-    with refused("measure 'mine': by = 'episode': must be 'step' or 'impacts'"):
-        eb.register_measure("mine", lambda given: given, by="episode")  # type: ignore[arg-type]
 
 
 # ---------------------------------------------------------------- training

@@ -1,6 +1,9 @@
 """What all extensions together give: every agent that is registered stands in a list of the tests."""
 
 import runpy
+from typing import Any
+
+import pytest
 
 from ethbrake_marl.agents.registry import agent_entries, agent_names
 from ethbrake_marl.cli.app import run_command
@@ -10,7 +13,7 @@ from tests.agents import test_knowledge as core, test_roles as roles
 from tests.cli.test_scenarios import SCRIPTS
 from tests.extensions.certified import test_knowledge as certified, test_roles as certified_roles
 from tests.extensions.field import test_knowledge as field, test_roles as field_roles
-from tests.extensions.learners import test_knowledge as learners, test_roles as learners_roles
+from tests.extensions.learners import test_branches, test_knowledge as learners, test_roles as learners_roles
 from tests.extensions.search import test_knowledge as search, test_roles as search_roles
 from tests.fixtures.commands import Command, told_json
 
@@ -22,7 +25,7 @@ def test_knowledge__every_agent_of_the_registry_stands_in_a_table():
 
 
 def test_agent_names__are_those_that_ship_and_are_listed(capsys):
-    scripts = ("coast", "constant", "e_v2x_bm", "full_brake", "planner")
+    scripts = ("coast", "constant", "e_v2x_bm", "full_brake")
     learned = ("ppo", "sac", "vine", "rollout-classification", "policy", "universal", "team")
     names = (*scripts, *FIELD, "best_harm", *learned)
     names = (*names, *(name for name in shipped_policies() if name not in names))
@@ -47,4 +50,9 @@ def test_validate__tells_which_agents_and_shields_refuse_a_script(ethbrake: Comm
         return set(told_json(ethbrake("scenario", "validate", path, "--json"))["refused_by"])
 
     assert {"e_v2x_bm", "best_harm", "+step"} < refused_by("own_calm")
-    assert refused_by("own_fixed") == {"+robust:interior", "early_impacts: reject"}
+    assert refused_by("own_fixed") == {"early_impacts: reject"}
+
+
+@pytest.mark.parametrize("options", [{"estimated": True}, {"mode": "robust", "uncertainty": "gaps_m=0.5"}], ids=str)
+def test_branch__of_a_shield_that_does_not_know_the_line_is_what_the_engine_does(options: dict[str, Any]) -> None:
+    test_branches.test_branch__of_what_remembers_is_what_the_engine_does(test_branches.shielded, options)

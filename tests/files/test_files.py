@@ -11,6 +11,7 @@ from hypothesis import given, settings, strategies as st
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.plain import read_plain
+from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.files.yaml import DEPTH_LIMIT, SIZE_LIMIT, flow_text, parse_yaml
 from ethbrake_marl.scenario.schema import Scenario
@@ -145,3 +146,16 @@ PLAIN = st.recursive(
 @given(PLAIN)
 def test_flow_text__reads_back_equal(value):
     assert parse_yaml(flow_text({"value": value})).content == {"value": value}
+
+
+# ---------------------------------------------------------------- Python files
+
+
+def test_python_file__is_run_once_and_refused_once_it_has_changed(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text("made = []")
+    load_from_file(str(file), "made").append(1)
+    assert load_from_file(str(file), "made") == [1]
+    file.write_text("made = [2]")
+    with pytest.raises(InvalidInput, match="has changed since it was loaded"):
+        load_from_file(str(file), "made")

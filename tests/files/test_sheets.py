@@ -41,24 +41,6 @@ In m²/s².
     )
 
 
-def test_sheet__in_a_narrow_terminal_leaves_out_wide_columns(capsys: pytest.CaptureFixture[str]) -> None:
-    assert (
-        printed(SHEET, 60, capsys)
-        == """Two agents
-Agent                  Hit
-──────────────────────────
-a|b                 25.0 %
-knows           12.5, 50.0
-
-paper, <test>
-Non-E                    –
-last
-
-In m²/s².
-"""
-    )
-
-
 def test_sheet__moves_no_cursor_and_reads_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
     marked = Sheet("[b]t[/b]", ["[red]x"], [("\x1b[31m[/]",)])
     assert printed(marked, 80, capsys) == "[b]t[/b]\n[red]x\n───────────\n\\x1b[31m[/]\n"
@@ -120,14 +102,6 @@ def test_sheet__as_data() -> None:
     assert csv_text([{"x": 1}], ["x", "y"]) == "x,y\n1,\n"
     with pytest.raises(ValueError, match="dict contains fields not in fieldnames: 'z'"):
         csv_text([{"z": 1}], ["x"])
-
-
-def test_sheet__of_some_columns() -> None:
-    some = Sheet("", ["Agent", "Knows", RATE], [("coast", None, 0.5), "section", ("other", None, None)])
-    assert some.filled() == [0, 2]
-    assert some.only([2, 0]).headings == ["Collisions", "Agent"]
-    first, section, last = some.only([2]).shown()
-    assert (first[0].value, section, last[0].value) == ("50.0 %", "section", "–")
 
 
 def test_estimates__in_words_and_as_data() -> None:

@@ -8,12 +8,8 @@ from typing import Any
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.driving import script_agents
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, UnknownName
-from ethbrake_marl.evaluation.trial import load_runnable
-from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.files.store import hold_lock
-from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.training.ppo import Ppo
 from ethbrake_marl.training.recipe import load_recipe, register_algorithm
 from ethbrake_marl.training.recipes import PpoRecipe
@@ -23,7 +19,6 @@ from ethbrake_marl.training.settings import read_settings
 from ethbrake_marl.training.team import load_team
 from ethbrake_marl.training.training import Training, check_same_training
 from tests.fixtures.policies import make_policy
-from tests.learning.test_algorithms import A2C, recipe_file
 from tests.learning.tiny import TINY_PPO
 from tests.refused import refused
 
@@ -58,42 +53,11 @@ def recipe(old: str, new: str) -> Any:
 
 
 RECIPES: dict[str, Callable[[], object]] = {
-    "mine.yaml, line 4: n_env: unknown key; did you mean n_envs?": lambda: recipe("n_envs: 16", "n_env: 16"),
-    "mine.yaml, line 15: network.policies: unknown key; did you mean policy?": lambda: recipe(
-        "policy: [8]", "policies: [8]"
-    ),
-    "mine.yaml, line 16: reward.speed: unknown key": lambda: recipe("harm: 1", "speed: 1"),
-    "mine.yaml: gamma: missing; this key is required; the shipped recipe ppo has all keys": lambda: recipe(
-        "gamma: 0.99\n", ""
-    ),
-    "mine.yaml, line 9: gamma = .nan: must be a finite number": lambda: recipe("gamma: 0.99", "gamma: .nan"),
-    "mine.yaml, line 9: gamma = 1.5: must be less than or equal to 1": lambda: recipe("gamma: 0.99", "gamma: 1.5"),
-    "mine.yaml, line 2: algorithm = trpo: must be one of ": lambda: recipe("algorithm: ppo", "algorithm: trpo"),
-    "must be a whole number, written without a decimal point": lambda: recipe("total_steps: 4096", "total_steps: 1e6"),
-    "mine.yaml, line 8: learning_rate.start = -0.001: must be greater than 0": lambda: recipe(
-        "start: 1e-3", "start: -1e-3"
-    ),
-    "mine.yaml, line 6: batch_size = 100: must divide n_envs x n_steps = 512": lambda: recipe(
-        "batch_size: 128", "batch_size: 100"
-    ),
-    "n_envs x n_steps = 3200000000 decisions per update": lambda: recipe("n_envs: 16", "n_envs: 100000000"),
-    "mine.yaml, line 15: network.policy = []: must not be empty": lambda: recipe("policy: [8]", "policy: []"),
-    "mine.yaml, line 16: reward = {harm: 0}: all weights of the reward except shaping are 0": lambda: recipe(
-        "harm: 1", "harm: 0"
-    ),
-    "mine.yaml, line 17: evaluation.every_updates = 0: must be greater than or equal to 1": lambda: recipe(
-        "every_updates: 2", "every_updates: 0"
-    ),
-    "must be 1 to 64 lower case letters, digits, - and _, beginning": lambda: recipe("name: mine", "name: ../mine"),
-    "mine.yaml, line 8: learning_rate = 0.0003: must be a mapping": lambda: recipe("{start: 1e-3, end: 1e-4}", "3e-4"),
-    "mine.yaml, line 2, column 10: not valid YAML: expected ',' or ']'": lambda: recipe("name: mine", "name: [mine"),
-    "mine.yaml: must be a mapping of keys to values": lambda: recipe(GOOD, "- ppo\n"),
-    "recipe 'ppo': seed = -1: must be greater than or equal to 0": lambda: load_recipe("ppo").replace(seed=-1),
-    "recipe 'sac': ent_coef = automatic: must be 'auto' or a finite number of at least 0": lambda: load_recipe(
-        "sac"
-    ).replace(ent_coef="automatic"),
-    "recipe 'sac': buffer_size = 63: must be at least n_envs = 128": lambda: load_recipe("sac").replace(buffer_size=63),
-    "recipe 'sac': n_steps: unknown key; did you mean total_steps?": lambda: load_recipe("sac").replace(n_steps=3),
+    "mine.yaml, line 4: n_env: unknown key;": lambda: recipe("n_envs: 16", "n_env: 16"),
+    "mine.yaml, line 2: algorithm = trpo:": lambda: recipe("algorithm: ppo", "algorithm: trpo"),
+    "mine.yaml, line 15: network.policy =": lambda: recipe("policy: [8]", "policy: []"),
+    "mine.yaml: must be a mapping of keys to": lambda: recipe(GOOD, "- ppo\n"),
+    "recipe 'sac': n_steps: unknown key; did": lambda: load_recipe("sac").replace(n_steps=3),
 }
 
 
@@ -105,21 +69,9 @@ def test_recipe__is_refused(message: str) -> None:
 
 
 SETTINGS: dict[str, Callable[[], object]] = {
-    "--set 'gamma': must be KEY=VALUE or KEY.KEY=VALUE": lambda: read_settings(["gamma"], [PPO]),
-    "--set 'a..b=1': must be KEY=VALUE or KEY.KEY=VALUE": lambda: read_settings(["a..b=1"], [PPO]),
-    "--set gamma, line 1, column 2: not valid YAML: expected the node content, but found '<stream end>'": lambda: (
-        read_settings(["gamma=["], [PPO])
-    ),
-    "--set gamma: this setting is given twice; give it once": lambda: read_settings(["gamma=0.9", "gamma=0.8"], [PPO]),
-    "recipe 'ppo': reward.terminl: unknown key; did you mean terminal?": lambda: read_settings(
-        ["reward.terminl=1"], [PPO]
-    ).change(PPO),
-    "--set gamma.x: 'x' cannot be set inside 0.995, which is neither a mapping nor a": lambda: read_settings(
-        ["gamma.x=1"], [PPO]
-    ).change(PPO),
-    "scenario 'paper-random': restitution = 3: must be finite and in [0, 1]": lambda: load_runnable(
-        "paper-random", read_settings(["restitution=3"]).scenario
-    ),
+    "--set 'gamma': must be KEY=VALUE or": lambda: read_settings(["gamma"], [PPO]),
+    "--set gamma: this setting is given": lambda: read_settings(["gamma=0.9", "gamma=0.8"], [PPO]),
+    "--set gamma.x: 'x' cannot be set inside": lambda: read_settings(["gamma.x=1"], [PPO]).change(PPO),
 }
 
 
@@ -130,43 +82,15 @@ def test_setting__is_refused(message: str) -> None:
 
 
 TRAININGS: dict[str, Callable[[], object]] = {
-    "algorithm 'My algorithm': the name must have 1 to 64 characters (a-z, 0-9, - and _), and must not begin": lambda: (
-        register_algorithm("My algorithm", PpoRecipe, Ppo)
+    "algorithm 'My algorithm': the name must": lambda: register_algorithm("My algorithm", PpoRecipe, Ppo),
+    "algorithm 'new': recipe = <class": lambda: register_algorithm("new", dict, Ppo),
+    "scenario 'cooperation-3-pair' has no": lambda: train(TINY_PPO, PAIR.with_learners([]), Path("run")),
+    "scheme single: scenario": lambda: train(TINY_PPO, PAIR, Path("run"), scheme="single"),
+    "recipe 'ppo': turns = 5 for each of 2": lambda: train(
+        TINY_PPO, PAIR, Path("run"), scheme="independent", steps=2048, turns=5
     ),
-    "algorithm 'new': recipe = <class 'dict'>: must be a class with the method network_spec, a subclass": lambda: (
-        register_algorithm("new", dict, Ppo)
-    ),
-    "algorithm 'new': algorithm = <built-in function len>: must be a class with the method build, or the": lambda: (
-        register_algorithm("new", PpoRecipe, len)
-    ),
-    "recipe 'ppo': total_steps = 0: must be greater than or equal to 1": lambda: train(
-        "ppo", "paper-random", Path("run"), steps=0
-    ),
-    "scenario 'cooperation-3-pair' has no learner; give at least one vehicle the role learner": lambda: train(
-        TINY_PPO, PAIR.with_learners([]), Path("run")
-    ),
-    "scheme single: scenario 'cooperation-3-pair' has 2 learners; use the scheme shared, independent or": lambda: train(
-        TINY_PPO, PAIR, Path("run"), scheme="single"
-    ),
-    "scheme independent: needs several learners, but scenario 'paper-random' has one; use the scheme": lambda: train(
-        TINY_PPO, PAPER, Path("run"), scheme="independent"
-    ),
-    "scheme independent: the algorithm sac of recipe 'sac' does not support this scheme; use a recipe for": lambda: (
-        train("sac", PAIR, Path("run"), scheme="independent")
-    ),
-    "scheme centralised: the algorithm sac of recipe 'sac' does not support this scheme; use a recipe for": lambda: (
-        train("sac", PAIR, Path("run"), scheme="centralised")
-    ),
-    "recipe 'ppo': turns = 3: is allowed with scheme: independent only; remove the key turns": lambda: train(
-        TINY_PPO, PAIR, Path("run"), scheme="shared", turns=3
-    ),
-    "recipe 'ppo': turns = 5 for each of 2 learners needs at least 10 updates, but total_steps = 2048 gives": lambda: (
-        train(TINY_PPO, PAIR, Path("run"), scheme="independent", steps=2048, turns=5)
-    ),
-    ".: is not the folder of a run; name the folder of a run, for instance": lambda: resume(Path()),
-    ".: has no file team.json, so it is not the folder of a team; give the folder of a training run": lambda: load_team(
-        Path(), PAIR
-    ),
+    ".: is not the folder of a run; name the": lambda: resume(Path()),
+    ".: has no file team.json, so it is not": lambda: load_team(Path(), PAIR),
 }
 
 
@@ -178,14 +102,8 @@ def test_training__is_refused(message: str) -> None:
 
 
 NAMES: dict[str, Callable[[], object]] = {
-    "unknown recipe 'ppo-papre'; did you mean 'ppo-paper'?": lambda: load_recipe("ppo-papre"),
-    "unknown recipe 'pppo'; did you mean 'ppo'?": lambda: train("pppo", PAPER, Path("run")),
-    "unknown scenario 'paper-randm'; did you mean 'paper-random'?": lambda: train("ppo", "paper-randm", Path("run")),
-    "unknown setting 'gama'; did you mean 'gamma'?": lambda: read_settings(["gama=0.9"], [PPO]),
-    "unknown setting 'mass_t'": lambda: read_settings(["recipe.mass_t=1"], [PPO]),
-    "unknown setting 'mass'; did you mean 'mass_t'?": lambda: load_runnable(
-        "paper-random", read_settings(["mass=3"]).scenario
-    ),
+    "unknown recipe 'ppo-papre'; did you": lambda: load_recipe("ppo-papre"),
+    "unknown setting 'gama'; did you mean": lambda: read_settings(["gama=0.9"], [PPO]),
 }
 
 
@@ -199,26 +117,6 @@ def test_name__is_unknown(message: str) -> None:
 def test_algorithm__has_a_name_of_its_own() -> None:
     with refused("algorithm 'ppo' is registered already; give another name", AlreadyExists):
         register_algorithm("ppo", PpoRecipe, Ppo)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"n_stepz": 3}, "mine.yaml, line 22: n_stepz: unknown key; did you mean n_steps?"),
-        ({"n_steps": 2.5}, "mine.yaml, line 21: n_steps = 2.5: must be a whole number"),
-        ({"algorithm": "a3c"}, "mine.yaml, line 1: algorithm = a3c: must be one of "),
-        (
-            {"scheme": "independent"},
-            "scheme independent: the algorithm a2c of recipe 'mine' does not support this scheme; use a",
-        ),
-    ],
-    ids=lambda value: str(value)[:30],
-)
-def test_recipe_of_a_user__is_checked_as_ours(changes: dict[str, Any], message: str, empty_folder: Path) -> None:
-    Path("my_algorithm.py").write_text(A2C)
-    load_from_file("my_algorithm.py", "A2C")
-    with refused(message):
-        train(recipe_file(Path(), **changes), PAIR, Path("run"))
 
 
 # ---------------------------------------------------------------- the folder of a run
@@ -248,14 +146,8 @@ def test_folder__that_is_there_is_not_replaced_unasked(run: RunDirectory) -> Non
     ("training", "other"),
     [
         (lambda: Training.of(TINY_PPO.replace(seed=1), PAPER), "recipe seed"),
-        (lambda: Training.of(TINY_PPO.replace(reward={"harm": 2.0}), PAPER), "recipe reward"),
-        (
-            lambda: Training.of(TINY_PPO, PAPER.replace(v2x="clear", early_impacts="keep")),
-            "scenario early_impacts, scenario v2x",
-        ),
         (lambda: Training.of(TINY_PPO, PAPER.replace(name="mine")), "scenario name"),
     ],
-    ids=["seed", "reward", "channel", "name"],
 )
 def test_folder__of_another_training_is_refused(
     training: Callable[[], Training], other: str, run: RunDirectory
@@ -267,19 +159,10 @@ def test_folder__of_another_training_is_refused(
 @pytest.mark.parametrize(
     ("status", "message"),
     [
-        (
-            '{"format": "ethbrake',
-            "run/run.json: is damaged: Unterminated string starting at: line 1 column 12 (char 11)",
-        ),
-        ("[]", "run/run.json: is damaged: the content is not a JSON object"),
-        ("{}", "run/run.json: format = None: must be ethbrake-run"),
-        (
-            '{"format": "ethbrake-run", "status": "done"}',
-            "run/run.json: status = 'done': must be running or finished or",
-        ),
-        (None, "run/run.json: is missing, but the run cannot be used without it"),
+        ('{"format": "ethbrake', "run/run.json: is damaged: Unterminated"),
+        ("[]", "run/run.json: is damaged: the content"),
+        ("{}", "run/run.json: format = None: must be"),
     ],
-    ids=["cut off", "a list", "empty", "other status", "missing"],
 )
 def test_status_of_a_run__is_refused(status: str | None, message: str, run: RunDirectory) -> None:
     run.status.unlink() if status is None else run.status.write_text(status)
@@ -289,15 +172,7 @@ def test_status_of_a_run__is_refused(status: str | None, message: str, run: RunD
 
 @pytest.mark.parametrize(
     ("changes", "message"),
-    [
-        ({"recipe": None}, "run/config.json: does not describe a training run, because the key 'recipe' is missing"),
-        ({"recipe": 3}, "run/config.json: recipe: must be a mapping of keys to values, for instance algorithm: ppo"),
-        ({"scenario": {"name": "paper-random"}}, "run/config.json: scenario: braking_capacity_mps2: missing"),
-        (
-            {"library": "benchmarl"},
-            "run: this run was trained with the library benchmarl, so it cannot be resumed; train again",
-        ),
-    ],
+    [({"recipe": None}, "run/config.json: does not describe a"), ({"recipe": 3}, "run/config.json: recipe: must be a")],
     ids=lambda value: str(value)[:30],
 )
 def test_configuration_of_a_run__is_refused(changes: dict[str, Any], message: str, run: RunDirectory) -> None:
@@ -305,18 +180,6 @@ def test_configuration_of_a_run__is_refused(changes: dict[str, Any], message: st
     run.config.write_text(json.dumps({key: value for key, value in told.items() if value is not None}))
     with refused(message):
         resume(run.path)
-
-
-def test_training_that_has_finished__says_how_to_measure_it(run: RunDirectory) -> None:
-    run.write_status("finished")
-    with refused("evaluate its policy with: ethbrake evaluate --scenario paper-random --agents full_brake,ppo@"):
-        resume(run.path)
-    team = RunDirectory(Path("team")).create(Training.of(TINY_PPO, PAIR, scheme="independent").config())
-    team.write_status("finished")
-    with refused(
-        "evaluate its policy with: ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,team@team"
-    ):
-        resume(team.path)
 
 
 def test_lock__is_held_by_one_and_is_a_file(empty_folder: Path) -> None:
@@ -336,14 +199,6 @@ def test_lock__is_held_by_one_and_is_a_file(empty_folder: Path) -> None:
 
 # ---------------------------------------------------------------- a policy for each vehicle
 
-FOUR = PAIR.replace(
-    vehicles=4,
-    braking_capacity_mps2=6,
-    driving_capacity_mps2=6,
-    mass_t=5,
-    latency_s=0.5,
-    roles={"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "learner", "vehicle_4": "full_brake"},
-)
 TEAM = Path("team/team.json")
 DRIVERS = {name: f"policy/{name}" for name in ("vehicle_2", "vehicle_3")}
 
@@ -357,43 +212,12 @@ def team(empty_folder: Path) -> RunDirectory:
     return RunDirectory(TEAM.parent)
 
 
-def test_team__drives_a_line_of_its_length_and_vehicles_of_its_own(team: RunDirectory) -> None:
-    assert sorted(load_team(team.path, PAIR).drivers) == [1, 2]
-    assert sorted(load_team(team.path, PAIR.with_learners(["vehicle_3"])).drivers) == [2]
-    with refused(
-        "team: this team is for a line of 3 vehicles, but scenario 'cooperation-3-pair' has 4 vehicles; choose a"
-    ):
-        load_team(team.path, FOUR)
-    with refused("team: this team can drive vehicle_2, vehicle_3, but scenario 'cooperation-3-pair' has no learner"):
-        load_team(team.path, PAIR.with_learners([]))
-    with refused(
-        "team: has one policy for each learner; give the path of one of them, for instance team/policy/vehicle_2"
-    ):
-        load_policy(TEAM.parent)
-    with refused(
-        "team: this team can drive vehicle_2, vehicle_3, but scenario 'cooperation-3-pair' has learner vehicle_1"
-    ):
-        script_agents(PAIR.replace(roles={"vehicle_1": "team@team", "vehicle_2": "team@team", "vehicle_3": "learner"}))
-
-
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("{", "team/team.json: is not JSON (Expecting property name enclosed in double quotes"),
-        ("[]", "team/team.json: must be a mapping of keys to values"),
-        ("{}", "team/team.json: scheme: missing"),
-        (
-            {"drivers": {**DRIVERS, "vehicle_3": "../policy"}},
-            'drivers.vehicle_3 = "../policy": must be policy/vehicle_3',
-        ),
-        (
-            {"drivers": {**DRIVERS, "vehicle_3": "policy/vehicle_2"}},
-            "must be policy/vehicle_3 under scheme independent",
-        ),
-        ({"scheme": "shared"}, "drivers.vehicle_2 = policy/vehicle_2: must be policy under scheme shared"),
-        ({"vehicles": 2}, "drivers = vehicle_3: must be one of vehicle_1 to vehicle_2"),
-        ({"scheme": "together"}, "scheme = together: must be single, shared, independent or centralised"),
-        ({"drivers": {"vehicle_3": "policy/vehicle_3"}}, "must be two vehicles or more under scheme independent"),
+        ("{", "team/team.json: is not JSON (Expecting"),
+        ("[]", "team/team.json: must be a mapping of"),
+        ({"drivers": {"vehicle_3": "policy/vehicle_3"}}, "must be two vehicles or more under"),
     ],
     ids=lambda value: str(value)[:40],
 )
@@ -401,13 +225,4 @@ def test_file_of_a_team__is_refused(content: Any, message: str, team: RunDirecto
     good = {"scheme": "independent", "vehicles": 3, "drivers": DRIVERS}
     TEAM.write_text(content if isinstance(content, str) else json.dumps(good | content))
     with refused(message, CorruptBundle):
-        load_team(team.path, PAIR)
-
-
-def test_policy_of_a_team__is_whole(team: RunDirectory) -> None:
-    Path("team/policy/vehicle_3/weights.safetensors").unlink()
-    with refused("team/policy/vehicle_3/weights.safetensors: is missing", CorruptBundle):
-        load_team(team.path, PAIR)
-    Path("team/policy/vehicle_2/manifest.json").write_text("{}")
-    with refused("team/policy/vehicle_2/manifest.json: algorithm: is missing", CorruptBundle):
         load_team(team.path, PAIR)

@@ -16,30 +16,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-import safetensors.numpy
 import torch
-from stable_baselines3.common.logger import Logger
 
 import ethbrake_marl as eb
-from ethbrake_marl.cli.train import run_folder
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.files.store import new_folder, write_file
-from ethbrake_marl.game.objectives import objective_harm, objectives_of
 from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.policies.layers import dense
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.teams import Trained, read_trained
 from ethbrake_marl.progress import Progress
 from ethbrake_marl.scenario.catalogue import shipped_folder
-from ethbrake_marl.training import (
-    model_state,
-    models,
-    progress as progress_module,
-    random_state,
-    session as train_module,
-)
+from ethbrake_marl.training import session as train_module
 from ethbrake_marl.training.checkpoint import ARRAYS, NUMBERS, TrainingState, read_checkpoint, write_checkpoint
 from ethbrake_marl.training.finite import TrainingDiverged
 from ethbrake_marl.training.logs import open_logs
@@ -208,14 +198,6 @@ def test_train__numbers_that_are_not_finite_stop_it_and_keep_the_last_good_polic
         assert all(np.isfinite(tensor).all() for tensor in policy.tensors.values())
 
 
-def test_train__an_error_of_the_callers_function_is_passed_on(tmp_path: Path) -> None:
-    with pytest.raises(ZeroDivisionError):
-        train(TINY, SCENARIO, tmp_path / "run", measure=lambda training: lambda policy: {"harm": 1 / 0})
-    status = status_of(tmp_path / "run")
-    assert (status["status"], status["reason"]) == ("failed", "ZeroDivisionError: division by zero")
-    assert load_policy(tmp_path / "run").manifest.steps == 0
-
-
 OF_THEIR_KIND = ("cooperation-ppo", "ppo-paper", "sac-paper")  # others differ in numbers
 CORE_RECIPES = [name for name, file in TrainingRecipe.shipped().items() if file.parent == shipped_folder("train")]
 
@@ -238,56 +220,6 @@ def check_one_update(recipe: TrainingRecipe, run: Path) -> None:
     assert load_policy(run).manifest.algorithm == recipe.algorithm
 
 
-@pytest.mark.parametrize("terminal", [False, True])
-def test_train__shows_its_progress_on_stderr_and_on_a_terminal_in_one_line(
-    terminal: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("sys.stderr.isatty", lambda: terminal)
-    train_module.train(TINY, "paper-random", tmp_path / "shown")
-    out, err = capsys.readouterr()
-    lines = err.splitlines()
-    assert out == "" and (err.count("\n") == 1) == (err.count("\r") > 1) == terminal and err.endswith("\n")
-    assert lines[0].startswith("training: 0 of 384, first-impact harm ") or terminal
-    assert "training: 384 of 384, first-impact harm " in lines[-1] and len(lines) == len(set(lines))
-
-
-def test_train__keeps_and_tells_what_the_learners_objectives_make_of_the_harm(tmp_path: Path) -> None:
-    objectives = ["total", "own", "weighted:0.001,0.001,1"]
-    scenario = SCENARIO.with_learners(["vehicle_2", "vehicle_3"]).replace(objective=objectives)
-    recipe = TINY.replace(total_steps=6 * 128, evaluation={"every_updates": 1, "worlds": 10, "seed": 7})
-    said: list[str] = []
-    result = train_module.train(recipe, scenario, tmp_path / "run", on_progress=lambda shown: said.append(shown.harm))
-    assert said[0] == f"objective by first impacts (own, {objectives[2]}) {result.evaluations[0]['objective']:.2f}"
-    rows = [row for row in RunDirectory(tmp_path / "run").rows() if row["eval/objective"]]
-    best = min(result.evaluations, key=lambda each: each["objective"])
-    kept = load_policy(tmp_path / "run" / "policy")
-    assert len(rows) == len(result.evaluations) > 3 and kept.manifest.steps == best["steps"]
-    found = evaluate(scenario.sample(10, 7).worlds, {"kept": eb.LearnedAgent(kept)}, scenario=scenario)
-    harm = objective_harm(found.outcome("kept").ledger, "first", objectives_of(objectives, 3)).mean(axis=0)
-    told = [best["objective_vehicle_2"], best["objective_vehicle_3"]]
-    assert told == pytest.approx(harm[1:]) and best["objective"] == sum(told) / 2
-    assert "objective" not in train_module.train(TINY, SCENARIO, tmp_path / "plain", steps=1).evaluations[0]
-
-
-@pytest.mark.parametrize(
-    ("objective", "words"),
-    [
-        ("total", ""),
-        ("own", "first-impact harm (own)"),
-        ("maximin", "first-impact harm (maximin)"),
-        ("injury:lr4s", "first-impact injuries in 1,000 lines (injury:lr4s)"),
-        ("mass-weighted", "objective by first impacts (mass-weighted)"),
-        ("weighted:1,4,1", "objective by first impacts (weighted:1,4,1)"),
-        ("social:45", "objective by first impacts (social:45)"),
-    ],
-)
-def test_progress__calls_harm_only_what_somebody_bears(objective: str, words: str) -> None:
-    assert progress_module.objective_in_words(Training.of(TINY, SCENARIO.replace(objective=objective))) == words
-    total = TINY.replace(reward=TINY.reward.model_copy(update={"harm_count": "total"}))
-    said = progress_module.objective_in_words(Training.of(total, SCENARIO.replace(objective=objective)))
-    assert said == words.replace("by first", "by all").replace("first-impact", "total")
-
-
 def test_course__the_best_is_judged_by_the_count_of_the_reward_and_comes_back_from_json(policy) -> None:
     other = policy.__class__(policy.manifest.model_copy(update={"steps": 5}), policy.tensors)
     course, again = Course("total"), Course("total")
@@ -299,18 +231,6 @@ def test_course__the_best_is_judged_by_the_count_of_the_reward_and_comes_back_fr
     assert (again.evaluations, again.best_harm) == (course.evaluations, 10.0)
     assert again.wall_s >= course.wall_before_s
     assert course.evaluations[1] == {"steps": 0, "updates": 0, **second, "episode_return": -3.0}
-
-
-def test_course__the_best_goes_by_the_objective_where_one_is_told(policy) -> None:
-    by_steps = [policy.__class__(policy.manifest.model_copy(update={"steps": k}), policy.tensors) for k in range(4)]
-    course, adversary = Course(), Course()
-    for each, line, objective in zip(by_steps, (24.0, 30.0, 20.0, 18.0), (8.0, 0.1, 6.0, 7.0), strict=True):
-        metrics = {"first_impact_harm": line, "objective": objective, "objective_vehicle_2": objective}
-        course.add_evaluation(each, metrics, None)
-    assert course.chosen is by_steps[1] and course.best_harm == 0.1
-    for k, each in enumerate([*by_steps, *by_steps]):
-        adversary.add_evaluation(each, {"first_impact_harm": 20.0 + k, "objective": -20.0 - k}, float(k))
-    assert adversary.best_harm == -27.0
 
 
 def test_write_file__replaces_in_one_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -647,38 +567,6 @@ def test_resume__one_process_at_a_time(run: Path, monkeypatch: pytest.MonkeyPatc
     assert asked == [5]
 
 
-@pytest.mark.parametrize("change", ["lost", "forged", "versions", "steps", "progress", "arrays", "ended"])
-def test_resume__a_checkpoint_that_does_not_fit_is_refused_and_stays(
-    run: Path, change: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    place = newest(run)
-    if change == "lost":  # as of another version
-        (place / NUMBERS).unlink()
-        told = rf"{place}: the checkpoint has no numbers.json, so another version of this package wrote it"
-    elif change == "arrays":
-        monkeypatch.setattr(safetensors.numpy, "save_file", lambda arrays, file: file.write_bytes(b"forged"))
-        state = read_checkpoint(place)
-        shutil.rmtree(place)
-        write_checkpoint(place, state)
-        told = rf"{place / ARRAYS}: .*; delete this checkpoint to resume from an earlier one"
-    elif change != "forged":
-        state = read_checkpoint(place)
-        shutil.rmtree(place)
-        write_checkpoint(place, TrainingState({**state.numbers, change: ["forged"]}, state.arrays))
-        told = rf"{place / NUMBERS}: {change} = \['forged'\]: must be of type"
-    else:  # whole, and not of this model
-        state = read_checkpoint(place)
-        shutil.rmtree(place)
-        arrays = state.arrays | {"policy.log_std": np.zeros(2, np.float32)}
-        write_checkpoint(place, TrainingState(state.numbers, arrays))
-        told = rf"the checkpoint of step {state.steps} does not fit this training run: .*log_std.*; delete this"
-    before = {file: file.read_bytes() for file in run.rglob("*") if file.is_file() and file.name != "run.lock"}
-    with pytest.raises(EthBrakeError, match=told) as error:
-        resume(run, measure=measure)
-    del before[run / "team.json"]  # is written anew
-    assert "\n" not in str(error.value) and all(file.read_bytes() == data for file, data in before.items())
-
-
 FORGED_ARRAYS = {
     "optimizer.policy.0.exp_avg": np.zeros((2, 1), np.float32),
     "optimizer.policy.0.step": np.zeros(3, np.float32),
@@ -712,33 +600,6 @@ def test_resume__a_forged_checkpoint_is_refused_in_one_line(run: Path, name: str
     assert "\n" not in str(error.value)
 
 
-def test_restore__a_forged_replay_memory_of_sac_is_refused() -> None:
-    training = Training.of(*TRAININGS["sac"])
-    algorithm, environment = training.recipe.make_algorithm(), models.make_environment(training)
-    with random_state.own_random_state():
-        model = models.make_model(algorithm, training, environment)
-        model._last_obs, model._last_episode_starts = environment.reset(), np.ones(environment.num_envs)
-        model.set_logger(Logger(None, []))
-        numbers, arrays = model_state.capture_model(model, algorithm)
-        restore = partial(model_state.restore_model, model, algorithm)
-        restore(TrainingState(numbers, arrays))
-        for forged in ([-1, False], [1.5, False], [1 << 40, True], [0, 1]):
-            with pytest.raises(
-                ValueError, match=r"replay = .*: must be .position, full.: the next position .* below 50"
-            ):
-                restore(TrainingState(numbers | {"replay": forged}, arrays))
-        with pytest.raises(ValueError, match=r"replay.observations: must be finite numbers"):
-            restore(TrainingState(numbers | {"replay": [3, False]}, arrays))
-
-
-@pytest.mark.parametrize("name", ["policy", "policy-last"])
-def test_resume__a_policy_that_cannot_be_replaced_is_refused_at_once(run: Path, name: str) -> None:
-    shutil.rmtree(run / name)
-    (run / name).touch()
-    with pytest.raises(InvalidInput, match=rf"{name}: must be a plain folder, not a link or a file"):
-        resume(run, measure=measure)
-
-
 @pytest.mark.parametrize("name", LINKS)
 def test_resume__follows_no_link_out_of_the_run(run: Path, name: str) -> None:
     outside = run.parents[1] / OUTSIDE
@@ -768,28 +629,6 @@ def test_learning_rate__falls_as_a_cosine_and_never_rises_again() -> None:
     # 1e-4 + 4e-4 * (1.0 + 0.5**0.5) / 2.0 = 0.0004414213562373095
 
 
-def test_scheme__says_who_drives_what() -> None:
-    assert Training.of(TINY_PPO, PAIR, scheme="centralised").scheme == "centralised"
-    assert Training.of(TINY_PPO, PAIR).who_drives() == "scheme shared: policy drives vehicle_2, vehicle_3"
-    assert (
-        Training.of(TINY_PPO, PAIR, scheme="independent").who_drives()
-        == "scheme independent: policy/vehicle_2 drives vehicle_2; policy/vehicle_3 drives vehicle_3"
-    )
-
-
-@pytest.mark.parametrize(
-    ("seed", "scheme", "folder"),
-    [
-        (None, None, "runs/paper-random-ppo-seed0"),
-        (4, None, "runs/paper-random-ppo-seed4"),
-        (None, "shared", "runs/paper-random-ppo-shared-seed0"),
-    ],
-)
-def test_folder_of_a_run__says_scenario_recipe_scheme_and_seed(seed, scheme, folder) -> None:
-    recipe = eb.load_recipe("ppo") if scheme is None else eb.load_recipe("ppo").replace(scheme=scheme)
-    assert str(run_folder(PAPER, recipe, seed)) == folder
-
-
 def test_network_of_the_paper__has_the_tensors_of_its_table() -> None:
     assert [(row.name, row.shape) for row in eb.load_recipe("ppo-paper").network_spec(27).tensors] == [
         ("policy.0.weight", (256, 27)),
@@ -815,20 +654,6 @@ def test_dense_layer__by_hand() -> None:
     x, y = np.array([[1, 0], [1, 0], [1, 0], [1, 0], [1, 2]], np.float32), np.empty((2, 2), np.float32)
     dense(weight, np.array([10, 20], np.float32), x, y)
     assert y.tolist() == [[25.0, 20.0], [19.0, 18.0]]
-
-
-def test_independent_learners__have_features_of_their_own(empty_folder: Path) -> None:
-    own = PAIR.replace(
-        observation={"vehicle_2": ["own", "front_1.gap"], "vehicle_3": ["rear_1.gap", "place", "own.speed"]}
-    )
-    training = Training.of(TINY_PPO.replace(scheme="independent"), own)
-    assert training.observation.size == 10
-    assert training.columns == [[0, 1, 2, 3, 4, 5, 6, 7], [8, 9, 0]]
-    made = eb.train(training.recipe, own, "own", steps=300, on_progress=None).policies
-    assert {
-        name: (policy.observation.size, policy.manifest.observation.features[-1]) for name, policy in made.items()
-    } == {"vehicle_2": (8, "front_1.gap"), "vehicle_3": (3, "own.speed")}
-    assert sorted(eb.make_agent("team@own", scenario=own).drivers) == [1, 2]
 
 
 def test_script_with_a_memory__leaves_a_folder_whose_agent_remembers(

@@ -1,6 +1,5 @@
 """The scripts below train/: IPPO and MAPPO in one file each, SuperSuit with PPO, and a clone of a dataset."""
 
-import runpy
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -10,7 +9,6 @@ import pytest
 import torch
 
 import ethbrake_marl as eb
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.training.own_team import save_team
 from ethbrake_marl.training.team import load_team
@@ -18,8 +16,7 @@ from tests.docs.site import load
 from tests.learning.tiny import harm_beside_full_braking
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning", "ignore::FutureWarning")
-TRAIN = Path(__file__).resolve().parents[2] / "train"
-PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")
+PAIR = eb.load_scenario("cooperation-3-pair")
 
 
 @pytest.fixture
@@ -40,32 +37,6 @@ def test_supersuit__worlds_are_seeded_and_no_two_copies_are_alike(supersuit: Mod
     assert len(np.unique(seen[0][::2], axis=0)) == supersuit.COPIES  # rows of Vehicle 2
     native = eb.make_sb3_vec_env(PAIR, 1, seed=5).reset()
     assert np.array_equal(seen[0][:2], native)  # copy 0 lives in the training worlds of its seed
-
-
-@pytest.mark.parametrize(
-    ("action", "steps", "ends"), [(1.0, 85, {(True, True)}), (-1.0, 160, {(True, False)})], ids=["drive on", "brake"]
-)
-def test_supersuit__tells_which_episodes_the_horizon_cut_off(
-    action: float, steps: int, ends: set[tuple[bool, bool]], supersuit: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Who drives on is never at rest; who brakes is before the horizon."""
-    monkeypatch.setattr(supersuit, "COPIES", 4)
-    worlds = supersuit.make_worlds(PAIR)
-    worlds.seed(1)
-    worlds.reset()
-    told: set[tuple[bool, bool]] = set()
-    for _ in range(steps):
-        _, _, done, infos = worlds.step(np.full((worlds.num_envs, 1), action, np.float32))
-        over = [info for d, info in zip(done, infos, strict=True) if d]
-        told |= {(True, info.get("TimeLimit.truncated", False)) for info in over}
-        assert all(info["terminal_observation"].shape == (27,) for info in over)
-    assert told >= ends and (action < 0.0 or told == ends)
-
-
-@pytest.mark.long
-def test_supersuit__learns_to_beat_full_braking(supersuit: ModuleType, tmp_path: Path) -> None:
-    supersuit.train(PAIR, 200_000, 0, tmp_path / "run")
-    assert harm_beside_full_braking(f"ppo@{tmp_path / 'run'}") < 0.9
 
 
 SINGLE_FILES = pytest.mark.parametrize("script", ["ippo", "mappo"])
@@ -110,53 +81,6 @@ def test_single_file__advantages_by_hand(script: str) -> None:
     assert module.advantages(rollout, values, settings).flatten().tolist() == [-0.75, 3.0]
 
 
-@SINGLE_FILES
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--scenario", "cooperation-3-pear"], "did you mean 'cooperation-3-pair'?"),
-        (["--steps", "0"], "steps = 0: must be a whole number, at least 1"),
-        (["--copies", "0"], "copies = 0: must be a whole number, at least 1"),
-        (["--minibatch", "0"], "minibatch = 0: must be a whole number, at least 1"),
-        (["--seed", "-1"], "seed"),
-        (["--output", "there"], "there: already exists"),
-        (["--harm-count", "all"], "harm_count"),
-        (["--scenario", "cooperation-0-sensors"], "has no learner"),
-    ],
-)
-def test_single_file__refuses_what_cannot_be_before_it_trains(
-    arguments: list[str],
-    message: str,
-    script: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "there").mkdir()
-    monkeypatch.setattr(sys, "argv", [f"{script}.py", "--output", "new", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        runpy.run_path(str(TRAIN / f"{script}.py"), run_name="__main__")
-    said = capsys.readouterr()
-    assert ended.value.code == 2 and message in said.err and said.out == "" and not (tmp_path / "new").exists()
-
-
-@SINGLE_FILES
-def test_single_file__ends_with_the_command_that_evaluates(
-    script: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    few = [part for name, value in FEW.items() for part in (f"--{name}", str(value))]
-    # minibatches of 32 leave a last one of one row
-    odd = ["--copies", "5", "--rollout", "13", "--minibatch", "32"]
-    monkeypatch.setattr(sys, "argv", [f"{script}.py", "--output", "my team", *few, *odd])
-    runpy.run_path(str(TRAIN / f"{script}.py"), run_name="__main__")
-    last = capsys.readouterr().out.splitlines()[-1]
-    assert last == "ethbrake evaluate --scenario cooperation-3-pair --agents 'full_brake,e_v2x_bm,team@my team'"
-    assert (tmp_path / "my team" / "team.json").is_file()
-    eb.make_agent("ppo@my team", scenario=PAIR)
-
-
 @pytest.mark.long
 @SINGLE_FILES
 def test_single_file__learns_to_beat_full_braking(script: str, tmp_path: Path) -> None:
@@ -191,9 +115,3 @@ def test_save_team__acts_as_the_actors_do(between: torch.nn.Module, shared: bool
         assert policy.manifest.learners == (tuple(actors) if shared else (name,))
         assert (policy.manifest.seeds, policy.manifest.steps) == ({"training": 3}, 5)
     assert sorted(load_team(tmp_path, PAIR).drivers) == [1, 2]
-
-
-def test_save_team__refuses_layers_that_a_bundle_cannot_hold(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInput, match="must be linear layers with ReLU between them, or with Tanh between them"):
-        save_team(tmp_path / "a", {"vehicle_2": OwnActor(torch.nn.GELU())}, eb.parallel_env(), seed=0, steps=1)
-    assert not (tmp_path / "a").exists()

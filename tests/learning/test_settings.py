@@ -37,14 +37,6 @@ def test_settings_of_a_recipe__are_checked_and_a_pair_is_kept_together() -> None
     }
 
 
-def test_setting_of_a_discount__is_told_that_it_belongs_with_that_of_shaping() -> None:
-    told: list[str] = []
-    assert read_settings(["gamma=0.9"], [PPO]).change(PPO, told.append).gamma == 0.9
-    assert told[0].startswith("note: gamma = 0.9 differs from reward.shaping_discount = 0.995")
-    both = read_settings(["gamma=0.9", "reward.shaping_discount=0.9"], [PPO])
-    assert both.change(PPO, told.append).gamma == 0.9 and len(told) == 1
-
-
 def test_settings_of_a_scenario__change_what_they_name() -> None:
     assert load("restitution=0.3").bounds("restitution") == ((0.3, 0.3),)
     assert load("roles.vehicle_3=coast").scripts[2] == "coast"

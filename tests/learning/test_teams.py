@@ -21,10 +21,9 @@ from ethbrake_marl.training.run_folder import RunDirectory
 from ethbrake_marl.training.session import train
 from ethbrake_marl.training.team import has_policy_each, load_team
 from ethbrake_marl.training.training import Training, check_same_training
-from tests.learning.tiny import TINY_PPO, Answer, files_of, harm_beside_full_braking, marked, watch_steps
+from tests.learning.tiny import TINY_PPO, Answer, harm_beside_full_braking, marked, watch_steps
 
 PAIR = eb.load_scenario("cooperation-3-pair")
-ALONE = eb.load_scenario("cooperation-2-paper")
 NAMES = ("vehicle_2", "vehicle_3")
 TINY = TINY_PPO.replace(total_steps=4 * 256)
 
@@ -48,15 +47,6 @@ def test_train__leaves_a_folder_that_drives_by_itself(scheme: Any, tmp_path: Pat
     told = [(each.learners, bool(each.network.value_hidden)) for each in manifests]
     assert told == [((name,) if separate else NAMES, scheme != "centralised") for name in NAMES]
     assert len({each.weights_sha256 for each in manifests}) == (2 if separate else 1)
-
-
-def test_train__takes_names_and_files_and_measuring_changes_nothing(tmp_path: Path) -> None:
-    (tmp_path / "tiny.yaml").write_text(json.dumps(TINY.model_dump(mode="json", exclude_unset=True)))
-    result = train(tmp_path / "tiny.yaml", "cooperation-2-paper", tmp_path / "named", steps=128)
-    assert (result.training.scheme, result.training.drivers) == ("single", {"vehicle_2": "policy"})
-    train(TINY, ALONE, tmp_path / "unmeasured", steps=128, measure=None)
-    last = "policy-last/weights.safetensors"
-    assert files_of(tmp_path / "named")[last] == files_of(tmp_path / "unmeasured")[last]
 
 
 def history(recipe: TrainingRecipe, folder: Path) -> list[dict[str, str]]:
@@ -124,15 +114,6 @@ def test_centralised__the_critic_sees_the_line_and_the_actor_does_not() -> None:
     actions = [policy.get_distribution(each).distribution.mean for each in (seen, elsewhere)]
     assert (actions[0] == actions[1]).all()
     assert (policy.predict_values(seen) != policy.predict_values(elsewhere)).all()
-
-
-@pytest.mark.long
-def test_cooperation__two_learners_avoid_what_can_be_avoided(tmp_path: Path) -> None:
-    """Contact cannot be avoided in 65 % of these worlds; PPO's pairs collided in every one (docs/cooperation.md)."""
-    train("cooperation", PAIR, tmp_path / "run", steps=800_000)
-    result = eb.evaluate(PAIR.sample(1000, 7), {"team": load_team(tmp_path / "run", PAIR)}, scenario=PAIR)
-    assert result.outcome("team").collided.mean() < 0.70
-    assert result.outcome("team").first_impact_harm.mean() < 7.2
 
 
 LEARNS = load_recipe("cooperation-ppo").replace(

@@ -38,15 +38,6 @@ def test_recipes__that_are_listed_can_be_used_and_run_takes_the_first_of_them() 
         load_recipe("quik")
 
 
-def test_algorithm__of_an_absent_extension_leaves_a_run_that_says_so(tmp_path: Path) -> None:
-    eb.train(TINY, "paper-random", tmp_path / "run", measure=None, on_progress=None)
-    config = json.loads((tmp_path / "run" / "config.json").read_text())
-    config["recipe"]["algorithm"] = "vine"
-    (tmp_path / "run" / "config.json").write_text(json.dumps(config))
-    with pytest.raises(InvalidInput, match=r"config.json: recipe: algorithm = vine: must be one of ppo, sac"):
-        eb.resume(tmp_path / "run", on_progress=None)
-
-
 def test_run__without_a_report_trains_shields_evaluates_and_writes_results(tmp_path: Path) -> None:
     result = run_experiment(eb.load_scenario("paper-random"), tmp_path / "run", recipe=TINY, episodes=20)
     rows = json.loads((tmp_path / "run" / "results.json").read_text())
@@ -55,10 +46,3 @@ def test_run__without_a_report_trains_shields_evaluates_and_writes_results(tmp_p
     assert not {"report.html", "other_tests.json"} & {path.name for path in (tmp_path / "run").iterdir()}
     assert json.loads((tmp_path / "run" / "run.json").read_text())["status"] == "finished"
     assert len(result.tables) > 0 and result.notes == (f"results, with every measure: {tmp_path}/run/results.json",)
-
-
-def test_policy__of_several_networks_drives_without_the_algorithm_that_trained_it() -> None:
-    scenario = eb.load_scenario("paper-random")
-    result = eb.evaluate(agents="full_brake,universal", scenario=scenario, episodes=20)
-    braking, universal = (result.outcome(name).total_harm.mean() for name in result.outcomes)
-    assert universal < braking

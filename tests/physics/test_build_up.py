@@ -5,23 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.files.yaml import flow_text
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.motion import stopping_distances
 from ethbrake_marl.physics.state import Floats, Ints, Worlds, make_worlds
 from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.scenario.tables import worlds_from_table
-from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.shields.drivers import ShieldedDriver
 from tests.physics.random_worlds import Draws, line
 from tests.reference.small_steps import run
 
@@ -270,39 +264,6 @@ def test_shield__executes_what_it_foresees(slow: Scenario) -> None:
     assert (harm["constant:2+step"] != harm["e_v2x_bm"]).any()
 
 
-def test_shield__of_a_mixture_in_which_some_worlds_build_up(slow: Scenario, tmp_path: Path) -> None:
-    keys = "\n".join(f"{key}: {flow_text(value)}" for key, value in slow.replace(name="slow").declared().items())
-    (tmp_path / "slow.yaml").write_text(keys)
-    members = "[{scenario: slow.yaml}, {scenario: paper-random}]"
-    (tmp_path / "some.yaml").write_text(f"name: some\nmixture: {members}\n")
-    some = load_scenario(tmp_path / "some.yaml")
-    told = QUANTITY.columns(some.sample(20, seed=1).worlds)
-    assert set(told["brake_rate_2_mps3"]) == {12.65, 1e6}  # told of all, the highest rate for at once
-    env = eb.shield(eb.EthBrakeVectorEnv(2, scenario=some))
-    env.reset(seed=0)
-    draws, ends = Draws(4), np.zeros(2)
-    for _ in range(120):  # one begins anew beside a running one
-        _, rewards, terminated, truncated, _ = env.step(draws.uniform(-1.0, 1.0, (2, 1)).astype(np.float32))
-        ends += terminated | truncated
-        assert np.isfinite(rewards).all()
-    assert (ends > 1).all()
-
-
-def test_shield__foresees_a_force_that_is_there_at_once_and_released_slowly() -> None:
-    scenario, at_onset = load_scenario("paper-random").replace(release_rate_mps3=12.65), []
-
-    class Watching:
-        name = "watching"
-
-        def act(self, worlds: Worlds, vehicle: int) -> Floats:
-            at_onset.extend(worlds.command_mps2[np.abs(worlds.time_s - 0.8) < 1e-6, 2])  # the latency of Vehicle 3
-            return np.full(worlds.n, -2.0)
-
-    shielded = ShieldedDriver.around(Watching(), Task(scenario, (1,)))
-    eb.evaluate(scenario.sample(1, seed=0), {"shielded": shielded}, scenario=scenario)
-    assert len(at_onset) > 1 and set(at_onset) == {0.0}  # it has coasted up to there
-
-
 @pytest.mark.parametrize("key", ["brake_rate_mps3", "release_rate_mps3"])
 def test_shield__of_several_learners_with_one_finite_rate_certifies_every_step(key: str) -> None:
     env = eb.shield(eb.parallel_env(scenario=load_scenario("cooperation-3-pair").replace(**{key: 12.65})))
@@ -311,14 +272,6 @@ def test_shield__of_several_learners_with_one_finite_rate_certifies_every_step(k
         env.reset(seed=seed)  # at 0.5 s; the latency of Vehicle 3 elapses at 0.8 s, a decision
         while env.agents:
             env.step({f"vehicle_{i}": draws.uniform(-1.0, 1.0, (1,)).astype(np.float32) for i in (2, 3)})
-
-
-@pytest.mark.parametrize("key", ["brake_rate_mps3", "release_rate_mps3"])
-def test_table__of_a_scenario_with_one_of_both_rates_is_read_again(key: str) -> None:
-    one = load_scenario("paper-random").replace(**{key: 12})
-    drawn = one.sample(3, seed=1).worlds
-    read = worlds_from_table(one, QUANTITY.columns(drawn))
-    assert np.array_equal(getattr(read.vehicles, key), getattr(drawn.vehicles, key))
 
 
 def test_release__has_its_own_rate_and_passes_zero_without_a_stop() -> None:

@@ -1,20 +1,14 @@
 """How kernels are compiled, the elementary functions that they share, and work in parts on threads."""
 
-import ast
 import math
-import re
-import sys
 import threading
-from pathlib import Path
 
 import mpmath
 import numba
 import numpy as np
 import pytest
-from numba.core.errors import NumbaError
 from scipy.special import ndtri
 
-import ethbrake_marl
 from ethbrake_marl.physics.elementary import (
     exp,
     exp_each,
@@ -45,31 +39,6 @@ def test_compiled__is_strict_releases_the_lock_and_divides_by_zero_as_ieee_does(
     options = {"nopython": True, "boundscheck": None, "fastmath": False, "nogil": True, "error_model": "numpy", **more}
     kernel = compile_kernel(**way)(lambda x: 1.0 / x)
     assert kernel.targetoptions == options and kernel(0.0) == float("inf")
-
-
-@needs_compiler
-def test_compiled_bare__leaves_the_counts_of_references_alone():
-    @compile_kernel(bare=True)
-    def first(values):
-        return values[1:][0]
-
-    values = np.arange(3.0)
-    before = sys.getrefcount(values)
-    assert [first(values) for _ in range(5)] == [1.0] * 5 and sys.getrefcount(values) == before
-    with pytest.raises(NumbaError, match="NRT required"):
-        compile_kernel(bare=True)(lambda n: np.zeros(n))(3)  # it can make no array: told at once
-
-
-def test_compiled_bare__gives_no_array_back():
-    bare = []
-    for source in sorted(Path(ethbrake_marl.__file__).parent.rglob("*.py")):
-        text = source.read_text("utf-8")
-        for node in ast.walk(ast.parse(text)) if "bare=True" in text else ():
-            if any("bare=True" in ast.unparse(each) for each in getattr(node, "decorator_list", ())):
-                bare.append(f"{source.name}: {node.name}")
-                words = set(re.findall(r"\w+", ast.unparse(node.returns)))
-                assert words <= {"None", "bool", "int", "float", "tuple"}, bare[-1]
-    assert len(bare) > 30
 
 
 # ---------------------------------------------------------------- elementary functions, against 40 digits

@@ -1,19 +1,14 @@
 """Vehicles that brake in pieces: a profile, fixed at the alert."""
 
-from pathlib import Path
-
 import numpy as np
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.making import make_agent
-from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.evaluation import trial
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.state import make_worlds
 from ethbrake_marl.physics.trace import segment_pieces
-from ethbrake_marl.scenario.tables import read_worlds
 from ethbrake_marl.training.settings import read_settings
-from tests.shield.attacks import line
 
 
 def one(latency_s, **settings):
@@ -115,30 +110,3 @@ def test_predictions__are_what_is_done() -> None:
 def check_predicted(agent: str) -> None:
     found = harm(SOFT, agent)
     assert np.allclose(found.first_impact_harm, found.predicted_harm, rtol=1e-9, atol=1e-9)
-
-
-def test_line_of_five__with_profiles_and_latencies() -> None:
-    long = line(5).replace(obstacle_gap_m=45, horizon_s=12)
-    long = long.replace(
-        roles={
-            **long.roles,
-            "vehicle_2": {"profile": [[0, 1], [0.5, 6], [1.3, 2]]},
-            "vehicle_5": {"profile": [[0, 6], [0.2, 0], [0.9, 5]]},
-        }
-    )
-    found = harm(long, "e_v2x_bm")
-    assert np.allclose(found.first_impact_harm, found.predicted_harm, rtol=1e-9, atol=1e-9)
-    assert int((found.predicted_harm > 0).sum()) == 30
-    early, late = (long.replace(roles={**long.roles, "vehicle_1": {"profile": [[0, 2], [at, 5]]}}) for at in (0.5, 3.0))
-    harms = [harm(each, "full_brake").first_impact_harm.mean() for each in (early, late)]
-    assert harms[0] != harms[1]
-    names = [profile_problem(each.sample(2, 7).worlds, [2]).identity.tolist() for each in (early, late, early)]
-    assert names[0] == names[2] != names[1]
-
-
-def test_roles__drive_worlds_of_another_list(empty_folder: Path) -> None:
-    bound = harm(SOFT, "e_v2x_bm").first_impact_harm
-    assert (harm(SOFT, "e_v2x_bm", PAPER.sample(30, 7)).first_impact_harm == bound).all()
-    worlds = SOFT.sample(3, 7).worlds
-    Path("rows.csv").write_text("gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps\n7,7,20,18,20\n")
-    assert read_worlds(SOFT, "rows.csv").vehicles.pieces.tolist() == worlds.vehicles.pieces[:1].tolist()

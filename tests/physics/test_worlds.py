@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.physics.columns import Packed, columns as places
+from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.state import Worlds, make_worlds
 from tests.physics.random_worlds import line
 
@@ -58,26 +58,6 @@ def test_make_worlds__one_set_of_gaps_or_of_speeds_is_that_of_all_worlds(gaps: A
     worlds = line(gaps, speeds, driving_capacity_mps2=0.0, latency_s=0.0, restitution=1.0, obstacle_gap_m=0.0)
     expected = [np.broadcast_to(given, (worlds.n, len(np.atleast_2d(given)[0]))).tolist() for given in (gaps, speeds)]
     assert [worlds.gaps_m.tolist(), worlds.speeds_mps.tolist()] == expected
-
-
-def test_known_at_once__takes_no_memory_and_goes_by_the_numbers() -> None:
-    worlds = line(5.0, np.full((4, 3), 10.0), latency_s=[0.0, 0.25, 0.5])
-    two = np.array([2, 0])
-    some_rows = (worlds.take(two), worlds.take(np.empty(0, np.int64)))
-    for some in (worlds, *some_rows, Worlds.concatenate([worlds, worlds]), worlds.assign(two, some_rows[0])):
-        news = some.vehicles.known_from_s
-        assert news.tolist() == [[[0.0] * 3, [0.25] * 3, [0.5] * 3]] * some.n
-        assert some.vehicles.is_known_at_once and (news.strides[2], news.flags.writeable) == (0, False)
-    vehicles = worlds.vehicles
-    late = vehicles.known_from_s.copy()
-    late[0, 2, 1] = np.inf
-    changes = [
-        {"known_from_s": vehicles.known_from_s.copy()},
-        {"latency_s": vehicles.latency_s + 0.125},
-        {"own_latency_s": vehicles.latency_s - 0.125},
-        {"known_from_s": late},
-    ]
-    assert [replace(vehicles, **change).is_known_at_once for change in changes] == [True, False, False, False]
 
 
 @pytest.mark.parametrize("rows", [[2, 0], np.array([False, True, True, False])])
@@ -132,30 +112,6 @@ def test_make_worlds__starts_at_the_alert_with_nothing_hit_and_nothing_commanded
     assert worlds.vehicles.speed_limit_mps.tolist() == [[40.0, 40.0, 40.0]]
 
 
-def test_make_worlds__broadcasts_every_parameter_to_arrays_of_its_own() -> None:
-    worlds = line(5.0, np.full((4, 3), 10.0), mass_t=[1.0, 2.0, 3.0], latency_s=np.full((4, 1), 0.25))
-    found = columns(worlds)
-    shapes = {
-        **dict.fromkeys(found, (4, 3)),
-        **dict.fromkeys(("gaps_m", "pair_hit"), (4, 2)),
-        **dict.fromkeys(("time_s", "restitution", "obstacle_gap_m", "obstacle_hit"), (4,)),
-        "known_from_s": (4, 3, 3),
-        "pieces": (4, 3, 0),
-        "messages": (4, 0),
-        "road": (4, 0),
-    }
-    assert {name: column.shape for name, column in found.items()} == shapes
-    own = [column for name, column in found.items() if name not in ("known_from_s", "messages", "road")]
-    assert all(column.flags.c_contiguous and column.flags.owndata for column in own)
-    assert worlds.vehicles.mass_t[3].tolist() == [1.0, 2.0, 3.0]
-    assert worlds.vehicles.own_latency_s.tolist() == [
-        [0.25, 0.25, 0.25],
-        [0.25, 0.25, 0.25],
-        [0.25, 0.25, 0.25],
-        [0.25, 0.25, 0.25],
-    ]
-
-
 def test_with_obstacle__writes_it_out_in_front() -> None:
     worlds = replace(line([5.0], [10.0, 9.0], obstacle_gap_m=12.0), obstacle_hit=np.array([True])).with_obstacle()
     found = {name: column[0].tolist() for name, column in columns(worlds).items()}
@@ -174,21 +130,6 @@ def test_with_obstacle__writes_it_out_in_front() -> None:
     }
     assert {name: found[name] for name in expected} == expected
     assert worlds.vehicles.known_from_s.shape == (1, 3, 3)
-
-
-def test_packed__columns_follow_each_other_without_a_hole() -> None:
-    # 3 vehicles, 2 pairs: time | speeds 3 | commands 3 | before 3 | gaps 2 | hit 2 | first 2 | total 2 | count 2 and
-    # restitution | braking 3 | driving 3 | latency 3 | mass 3 | limit 3 | brake rate 3 | release rate 3 | weight of
-    # harm 3 | own latency 3 | news 9
-    rows = Packed.of(line([5.0, 6.0], [9.0, 9.0, 9.0]))
-    assert (
-        places(rows.state) == rows.column == (3, 0, 1, 4, 7, 10, 12, 14, 20, 0, 1, 4, 7, 10, 13, 16, 19, 22, 25, 28, 37)
-    )
-    assert rows.state.shape == (1, 20)
-    assert rows.params.shape == (1, 25)
-    wide = rows.widened(obstacle=True, news=True)
-    assert wide.state.shape == (1, 25)
-    assert wide.params.shape == (1, 37)
 
 
 def test_packed__ledger_is_that_of_the_columns_of_harm_in_its_own_memory() -> None:

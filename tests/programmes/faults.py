@@ -1,29 +1,22 @@
-"""Faults that some test must find: small random changes of the code in every folder, and planted bugs.
+"""Planted bugs that some test must find: errors that people make in such code. They are in ``bugs.yaml``.
 
-    make programme NAME=faults ARGS="mutants --folders physics,shield --sample 40 --seed 0"
     make programme NAME=faults ARGS="bugs --only WORD"
 
-A *mutant* changes one node of the syntax tree: an arithmetic or comparison operator, a constant, a sign, a negated
-condition, a removed statement, or min and max exchanged. The *planted bugs* are in ``bugs.yaml``: errors that people
-make in such code. A fault is written into a copy of the repository, never into the working tree. In the copy the tests
-run that call the changed function, likely and fast tests first, until one fails. Compiled functions are first tried
-without compilation. A fault is found if a test fails, or if the tests do not end.
+A bug is written into a copy of the repository, never into the working tree. In the copy the tests run that call the
+changed function, likely and fast tests first, until one fails. Compiled functions are first tried without compilation.
+A bug is found if a test fails, or if the tests do not end.
 
 The calls of each test are recorded once per state of the repository. As a pytest plugin (``-p
 tests.programmes.faults``, with a folder in the variable ``CALLS``) this file records, per process, the functions that
 every test called, and its time. Calls of compiled functions are invisible; functions that mention their names count
 instead.
-
-``--journal`` writes each verdict to a file, and uses verdicts that are already there.
 """
 
 import ast
-import copy
 import hashlib
 import importlib
 import json
 import os
-import random
 import re
 import resource
 import shutil
@@ -33,7 +26,7 @@ import sys
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -202,13 +195,10 @@ class Callers:
         around = [f for f in self.functions.values() if f.key.startswith(place) and f.first <= line <= f.last]
         return min(around, key=lambda f: f.last - f.first)
 
-    def of(self, function: Function, words: Iterable[str] = ()) -> set[str]:
-        """Tests that call a function; if none is seen to, those of who mentions its name.
-
-        Outside of functions, those of who mentions one of the ``words`` that get a value there, or the class.
-        """
+    def of(self, function: Function) -> set[str]:
+        """Tests that call a function; if none is seen to, those of who mentions its name."""
         found = set(self.callers.get(function.key, ())) if function.callable else set()
-        frontier = {function.key.rpartition(":")[2].rpartition(".")[2], *(() if function.callable else words)}
+        frontier = {function.key.rpartition(":")[2].rpartition(".")[2]}
         known: set[str] = set()
         while not found and frontier - known:
             known |= frontier
@@ -218,14 +208,12 @@ class Callers:
             frontier = {f.key.rpartition(":")[2].rpartition(".")[2] for f in mentioning}
         return found
 
-    def ordered(
-        self, function: Function, words: Iterable[str], topic: str, budget_s: float, most_files: int
-    ) -> list[str]:
+    def ordered(self, function: Function, topic: str, budget_s: float, most_files: int) -> list[str]:
         """Tests that may notice a change of a function: likely and quick ones first, as many as the time allows.
 
         Likely are those of its module, those that are named by a word of the ``topic``, and those of its folder.
         """
-        found = self.of(function, words)
+        found = self.of(function)
         room = "tests/" + function.key.rpartition(":")[0].removesuffix(".py").partition("/")[0]
         module = "/test_" + function.key.rpartition(":")[0].rpartition("/")[2] + "::"
 
@@ -265,116 +253,6 @@ class Fault:
     file: str  # below the package; the first one that changes
     line: int
     texts: tuple[tuple[str, str], ...]  # file below the package, its text
-    words: tuple[str, ...] = ()  # names that a change outside of all functions gives a value
-
-    @property
-    def folder(self) -> str:
-        """Of the file; the package itself for its modules."""
-        return self.file.partition("/")[0] if "/" in self.file else "ethbrake_marl"
-
-    @property
-    def digest(self) -> str:
-        """Of what it changes."""
-        return hashlib.sha256(repr(self.texts).encode()).hexdigest()[:20]
-
-
-ARITHMETIC: dict[type[ast.operator], type[ast.operator]] = {
-    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Mult, ast.Mod: ast.Mult,
-    ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd, ast.Pow: ast.Mult,
-}  # fmt: skip
-BOUNDARY: dict[type[ast.cmpop], type[ast.cmpop]] = {
-    ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
-    ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
-}  # fmt: skip
-SWAPPED = {"min": "max", "max": "min", "np.maximum": "np.minimum", "np.minimum": "np.maximum"}
-REMOVABLE = (ast.Assign, ast.AugAssign, ast.Expr, ast.Continue, ast.Break, ast.Raise)
-NOT_CODE = ("annotation", "returns", "decorator_list", "bases", "type_params")
-NO_CODE = (ast.Import, ast.ImportFrom, ast.JoinedStr, ast.arg)
-
-
-class Change(NamedTuple):
-    """A changed node of a syntax tree."""
-
-    node: Any
-    what: str
-    new: ast.AST | None  # None: a statement is removed
-    words: tuple[str, ...]  # names that the statement around it gives a value
-
-
-def mutant(file: Path, change: Change) -> Fault:
-    """Return the text of a file with one change; line numbers stay."""
-    node, what, new, words = change
-    text, place = file.read_text("utf-8"), file.relative_to(PACKAGE).as_posix()
-    lines = text.splitlines(keepends=True)
-
-    def offset(line: int, column: int) -> int:
-        return sum(map(len, lines[: line - 1])) + len(lines[line - 1].encode()[:column].decode())
-
-    begin, end = offset(node.lineno, node.col_offset), offset(node.end_lineno, node.end_col_offset)
-    old, written = text[begin:end], "pass" if new is None else ast.unparse(new)
-    if isinstance(new, ast.expr):
-        written = f"({written})"
-    written += "\n" * (old.count("\n") - written.count("\n"))
-    name = f"{place}:{node.lineno}: {what} in `{' '.join(old.split())[:60]}`"
-    return Fault(name, place, node.lineno, ((place, text[:begin] + written + text[end:]),), words)
-
-
-def changes(node: ast.AST, words: tuple[str, ...] = ()) -> Iterator[Change]:
-    """Yield changes of a node and all nodes below it, except imports, annotations, decorators and texts."""
-    if isinstance(node, ast.Assign | ast.AnnAssign):
-        targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-        words = tuple(n.id for target in targets for n in ast.walk(target) if isinstance(n, ast.Name))
-    if isinstance(node, ast.expr):
-        for what, new in _of_expression(node):
-            yield Change(node, what, new, words)
-    if isinstance(node, ast.AugAssign) and type(node.op) in ARITHMETIC:
-        statement = copy.copy(node)
-        statement.op = ARITHMETIC[type(node.op)]()
-        yield Change(node, "operator", statement, words)
-    if isinstance(node, ast.If | ast.While | ast.IfExp):
-        yield Change(node.test, "condition negated", ast.UnaryOp(ast.Not(), node.test), words)
-    for name, value in ast.iter_fields(node):
-        for child in value if isinstance(value, list) else [value]:
-            is_text = isinstance(child, ast.Expr) and isinstance(child.value, ast.Constant)
-            if name in NOT_CODE or not isinstance(child, ast.AST) or isinstance(child, NO_CODE) or is_text:
-                continue
-            if name in ("body", "orelse") and isinstance(child, REMOVABLE):
-                yield Change(child, "removed", None, words)
-            yield from changes(child, words)
-
-
-def _of_expression(node: ast.expr) -> Iterator[tuple[str, ast.expr]]:
-    new: Any = copy.copy(node)
-    if isinstance(node, ast.BinOp) and type(node.op) in ARITHMETIC:
-        new.op = ARITHMETIC[type(node.op)]()
-        yield f"{type(node.op).__name__} -> {type(new.op).__name__}", new
-    elif isinstance(node, ast.Compare):
-        for k, op in enumerate(node.ops):
-            new = copy.copy(node)
-            new.ops = [*node.ops[:k], BOUNDARY[type(op)](), *node.ops[k + 1 :]]
-            yield f"{type(op).__name__} -> {type(new.ops[k]).__name__}", new
-    elif isinstance(node, ast.BoolOp):
-        new.op = ast.Or() if isinstance(node.op, ast.And) else ast.And()
-        yield "and <-> or", new
-    elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
-        yield "sign dropped", node.operand
-    elif isinstance(node, ast.Call) and (other := SWAPPED.get(ast.unparse(node.func))):
-        new.func = ast.parse(other, mode="eval").body
-        yield f"-> {other}", new
-    elif isinstance(node, ast.Constant) and isinstance(node.value, bool | int | float):
-        if isinstance(node.value, bool):
-            new.value = not node.value
-        else:
-            new.value = node.value + 1 if isinstance(node.value, int) or node.value == 0 else node.value * 2
-        yield f"{node.value!r} -> {new.value!r}", new
-
-
-def sample_of(folder: str, count: int, seed: int) -> list[Fault]:
-    """Return random mutants of a folder. A smaller sample is part of a larger one."""
-    files = sorted(PACKAGE.glob("*.py") if folder == PACKAGE.name else (PACKAGE / folder).rglob("*.py"))
-    every = [(file, change) for file in files for change in changes(ast.parse(file.read_text("utf-8")))]
-    random.Random(seed).shuffle(every)
-    return [mutant(file, change) for file, change in every[:count]]
 
 
 def planted() -> tuple[list[Fault], list[str]]:
@@ -396,11 +274,6 @@ def planted() -> tuple[list[Fault], list[str]]:
         at = text.find(old) + next((k for k, (a, b) in enumerate(zip(old, patches[0][2], strict=False)) if a != b), 0)
         bugs.append(Fault(name, place, text[:at].count("\n") + 1, tuple(texts.items())))
     return bugs, misfits
-
-
-def folders() -> list[str]:
-    """Return the folders of the package with code; the package itself stands for its own modules."""
-    return [PACKAGE.name, *sorted(file.parent.name for file in PACKAGE.glob("*/__init__.py"))]
 
 
 # ---------------------------------------------------------------- one copy of the repository
@@ -527,7 +400,7 @@ class Copy:
     def verdict(self, fault: Fault) -> str:
         """Return the first test that finds a fault; empty if none does."""
         function = self.function(fault)
-        tests = self.tests.ordered(function, fault.words, fault.name, BUDGET_S, MOST_FILES)
+        tests = self.tests.ordered(function, fault.name, BUDGET_S, MOST_FILES)
         for compiled in (False, True) if function.compiled else (True,):
             while True:
                 with self.changed(fault):
@@ -598,27 +471,18 @@ def preload() -> None:
 
 
 OPTIONS = {
-    "what": {"choices": ("mutants", "bugs")},
-    "--folders": {"default": ",".join(folders()), "help": "folders, separated by commas; default: all"},
-    "--sample": {"type": int, "default": 40, "help": "mutants of each folder"},
-    "--seed": {"type": int, "default": 0, "help": "seed of the sample"},
+    "what": {"choices": ("bugs",), "nargs": "?"},
     "--jobs": {"type": int, "default": 2, "help": "number of processes"},
-    "--journal": {"type": Path, "help": "file for verdicts; recorded verdicts are used"},
 }
 
 
 def cases(given: Given) -> Cases:
-    """Yield all faults with the test that finds each; then print a table of folders."""
-    wanted = given.folders.split(",")
-    faults, misfits = planted()
-    if given.what == "mutants":
-        faults, misfits = [fault for folder in wanted for fault in sample_of(folder, given.sample, given.seed)], []
+    """Yield all planted bugs with the test that finds each."""
+    bugs, misfits = planted()
     for wrong in misfits:
         yield wrong, partial(Told, False, "the bug's text is not in the code")
-    faults = [fault for fault in faults if given.only in fault.name and fault.folder in wanted]
-    known = verdicts_of(given.journal)
-    fresh = [] if given.list else [fault for fault in faults if fault.digest not in known]
-    if fresh:
+    bugs = [bug for bug in bugs if given.only in bug.name]
+    if bugs and not given.list:
         record(given.jobs)
         preload()
     context = get_context("fork")
@@ -626,31 +490,11 @@ def cases(given: Given) -> Cases:
     for number in range(given.jobs):
         numbers.put(number)
     with ProcessPoolExecutor(given.jobs, context, make_copy, (numbers, given.jobs)) as pool:
-        tried = {fault.digest: pool.submit(try_fault, fault) for fault in fresh}
+        tried = {} if given.list else {bug.name: pool.submit(try_fault, bug) for bug in bugs}
 
-        def told(fault: Fault) -> Told:
-            red = known.get(fault.digest)
-            if red is None:
-                red = known[fault.digest] = tried[fault.digest].result()
-                note(given.journal, fault, red)
-            return Told(True, red) if red else Told(False if given.what == "bugs" else None, "no test finds it")
+        def told(bug: Fault) -> Told:
+            red = tried[bug.name].result()
+            return Told(bool(red), red or "no test finds it")
 
-        for fault in faults:
-            yield fault.name, partial(told, fault)
-    for folder in folders():
-        here = [fault for fault in faults if fault.folder == folder and fault.digest in known]
-        if here:
-            print(f"{folder:16} {sum(known[fault.digest] != '' for fault in here):4d} of {len(here)} found")
-
-
-def verdicts_of(journal: Path | None) -> dict[str, str]:
-    """Return the recorded verdicts: digest of a fault -> the test that found it."""
-    lines = journal.read_text("utf-8").splitlines() if journal is not None and journal.exists() else []
-    return {line["digest"]: line["red"] for line in map(json.loads, lines)}
-
-
-def note(journal: Path | None, fault: Fault, red: str) -> None:
-    """Write a verdict to the journal."""
-    if journal is not None:
-        with journal.open("a", encoding="utf-8") as out:
-            out.write(json.dumps({"digest": fault.digest, "name": fault.name, "red": red}) + "\n")
+        for bug in bugs:
+            yield bug.name, partial(told, bug)

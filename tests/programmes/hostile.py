@@ -1,348 +1,429 @@
-"""Hostile and damaged files, each read by its command, and hostile command lines.
+"""Hostile files: what somebody could try who sends a scenario, a recipe, a table, a policy or a run.
 
-Every case must end within 10 s of processor time and 2 GiB of memory. The exit status must be 2, with one error line of
-at most 2,000 characters without control characters; a case that may be valid can also succeed. In Python the error must
-be an ``EthBrakeError``. Nothing may be executed, and nothing written except the command's output. The folder of the
-attack is deleted at the end.
+Each file is read in its own process and folder. It must be refused with one line of error of at most 2,000 characters
+without control characters, within 10 s of processor time and 2 GiB of memory; a case that is marked ``may_be_valid``
+can also succeed. An audit hook of Python reports code that is executed, and prevents changes of files elsewhere.
 """
 
-import functools
-import gc
 import io
-import itertools
+import json
 import os
-import random
+import pickle
+import resource
 import shutil
-import socket
+import signal
+import struct
 import sys
 import tempfile
-from collections import defaultdict
+import threading
+import traceback
+import zipfile
 from collections.abc import Callable, Iterator
-from contextlib import chdir, redirect_stderr, redirect_stdout, suppress
-from functools import partial
+from contextlib import redirect_stdout
+from functools import cache, partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import torch
-import typer.main
+import numpy as np
 
+import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import EthBrakeError
-from ethbrake_marl.extensions.search.tables import BestHarmTable
-from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.extensions.search.best_harm import best_harm
+from ethbrake_marl.extensions.search.tables import BestHarmTable, table_bytes
+from ethbrake_marl.policies.shipped import shipped_policies
+from ethbrake_marl.scenario.tables import read_worlds
+from ethbrake_marl.training.session import train
+from tests.learning.tiny import LINKS, OUTSIDE, PRECIOUS, link_out
 from tests.programmes import Cases, Given, Told
-from tests.programmes.archives import COMMAND, good_bytes, table_cases
-from tests.programmes.cage import (
-    HERE,
-    INSIDE,
-    NASTY,
-    OUTSIDE,
-    PRECIOUS,
-    REFUSED,
-    Build,
-    Case,
-    Generator,
-    judge,
-    read_states,
-    read_table,
-    write,
-)
-from tests.programmes.files import (
-    EVALUATE,
-    MANIFEST,
-    SPECS,
-    WEIGHTS,
-    bundle,
-    bundle_cases,
-    run_cases,
-    stopped,
-    text_cases,
-    texts,
-)
 
-# ---------------------------------------------------------------- places: what may stand where a file is expected
+CPU_LIMIT_S, WALL_LIMIT_S = 10, 90.0
+MEMORY_LIMIT_BYTES = 2 << 30  # in addition to the memory of the loaded libraries
+LINE_LIMIT = 2_000  # characters
+REFUSED, BROKEN = 2, 99  # exit status of an error, and of a traceback
+DEED = "DEED: "
+
+Command = tuple[str, ...] | Callable[[], object]
+Build = Callable[[Path], object]
 
 
-class Target(NamedTuple):
-    """A file that a command reads."""
+class Case(NamedTuple):
+    """One attempt: ``build`` fills a folder, in which ``command`` runs (a command line, or a function that reads)."""
 
     name: str
-    right: bytes
-    command: tuple[str, ...]  # command with the file's name
-    reader: Callable[[str], object]
-    beside: Build = lambda folder: None  # makes other files that the command needs
+    command: Command
+    build: Build
+    may_be_valid: bool = False
 
 
-def targets() -> Iterator[Target]:
-    for kind in ("scenario", "recipe", "CSV"):
-        text = texts()[kind]
-        yield Target(text.file, text.text.encode(), text.command, text.reader)
-    yield Target(
-        "mine.yaml", texts()["scenario"].text.encode(), ("scenario", "show", "mine.yaml"), texts()["scenario"].reader
+# ---------------------------------------------------------------- YAML and CSV
+
+SCENARIO = """name: mine
+title: A line of three
+description: What a stranger sends.
+vehicles: 3
+time_step_s: 0.1
+horizon_s: 8
+gaps_m: {uniform: [5, 10]}
+speeds_mps: {uniform: [18, 22]}
+braking_capacity_mps2: [6, 7, 6]
+driving_capacity_mps2: [6, 7, 6]
+mass_t: [4.5, 5.5, 5.9]
+latency_s: [0, 0.5, 0.8]
+speed_limit_mps: 40
+restitution: 0.1
+early_impacts: keep
+roles:
+  vehicle_1: full_brake
+  vehicle_2: learner
+  vehicle_3: full_brake
+"""
+RECIPE = eb.load_recipe("ppo").replace(name="mine").text("")
+STATES = "gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps\n" + 3 * "7,7,20,18,20\n"
+PYTHON = "from pathlib import Path\nPath('pwned').touch()\ndef make(**given): pass\n"
+TITLE = "title: A line of three"
+ROLE = "vehicle_3: full_brake"
+BILLION = "a: &a [x, x]\n" + "".join(f"b{k}: &b{k} [*{f'b{k - 1}' if k else 'a'}, *a]\n" for k in range(40))
+# Name of a case -> the old text, and the text that replaces it. An empty old text stands for the beginning of the file.
+SCENARIOS: dict[str, tuple[str, str]] = {
+    "a tag that calls a function": (TITLE, "title: !!python/object/apply:os.system ['touch pwned']"),
+    "a tag that names a module": (TITLE, "title: !!python/module:os"),
+    "a tag of its own": (TITLE, "title: !local thing"),
+    "a billion laughs": ("", BILLION),
+    "a merge key": (TITLE, "<<: {title: x}"),
+    "a second document": (ROLE, f"{ROLE}\n---\n{SCENARIO}"),
+    "a key twice": (TITLE, f"{TITLE}\n{TITLE}"),
+    "deep brackets": (TITLE, f"title: {'[' * 30_000}"),
+    "deep indents": ("", "".join(f"{' ' * k}k:\n" for k in range(300))),
+    "many keys": ("", "".join(f"k{k}: 1\n" for k in range(4_000))),
+    "a long key": (TITLE, f'? "{"b" * 60_000}"\n: 1'),
+    "an escape sequence in a key": (TITLE, '"\\e[2Jtitle": x'),
+    "an escape sequence in a name": ("name: mine", 'name: "\\e]0;x\\a"'),
+    "a text from right to left": ("name: mine", 'name: "\\u202egnp.exe"'),
+    "NUL": (TITLE, "title: a\0b"),
+    "too large": ("", f"# {'x' * (10 << 20)}\n"),
+    "not a number": ("restitution: 0.1", "restitution: .nan"),
+    "infinite": ("speed_limit_mps: 40", "speed_limit_mps: 1e999"),
+    "a number of 40,000 digits": ("horizon_s: 8", f"horizon_s: {'9' * 40_000}"),
+    "a billion vehicles": ("vehicles: 3", "vehicles: 1000000000"),
+    "a role that is a Python file": (ROLE, "vehicle_3: mine.py:make"),
+    "a role that is code": (ROLE, "vehicle_3: __import__('os').system('touch pwned')"),
+    "a role with a device as its policy": (ROLE, "vehicle_3: ppo@/dev/zero"),
+    "a role that computes for ever": (ROLE, "vehicle_3: best_harm:99999999999"),
+    "a step that is too short": ("time_step_s: 0.1", "time_step_s: 1e-300"),
+}
+RECIPES: dict[str, tuple[str, str]] = {
+    "an algorithm in a Python file": ("\nalgorithm: ppo", "\nalgorithm: mine.py:make"),
+    "an algorithm of Python's own": ("\nalgorithm: ppo", "\nalgorithm: os.system"),
+    "a reward in a Python file": ("\nreward:", "\nreward: {'mine.py:make': 1}\nother:"),
+    "more worlds than memory": ("\nn_envs: ", "\nn_envs: 99999999"),
+    "a tag": ("\nalgorithm: ppo", "\nalgorithm: !!python/name:os.system"),
+}
+LISTS: dict[str, bytes] = {
+    "a formula": STATES.replace("7,7", "=cmd|'/c calc'!A1,7").encode(),
+    "an escape sequence in a column": STATES.replace("gap_1_m", "\x1b[2J").encode(),
+    "100,000 columns": b",".join([b"gap_1_m"] * 100_000) + b"\n1\n",
+    "a field of two million digits": STATES.replace("7,7", f"{'9' * 2_000_000},7").encode(),
+    "not text": STATES.encode() + b"\xed\xa0\x80",
+    "too large": b"7" * ((64 << 20) + 1),
+}
+
+
+def put(name: str, content: bytes | str, folder: Path) -> None:
+    (folder / "mine.py").write_text(PYTHON, "utf-8")
+    (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+
+
+def texts() -> Iterator[Case]:
+    read = partial(eb.load_recipe, "mine.yaml")
+    kinds: tuple[tuple[str, str, Command, dict[str, tuple[str, str]]], ...] = (
+        ("scenario", SCENARIO, ("scenario", "validate", "mine.yaml"), SCENARIOS),
+        ("recipe", RECIPE, read, RECIPES),
     )
-    yield Target("t.npz", good_bytes(), COMMAND, lambda path: BestHarmTable.load(Path(path)))
-    with tempfile.TemporaryDirectory() as folder:
-        bundle(Path(folder))
-        right = {name: (Path(folder) / "policy" / name).read_bytes() for name in (MANIFEST, WEIGHTS)}
-    for name in right:
-        yield Target(f"policy/{name}", right[name], EVALUATE, lambda path: load_policy("policy"), bundle)
+    for kind, text, command, changes in kinds:
+        for name, (old, new) in changes.items():
+            assert old in text, old
+            yield Case(f"{kind}: {name}", command, partial(put, "mine.yaml", text.replace(old, new, 1)))
+    for name, raw in (("UTF-16", SCENARIO.encode("utf-16")), ("not text", SCENARIO.encode() + b"\xff")):
+        yield Case(f"scenario: {name}", kinds[0][2], partial(put, "mine.yaml", raw))
+    for name, raw in LISTS.items():
+        yield Case(f"table of states: {name}", read_states, partial(put, "mine.csv", raw))
 
 
-def _socket(path: Path) -> None:
-    with socket.socket(socket.AF_UNIX) as server, chdir(path.parent):  # the name of a socket has at most 107 bytes
-        server.bind(path.name)
+def read_states() -> object:
+    return read_worlds(eb.load_scenario("paper-random"), Path("mine.csv"))
 
 
-def _loop(path: Path) -> None:
-    path.symlink_to(path.name + "2")
-    (path.parent / (path.name + "2")).symlink_to(path.name)
+# ---------------------------------------------------------------- archives of arrays
 
 
-def _outside(path: Path) -> None:
-    path.symlink_to(next(above for above in path.parents if above.name == INSIDE).parent / OUTSIDE)
+class Touch:
+    """Pickle that creates a file when it is loaded."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (Path("pwned"),)
 
 
-def _link(to: str, path: Path) -> None:
-    path.symlink_to(to)
+@cache
+def good_table() -> bytes:
+    """Return a valid table of best known harm, of three worlds."""
+    scenario = eb.load_scenario("paper-random")
+    return table_bytes(best_harm(scenario, scenario.sample(3, 7).worlds, budget=1, threads=1))
 
 
-DEVICES = (
-    "/dev/zero", "/dev/full", "/dev/tty", "/dev/stdin", "/dev/random", "/dev/null", "/proc/self/mem", "/proc/kmsg",
-    "/proc/self/fd/0",
-)  # fmt: skip
+def tables() -> dict[str, bytes]:
+    """Return tables of best known harm, as attackers might write them."""
+    good = good_table()
+    with np.load(io.BytesIO(good)) as arrays:
+        members = {f"{name}.npy": npy(array) for name, array in arrays.items()}
+    shape = members["identity.npy"].replace(b"(3,)", b"(1<<40,)")
+    return {
+        "pickled objects": packed({**members, "identity.npy": npy(np.array([Touch()] * 3, object))}),
+        "code in a header": packed({**members, "identity.npy": members["identity.npy"].replace(b"'<u8'", b"exit()")}),
+        "a shape that is code": packed({**members, "identity.npy": shape}),
+        "a bomb": packed({**members, "identity.npy": npy(np.zeros(1 << 27, np.uint64))}),
+        "a path outside": packed({**members, "../pwned.npy": members["identity.npy"]}),
+        "3,000 members": packed({**members, **{f"a{k}.npy": b"" for k in range(3_000)}}),
+        "sizes that lie": good.replace(b"PK\x01\x02", b"PK\x01\x02" + bytes(4), 1),
+        "a pickle": pickle.dumps(Touch()),
+        "cut off": good[: len(good) // 2],
+    }
+
+
+def archives() -> Iterator[Case]:
+    for name, content in tables().items():
+        yield Case(f"archive: {name}", partial(BestHarmTable.load, Path("t.npz")), partial(put, "t.npz", content))
+
+
+def npy(array: Any) -> bytes:
+    buffer = io.BytesIO()
+    np.lib.format.write_array(buffer, np.asanyarray(array), allow_pickle=True)
+    return buffer.getvalue()
+
+
+def packed(members: dict[str, bytes]) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return buffer.getvalue()
+
+
+# ---------------------------------------------------------------- policies, runs, places and command lines
+
+EVALUATE = ("evaluate", "--episodes", "2", "--agents", "ppo@policy")
+MANIFEST, WEIGHTS = "manifest.json", "weights.safetensors"
+
+
+def policies() -> Iterator[Case]:
+    def with_policy(change: Callable[[Path], object], folder: Path) -> None:
+        shutil.copytree(shipped_policies()["ppo"] / "policy", folder / "policy", copy_function=shutil.copyfile)
+        change(folder / "policy")
+
+    def edited(name: str, change: Callable[[bytes], bytes], policy: Path) -> None:
+        (policy / name).write_bytes(change((policy / name).read_bytes()))
+
+    attacks: dict[str, Callable[[Path], object]] = {
+        "another number in the manifest": partial(
+            edited, MANIFEST, lambda data: data.replace(b'"steps": ', b'"steps": 9')
+        ),
+        "a manifest that is deep": partial(edited, MANIFEST, lambda data: b"[" * 99_999),
+        "other weights": partial(edited, WEIGHTS, lambda data: data[:-1] + b"\x99"),
+        "a pickle as weights": partial(edited, WEIGHTS, lambda data: pickle.dumps(Touch())),
+        "a header of 2^63 bytes": partial(edited, WEIGHTS, lambda data: struct.pack("<Q", 2**63) + data[8:]),
+        "a file of code more": lambda policy: (policy / "policy.py").write_text(PYTHON),
+        "weights that are a link": lambda policy: (policy / WEIGHTS).symlink_to(
+            (policy / WEIGHTS).rename(policy.parent / WEIGHTS)
+        ),
+    }
+    for name, change in attacks.items():
+        yield Case(f"policy: {name}", EVALUATE, partial(with_policy, change))
+
+
+def runs(stopped: Path) -> Iterator[Case]:
+    """Yield an interrupted training that was changed before it is resumed."""
+
+    def with_run(change: Callable[[Path], object], folder: Path) -> None:
+        change(Path(shutil.copytree(stopped, folder / "run")))
+
+    def pickled(run: Path) -> None:
+        for file in run.glob("checkpoints/*/*"):
+            file.write_bytes(pickle.dumps(Touch()))
+
+    attacks: dict[str, tuple[Callable[[Path], object], bool]] = {
+        **{f"{name} is a link outside": (partial(link_out, name), not sure) for name, (_, sure) in LINKS.items()},
+        "checkpoints that are pickles": (pickled, True),
+        "settings that are deep": (lambda run: (run / "config.json").write_text("[" * 99_999), False),
+        "a status that lists files outside": (list_outside, True),
+    }
+    for name, (change, may_be_valid) in attacks.items():
+        yield Case(f"run: {name}", ("train", "--resume", "run"), partial(with_run, change), may_be_valid)
+
+
+def list_outside(run: Path) -> None:
+    status = json.loads((run / "run.json").read_text())
+    (run / "run.json").write_text(json.dumps({**status, "written": [f"../../{OUTSIDE}/{PRECIOUS}", "..", 7]}))
+
+
+def stopped_run(folder: Path) -> Path:
+    """Train, interrupt the training after its second evaluation, and return its folder."""
+    seen = []
+
+    def measure(policy: object) -> dict[str, float]:
+        seen.append(policy)
+        if len(seen) == 3:
+            signal.raise_signal(signal.SIGINT)
+        return {"first_impact_harm": 1.0, "total_harm": 1.0}
+
+    small = {"policy": [4], "value": [4]}
+    evaluation = {"every_updates": 2, "worlds": 2, "seed": 7}
+    recipe = eb.load_recipe("ppo").replace(
+        n_envs=4, batch_size=16, n_steps=8, n_epochs=1, total_steps=256, checkpoint_every_updates=2, network=small,
+        evaluation=evaluation,
+    )  # fmt: skip
+    train(recipe, eb.load_scenario("paper-random"), folder / "run", measure=lambda training: measure)
+    assert json.loads((folder / "run" / "run.json").read_text())["status"] == "interrupted"
+    return folder / "run"
+
+
 PLACES: dict[str, Callable[[Path], object]] = {
     "a pipe": os.mkfifo,
-    "a socket": _socket,
     "a folder": Path.mkdir,
-    "nothing": lambda path: None,
-    "a link to nothing": partial(_link, "nowhere"),
     "a link to itself": lambda path: path.symlink_to(path.name),
-    "links in a loop": _loop,
-    "a link to a folder": partial(_link, "."),
-    "a link to a folder elsewhere": _outside,
+    "a link to /dev/zero": lambda path: path.symlink_to("/dev/zero"),
     "ten gigabytes of nothing": lambda path: (path.touch(), os.truncate(path, 10 << 30)),
-    "an empty file": Path.touch,
-    **{f"a link to {device}": partial(_link, device) for device in DEVICES},
+}
+LINES: dict[str, tuple[str, ...]] = {
+    "an agent with an escape sequence": ("evaluate", "--agents", "\x1b[2J"),
+    "a setting that is code": ("evaluate", "--episodes", "3", "--set", "mass_t=__import__('os').system('touch pwned')"),
+    "an output that is a link outside": ("scenario", "new", "mine", "--output", "link"),
 }
 
 
-LONG = ("a" * 300, "a/" * 3000, "a" * 5000, f"../{INSIDE}/" * 300 + "x", HERE + "/" * 5000 + "x", "é" * 200)
+def places_and_lines() -> Iterator[Case]:
+    for name, place in PLACES.items():
+        yield Case(
+            f"scenario: {name}", ("scenario", "show", "mine.yaml"), lambda f, place=place: place(f / "mine.yaml")
+        )
+    for name, words in LINES.items():
+        yield Case(f"command: {name}", words, lambda f: (f / "link").symlink_to(f"../{OUTSIDE}/{PRECIOUS}"))
 
 
-def places(rng: random.Random) -> Iterator[Case]:
-    """Yield cases with every kind of file replaced by pipes, links, folders and so on, and with hostile file names."""
-    for target in targets():
-        for place, put in PLACES.items():
-            yield _at(target, place, put)
-        if "policy/" in target.name:
-            continue
-        suffix = Path(target.name).suffix
-        half = len(target.right) // 2
-        wrong = target.right[:half] + b"\n\tq: [" + target.right[half:]
-        for nasty in NASTY:
-            name = f"{nasty.replace('/', '_')}{rng.randrange(10)}{suffix}"
-            yield _named(target, "nasty name", name, partial(_write, name, wrong))
-            yield _named(target, "nasty name of nothing", name)
-        raw = os.fsdecode(b"\xff\xfe\x80") + suffix
-        yield _named(target, "name that is no text", raw, partial(_write, raw, b"\x00"))
-        for name in LONG:
-            yield _named(target, "long name", name + suffix)
-        yield _named(target, "name with NUL", f"a\0b{suffix}")
-        yield _named(target, "name that is empty", "")
-        yield _named(target, "below a file", f"f/x{suffix}", partial(_write, "f", b""))
-        yield _named(target, "name like an option", f"--help-me{suffix}")
-
-
-def _write(name: str, content: bytes, folder: Path) -> None:
-    write(folder / name, content)
-
-
-def _at(target: Target, category: str, put: Callable[[Path], object]) -> Case:
-    """Return a case with something else in the place of the file."""
-
-    def build(folder: Path) -> None:
-        target.beside(folder)
-        write(folder / "taken", b"")
-        (folder / target.name).unlink(missing_ok=True)
-        put(folder / target.name)
-
-    return Case(category, target.command, build, reader=partial(target.reader, target.name))
-
-
-def _named(target: Target, category: str, name: str, build: Build = lambda folder: None) -> Case:
-    """Return a case in which the file has another name."""
-    command = tuple(name if word == target.name else word for word in target.command)
-    reader = None if name.startswith("--") or not name else lambda: target.reader(name.replace(HERE, f"{Path.cwd()}"))
-    return Case(category, command, build, reader=reader)
-
-
-# ---------------------------------------------------------------- command lines
-
-FEW = ("--episodes", "3")
-NUMBERS = (
-    "", "-1", "0", "1.5", "1e3", "nan", "inf", "9" * 5000, "0x10", "1_000", "\u0663", "1;2", " 1 x", "None", "10000001",
-)  # fmt: skip
-WORDS = (
-    "", "x" * 9000, f"{HERE}/", "..", "a/../../b", "a\0b", "%s%n", "{}", "[/]", "[bold]", ":smile:", "$(touch pwned)",
-    "`touch pwned`", *NASTY,
-)  # fmt: skip
-VARIABLES = (
-    {"PYTHONWARNINGS": "error"}, {"COLUMNS": "1"}, {"COLUMNS": "9" * 30}, {"COLUMNS": "-5"}, {"LINES": "x"},
-    {"TERM": "\x1b[2J"}, {"LC_ALL": "\u202e"}, {"PYTHONIOENCODING": "ascii"}, {"NO_COLOR": ""}, {"FORCE_COLOR": "1"},
-    {"TTY_COMPATIBLE": "1"}, {"TMPDIR": f"{HERE}/file/x"}, {"TMPDIR": f"{HERE}/file"}, {"HOME": f"{HERE}/file/x"},
-    {"NUMBA_CACHE_DIR": f"{HERE}/file/x"}, {"MPLBACKEND": "nonsense"}, {"NUMBA_NUM_THREADS": "x"},
-    {"OMP_NUM_THREADS": "-1"}, {"MPLCONFIGDIR": f"{HERE}/file"}, {"PWD": f"{HERE}/nowhere"}, {"TZ": "\x1b"},
-    {"_ETHBRAKE_COMPLETE": "bash_source"}, {"_TYPER_STANDARD_TRACEBACK": "1"},
-)  # fmt: skip
-# Command lines in which ``@`` is replaced by a hostile word.
-LINES = (
-    "scenario show @", "scenario new @", "compare @ @", "train --resume @", "@",
-    "evaluate --episodes 3 --set @", "evaluate --episodes 3 --set mass_t=@", "evaluate --episodes 3 --set harm_count=@",
-    "evaluate --no@", "train --recipe @", "watch --agents coast --output @.svg",
-    "shield --episodes 3 --agents @", "agent export @ --onnx x.onnx", "study falsify --budget 10 --scenario @",
-    "study ablate --levels @ --output o",
-)  # fmt: skip
-# Places in the case's folder where not even the superuser can write.
-TARGETS = ("file", "file/x", "full", "link", "dangling", "loop", "pipe", "pipe/x", f"{HERE}/loop/x", "x" * 300, "\0b")
-WRITERS: dict[str, tuple[str, ...]] = {
-    "results": ("evaluate", "--agents", "coast", *FEW, "--output"),
-    "worlds": ("study", "falsify", "--agent", "coast", "--against", "full_brake", "--budget", "9", "--output"),
-    "run": ("train", "--steps", "1", "--output"),
-    "new scenario": ("scenario", "new", "mine", "--output"),
-    "film": ("watch", "--output"),
-}
-MAY_CHANGE = ("file", "full/results.json", "full/mine.yaml")
-
-
-def _taken(folder: Path) -> None:
-    write(folder / "file", "precious")
-    write(folder / "full" / "thesis.txt", "years of work")
-    (folder / "link").symlink_to(f"../../{OUTSIDE}/{PRECIOUS}")
-    (folder / "dangling").symlink_to("nowhere")
-    (folder / "loop").symlink_to("loop")
-    os.mkfifo(folder / "pipe")
-
-
-def commands(rng: random.Random) -> Iterator[Case]:
-    """Yield hostile command lines, output paths and environment variables."""
-    line = partial(Case, build=lambda folder: None, may_change=MAY_CHANGE)
-    for spec in (*SPECS, *(f"ppo@{word}" for word in WORDS), *(f"{word}:1" for word in WORDS if word)):
-        good = spec in ("ppo", "ladder", "constant:-7")
-        yield line("agent", ("evaluate", *FEW, "--agents", spec), certain=not good)
-    for number in NUMBERS:
-        certain = number not in ("0", "0x10", "\u0663", "10000001", "1e3", "1_000")
-        for option in ("--seed", *(["--episodes"] if number != "10000001" else [])):  # so many worlds take long
-            yield line("number", ("evaluate", "--agents", "coast", option, number), certain=certain)
-        if number != "10000001":  # a large budget is allowed to take long
-            wrong = number in ("", "-1", "0", "1.5", "nan")
-            yield line(
-                "number",
-                ("study", "falsify", "--agent", "coast", "--measure", "harm", "--budget", number),
-                certain=wrong,
-            )
-    for word, text in itertools.product(WORDS, LINES):
-        yield line("word", tuple(each.replace("@", word) for each in text.split(" ")))
-    for (what, command), target in itertools.product(WRITERS.items(), TARGETS):
-        taken = partial(Case, f"output taken: {what}", build=_taken, may_change=MAY_CHANGE)
-        yield taken((*command, target), certain=what not in ("new scenario", "results") or target != "full")
-        if what not in ("run", "new scenario"):
-            yield taken((*command, target, "--force"), certain=target != ("full" if what == "results" else "file"))
-    for variables in VARIABLES:
-        around = partial(Case, build=partial(_write, "file", b"precious"), environment=variables)
-        yield around("environment", ("evaluate", "--agents", "coast,full_brake", *FEW), certain=False)
-        yield around("environment, error", ("evaluate", "--agents", "ppo@\x1b[2J"))
-
-
-KINDS: dict[str, Generator] = {
-    **{kind: partial(text_cases, kind) for kind in ("scenario", "recipe", "sweep", "worlds", "tuning", "CSV")},
-    "table": table_cases,
-    "place": places,
-    "bundle": bundle_cases,
-    "run": partial(run_cases, "run"),
-    "checkpoint": partial(run_cases, "checkpoint"),
-    "command": commands,
-}
-
-
-# ---------------------------------------------------------------- the attack
-
-
-OPTIONS = {"--sample": {"type": int, "help": "number of cases per category"}, "--seed": {"type": int, "default": 0}}
-
-
-def by_category(kind: str, seed: int) -> dict[str, list[Case]]:
-    """Return the cases of a kind by category, each category shuffled."""
-    grouped: dict[str, list[Case]] = defaultdict(list)
-    for case in KINDS[kind](random.Random(f"{seed} {kind}")):
-        grouped[case.category].append(case)
-    for group in grouped.values():
-        random.Random(f"{seed} {kind} sample").shuffle(group)
-    return grouped
+# ---------------------------------------------------------------- the cage
 
 
 def cases(given: Given) -> Cases:
     with tempfile.TemporaryDirectory(prefix="hostile-", ignore_cleanup_errors=True) as folder:
-        own = Path(folder).resolve()
-        tempfile.tempdir = os.fspath(own)
-        os.chdir(own)
-        if not given.list:
-            warm_up(own)
-        for kind in KINDS:
-            for number, (category, group) in enumerate(by_category(kind, given.seed).items()):
-                tried = group[: given.sample]
-                yield f"{kind}: {category}, {len(tried)}", partial(attack, tried, own / f"{kind}-{number}")
-
-
-def attack(tried: list[Case], folder: Path) -> Told:
-    """Judge the cases of a category."""
-    verdicts = []
-    for case in tried:
-        verdicts.append(judge(case, folder))
-        if faults := verdicts[-1].faults:
-            print(f"BROKEN {' '.join(case.command)!a:.120}:", *(f"    {each!a:.400}" for each in faults), sep="\n")
-    refused = sum(verdict.status == REFUSED for verdict in verdicts)
-    broken = sum(bool(verdict.faults) for verdict in verdicts)
-    slowest, longest = max(verdict.cpu_s for verdict in verdicts), max(verdict.longest for verdict in verdicts)
-    return Told(
-        not broken,
-        f"{refused} refused, {len(tried) - refused - broken} valid, {broken} broke a rule; at most {slowest:.2f} s"
-        f" of processor time and {longest} characters per line",
-    )
-
-
-WARM = (
-    *(f"{command} {place}{file}{rest}"
-      for place in ("", "bad/")
-      for command, file, rest in (
-          ("scenario validate", "scenario.yaml", ""),
-          ("train --recipe", "recipe.yaml", " --output file"),
-          ("study sweep", "sweep.yaml", " --output file"),
-          ("study tune", "tuning.yaml", " --output file"),
-          ("study falsify --again", "worlds.yaml", ""),
-      )),
-    "train --resume ppo", "train --resume sac", "nonsense", "shield --agents x",
-    "study ablate --levels x --output x", "agent export x --onnx x", "watch --output file",
-    "evaluate --agents coast,full_brake --episodes 3 --output out --per-world csv",
-)  # fmt: skip
+        tempfile.tempdir = folder
+        os.chdir(folder)
+        warm_up(Path(folder))
+        for k, case in enumerate(
+            (*texts(), *archives(), *policies(), *places_and_lines(), *runs(stopped_run(Path(folder))))
+        ):
+            yield case.name, partial(judge, case, Path(folder) / f"case-{k}")
 
 
 def warm_up(folder: Path) -> None:
-    """Import late modules and compile the kernels, so that a case is charged only for its own work."""
-    torch.set_num_threads(1)
-    typer.main.get_command = functools.cache(typer.main.get_command)  # else built per command line
-    write(folder / "file", "")
-    for place in (folder, folder / "bad"):
-        for kind, text in texts().items():
-            write(place / f"{kind}{Path(text.file).suffix}", text.text if place == folder else "bad: [")
-        write(place / "t.npz", good_bytes() if place == folder else b"")
-    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
-        for algorithm in ("ppo", "sac"):
-            shutil.copytree(stopped(algorithm), folder / algorithm)
-        for line in WARM:
-            run_command(line.split(" "))
-        for place, read in itertools.product((folder, folder / "bad"), (read_states, read_table)):
-            with suppress(EthBrakeError):
-                read(place / ("CSV.csv" if read is read_states else "t.npz"))
+    """Read valid files: late modules are imported and kernels compiled, so that a case is charged for its own work."""
+    put("mine.yaml", SCENARIO, folder)
+    put("mine.csv", STATES, folder)
+    with redirect_stdout(io.StringIO()):
+        for words in (("scenario", "validate", "mine.yaml"), ("evaluate", "--episodes", "2", "--agents", "ppo")):
+            assert run_command(words) == 0, words
+    read_states()
+    put("mine.yaml", RECIPE, folder)
+    eb.load_recipe("mine.yaml")
+
+
+def judge(case: Case, folder: Path) -> Told:
+    """Build the case in the new ``folder``, run it in a child process, and check the rules."""
+    inside, told = folder / "inside", folder.with_suffix(".told")
+    (folder / OUTSIDE).mkdir(parents=True)
+    (folder / OUTSIDE / PRECIOUS).write_text("years of work")
+    inside.mkdir()
+    case.build(inside)
     sys.stdout.flush()
-    gc.collect()
-    gc.freeze()  # so that children share these pages
+    child = os.fork()
+    if child == 0:
+        status = BROKEN
+        try:
+            status = caged(case, inside, told)
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            sys.stderr.flush()
+            os._exit(status)
+    timer = threading.Timer(WALL_LIMIT_S, os.kill, (child, signal.SIGKILL))
+    timer.start()
+    _, ended, _ = os.wait4(child, 0)
+    timer.cancel()
+    faults = [*broken_rules(case, os.waitstatus_to_exitcode(ended), told.read_text("utf-8", "backslashreplace"))]
+    faults += ["code was executed"] if (inside / "pwned").exists() or (folder / "pwned").exists() else []
+    kept = [path.name for path in (folder / OUTSIDE).iterdir()]
+    if kept != [PRECIOUS] or (folder / OUTSIDE / PRECIOUS).read_text() != "years of work":
+        faults.append(f"changed outside: {kept}")
+    shutil.rmtree(folder)
+    return Told(not faults, "; ".join(faults))
+
+
+def caged(case: Case, inside: Path, told: Path) -> int:
+    """In the child: set limits and hooks, read the file, and return the exit status."""
+    for stream in (1, 2):
+        os.dup2(os.open(told, os.O_CREAT | os.O_WRONLY | os.O_APPEND), stream)
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+    os.chdir(inside)
+    size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    for what, most in ((resource.RLIMIT_AS, size + MEMORY_LIMIT_BYTES), (resource.RLIMIT_CPU, CPU_LIMIT_S)):
+        resource.setrlimit(what, (most, most))
+    sys.addaudithook(partial(watch, os.path.realpath(inside) + os.sep))
+    if isinstance(case.command, tuple):
+        return run_command(case.command)
+    try:
+        case.command()
+    except EthBrakeError as error:
+        print(f"ethbrake: error: {error}", file=sys.stderr)
+        return REFUSED
+    return 0
+
+
+EXECUTING = (
+    "os.system", "os.exec", "os.posix_spawn", "os.fork", "subprocess.Popen", "pickle.find_class", "socket.connect",
+)  # fmt: skip
+CHANGING = {  # event -> which of its arguments is the changed path, and which the open folder that it is relative to
+    "os.mkdir": (0, 2), "os.remove": (0, 1), "os.rmdir": (0, 1), "os.truncate": (0, 0), "os.rename": (1, 3),
+    "os.symlink": (1, 2), "os.link": (1, 3), "shutil.rmtree": (0, 1),
+}  # fmt: skip
+WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+
+
+def watch(own: str, event: str, arguments: tuple[Any, ...]) -> None:
+    """Report what is executed; refuse and report changes of files outside the folder ``own``."""
+    if event in EXECUTING:
+        os.write(2, f"{DEED}executed {event} {arguments!r:.60}\n".encode())
+    writes = event == "open" and isinstance(arguments[2], int) and arguments[2] & WRITING
+    if not writes and event not in CHANGING:
+        return
+    path, folder = CHANGING.get(event, (0, 0))
+    if isinstance(arguments[path], int):
+        return
+    name, base = os.fsdecode(arguments[path]), arguments[folder]
+    if folder and isinstance(base, int) and base >= 0:
+        name = os.path.join(os.readlink(f"/proc/self/fd/{base}"), name)
+    place = os.path.realpath(name if writes and not arguments[2] & os.O_NOFOLLOW else os.path.dirname(name) or ".")
+    if place != os.devnull and not f"{place}{os.sep}".startswith(own):
+        os.write(2, f"{DEED}{event} {place}\n".encode())
+        raise PermissionError("outside the case's folder", place)
+
+
+def broken_rules(case: Case, status: int, told: str) -> Iterator[str]:
+    lines = told.split("\n")
+    errors = [line for line in lines if line.startswith("ethbrake: error: ")]
+    if status != REFUSED and (status != 0 or not case.may_be_valid):
+        yield f"exit status {status}: {lines[-2:]}"[:300]
+    if status == REFUSED and len(errors) != 1:
+        yield f"not one line of error: {told!r:.300}"
+    if status == REFUSED and "not enough memory" in told:
+        yield "the file was unpacked before it was refused"
+    yield from (line for line in lines if line.startswith(DEED))
+    if any(len(line) > LINE_LIMIT or not line.isprintable() for line in (errors if status == 0 else lines)):
+        yield "a line is too long, or has control characters"

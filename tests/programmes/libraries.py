@@ -4,8 +4,8 @@ The programs of docs/train.md and docs/extensions/benchmarl.md run, too, in the 
 
 Each library has its own environment in ``.venvs/``, with this project in its present state. A library that cannot be
 installed is skipped with the reason. A policy is evaluated on a fixed list of worlds, together with full braking. If
-the library can evaluate policies itself, its harm is compared with ours, world by world. ``--write`` writes the rows to
-docs/results/libraries.json. ``--ci`` runs only the libraries that are cheap to install.
+the library can evaluate policies itself, its harm is compared with ours, world by world. docs/results/libraries.md has
+the rows that are printed. ``--ci`` runs only the libraries that are cheap to install.
 """
 
 import json
@@ -25,12 +25,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tests.docs.site import load
 from tests.programmes import KEPT, ROOT, Cases, Given, NotInstalled, Told, ready_python, watched
 
 PAGE = Path(__file__).with_name("libraries.md")
 TRAIN, BENCHMARL = ROOT / "docs" / "train.md", ROOT / "docs" / "extensions" / "benchmarl.md"
-MEASURED = load("results")
 SCENARIO, EPISODES, SEED = "paper-random", 500, 7
 OWN_EPISODES, CLOSE = 50, 1e-5  # worlds of the library's own evaluation, and tolerance in m2/s2
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
@@ -291,7 +289,6 @@ def cpu_seconds() -> float:
 OPTIONS = {
     "--ci": {"action": "store_true", "help": "only the libraries that are cheap to install"},
     "--limit": {"type": float, "default": 900.0, "help": "limit for one program, in seconds"},
-    "--write": {"action": "store_true", "help": "write the rows to docs/results/libraries.json"},
 }
 
 
@@ -299,7 +296,7 @@ def cases(given: Given) -> Cases:
     taken = {library for library in LIBRARIES if LIBRARIES[library].in_ci or not given.ci}
     for k, way in enumerate(ways()):
         if way.library in taken:
-            yield f"{way.library}: {way.title} ({way.ran})", partial(run, way.library, f"tell({k})", given, way)
+            yield f"{way.library}: {way.title} ({way.ran})", partial(run, way.library, f"tell({k})", given)
     if "BenchMARL" in taken:
         yield (
             "BenchMARL: docs/train.md, docs/extensions/benchmarl.md",
@@ -307,7 +304,7 @@ def cases(given: Given) -> Cases:
         )
 
 
-def run(library: str, function: str, given: Given, way: Way | None = None) -> Told:
+def run(library: str, function: str, given: Given) -> Told:
     """Run one program, or the programs of the pages, in the environment of its library."""
     name = re.sub(r"\W+", "_", library.lower())
     try:
@@ -327,19 +324,7 @@ def run(library: str, function: str, given: Given, way: Way | None = None) -> To
     if status:
         return Told(False, f"exit status {status}: {last}")
     cells = json.loads(last)
-    if given.write and way is not None:
-        write_row(way, cells)
     return Told(True, "  ".join(filter(None, cells)))
-
-
-def write_row(way: Way, cells: list[str]) -> None:
-    """Replace the row of the same library and title in docs/results/libraries.json."""
-    row = [way.library, cells[0], lowered(way.title), way.ran, *cells[1:]]
-    (table,) = MEASURED.read_tables("libraries")
-    rows = [row if (each[0], each[2]) == (row[0], row[2]) else each for each in table.rows]
-    assert row in rows, f"docs/results/libraries.json has no row for {way.library}, {way.title}"
-    changed = table.model_copy(update={"rows": rows})
-    (MEASURED.RESULTS / "libraries.json").write_text(MEASURED.text_of([changed]), "utf-8")
 
 
 def lowered(title: str) -> str:

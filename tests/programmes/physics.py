@@ -19,8 +19,6 @@ from ethbrake_marl.game.harm import split
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.left_out import Impacts
 from ethbrake_marl.physics.state import Floats, Ints, Worlds, make_worlds
-from tests.extensions.proofs.test_lower_bound import bounded_and_found
-from tests.fixtures.lines import REGIONS
 from tests.golden.test_golden import GOLDEN, figures
 from tests.physics.exact_simulator import line_of, simulate
 from tests.physics.manufacture import Case, manufactured, pressed, stored
@@ -88,11 +86,6 @@ def measured(measure: Callable[[], Figure]) -> Told:
 OPTIONS = {
     "--small-step-worlds": {"type": int, "default": 10_000, "help": "worlds of 'brakes that build up'"},
     "--one-physics-worlds": {"type": int, "default": 10_000, "help": "worlds of 'one physics'"},
-    "--bounded-worlds": {
-        "type": int,
-        "default": 3_500,
-        "help": "worlds of each region of 'lower bound where brakes build up'",
-    },
 }
 
 
@@ -107,20 +100,9 @@ def cases(given: Given) -> Cases:
         N, learners, obstacle, in_pieces = kind
         told = f"one physics, N = {N}, {len(learners)} decide{', obstacle' * obstacle}{', in pieces' * in_pieces}"
         yield told, partial(measured, partial(one_physics, kind, max(1, given.one_physics_worlds // len(KINDS))))
-    for region in REGIONS:
-        told = f"lower bound where brakes build up, {region}"
-        yield told, partial(measured, partial(never_above, region, given.bounded_worlds))
 
 
 # ---------------------------------------------------------------- brakes that build up
-
-
-def never_above(region: str, worlds: int) -> Figure:
-    """Return the largest excess of the lower bound over the least harm of all tried profiles, for both counts."""
-    found = [(bound.harm, least) for bound, least in bounded_and_found(region, worlds, 600, seed=7)]
-    bounds, least = (np.concatenate(each) for each in zip(*found, strict=True))
-    above = float(np.max(bounds - least, initial=0.0))
-    return Figure(above, 0.0, f"{len(least):,} searches, harm {bounds.mean():.3f} of {least.mean():.3f} proven")
 
 
 def small_steps(N: int, obstacle: bool, in_pieces: bool, worlds: int) -> Figure:

@@ -72,7 +72,7 @@ COMMANDS = (
     Call(("ethbrake", "evaluate", "--agents", SHIPPED, "--episodes", "200")),
     Call(("ethbrake", "evaluate", "--agents", "full_brake,ppo+step", "--episodes", "20", "--json")),
     Call(("ethbrake", "shield", "--agents", "ppo", "--episodes", "20")),
-    Call(("ethbrake", "watch", "--output", "film.svg")),
+    Call(("ethbrake", "watch", "--output", "film.png")),
     Call(("ethbrake", "scenario", "validate", "paper-random")),
     Call(("ethbrake", "doctor")),
     Call(("ethbrake", "train", "--steps", "1000"), 2, NEEDS_TRAIN),

@@ -33,28 +33,6 @@ def test_follower__keeps_its_time_gap_at_the_speed_of_the_last_vehicle() -> None
     assert line.replace(follower={}).vehicles == 4
 
 
-def test_follower__of_a_table_drives_at_the_speed_of_each_row() -> None:
-    table = {"columns": ["gap_1_m", "speed_1_mps", "speed_2_mps"], "rows": [[5, 20, 10], [7, 20, 15]]}
-    content = {key: value for key, value in PAIR.items() if key not in ("gaps_m", "speeds_mps")}
-    worlds = Scenario(**content, table=table, follower={"time_gap_s": 2.0}).sample(50, 7).worlds
-    rows = {(*gaps, *speeds) for gaps, speeds in zip(worlds.gaps_m.tolist(), worlds.speeds_mps.tolist(), strict=True)}
-    assert rows == {(5.0, 20.0, 20.0, 10.0, 10.0), (7.0, 30.0, 20.0, 15.0, 15.0)}
-
-
-def test_follower__of_a_table_of_gaps_stands_in_it_too() -> None:
-    table = {"columns": ["gap_1_m", "recording"], "rows": [[5, "a: 1-2"], [7, "b: 1-2"]]}
-    content = {key: value for key, value in PAIR.items() if key != "gaps_m"}
-    gaps = Scenario(**content, table=table, follower={}).sample(50, 7).worlds.gaps_m
-    assert {tuple(each) for each in gaps.tolist()} == {(5.0, 12.0), (7.0, 12.0)}
-
-
-def test_follower__of_time_gaps_has_one_too() -> None:
-    content = {key: value for key, value in PAIR.items() if key != "gaps_m"}
-    line = Scenario(**content, time_gaps_s={"uniform": [1, 2]}, follower={})
-    gaps = line.sample(20, 7).worlds.gaps_m
-    assert (gaps[:, 1] == 0.6 * 20.0).all() and len(set(gaps[:, 0])) == 20
-
-
 def test_follower__beside_a_mixture_stands_behind_each_of_its_lines() -> None:
     both = [{"scenario": {**PAIR, "name": name, "speeds_mps": speed}} for name, speed in (("slow", 10), ("fast", 20))]
     worlds = Scenario(name="both", mixture=both, follower={}).sample(30, 7).worlds

@@ -47,135 +47,38 @@ def loaded(text: str) -> Scenario:
 
 
 QUANTITIES_AND_ROLES: dict[str, Callable[[], object]] = {
-    "line 15: road_friction: unknown key; declare the friction of the road with the key friction, for": lambda: given(
-        gaps_m=None, road_friction="0.7"
-    ),
-    "line 15: gaps_km: unknown key; did you mean gaps_m (metres)?": lambda: given(gaps_m=None, gaps_km="0.007"),
-    "line 15: restituton: unknown key; did you mean restitution?": lambda: given(restitution=None, restituton="0.1"),
+    "line 15: road_friction: unknown key;": lambda: given(gaps_m=None, road_friction="0.7"),
+    "line 15: gaps_km: unknown key; did you": lambda: given(gaps_m=None, gaps_km="0.007"),
     "line 15: zzz: unknown key": lambda: given(restitution=None, zzz="0.1"),
-    "bad.yaml: gaps_m: missing; write, for instance, gaps_m: [7, 7], or time_gaps_s: [1": lambda: given(gaps_m=None),
-    "bad.yaml: name: missing; write, for instance, name: my-scenario": lambda: given(name=None),
-    "line 5: gaps_m = -1: must be finite and in [0, 10000] m (metres)": lambda: given(gaps_m="-1"),
-    "line 5: gaps_m: has 3 entries; must have 2, one per pair, or be a single": lambda: given(gaps_m="[7, 7, 7]"),
+    "bad.yaml: gaps_m: missing; write, for": lambda: given(gaps_m=None),
+    "bad.yaml: name: missing; write, for": lambda: given(name=None),
+    "line 5: gaps_m = -1: must be finite and": lambda: given(gaps_m="-1"),
+    "line 5: gaps_m: has 3 entries; must": lambda: given(gaps_m="[7, 7, 7]"),
     "line 5: gaps_m = []: must not be empty": lambda: given(gaps_m="[]"),
-    'line 5: gaps_m = "7": must be a number, not text; write it without quotes': lambda: given(gaps_m='"7"'),
-    "line 5: gaps_m = true: must be a number or a distribution": lambda: given(gaps_m="true"),
-    "must be a number or a distribution; leave the key out if you do not need it": lambda: given(gaps_m=""),
-    "line 5: gaps_m[1] (vehicle_2 to vehicle_3) = .inf: must be a finite number": lambda: given(gaps_m="[7, .inf]"),
-    "line 5: gaps_m[0] (vehicle_1 to vehicle_2) = [7]: must be a number, {uniform": lambda: given(gaps_m="[[7], 7]"),
-    "line 5: gaps_m = {unifrom: [5, 9]}: must be a number, {uniform: [low, high]}, {loguniform": lambda: given(
-        gaps_m="{unifrom: [5, 9]}"
-    ),
-    "line 5: gaps_m.uniform = 5: must be a list": lambda: given(gaps_m="{uniform: 5}"),
-    "line 5: gaps_m.uniform[1]: missing; two numbers [low, high] are needed": lambda: given(gaps_m="{uniform: [5]}"),
-    "line 5: gaps_m.uniform = [5, 6, 7]: must have 2 entries": lambda: given(gaps_m="{uniform: [5, 6, 7]}"),
-    "line 5: gaps_m.uniform = [9, 6]: low must not be above high": lambda: given(gaps_m="{uniform: [9, 6]}"),
-    "line 5: gaps_m.uniform[1] = .nan: must be a finite number": lambda: given(gaps_m="{uniform: [5, .nan]}"),
-    "line 5: gaps_m.choice: cannot be combined with the other keys here; a quantity has only one": lambda: given(
-        gaps_m="{uniform: [5, 9], choice: [7]}"
-    ),
-    "line 5: gaps_m.normal.high: missing; a number is needed, as in {normal: {mean: 20": lambda: given(
-        gaps_m="{normal: {mean: 7, sd: 1, low: 5}}"
-    ),
-    "line 5: gaps_m.normal.std: unknown key; did you mean sd?": lambda: given(
-        gaps_m="{normal: {mean: 7, std: 1, low: 5, high: 9}}"
-    ),
-    "line 5: gaps_m.normal = {mean: 7, sd: 0, low: 5, high: 9}: sd must be above 0": lambda: given(
-        gaps_m="{normal: {mean: 7, sd: 0, low: 5, high: 9}}"
-    ),
-    "line 5: gaps_m.normal = {mean: 7, sd: 1, low: 9, high: 9}: low must be below high": lambda: given(
+    'line 5: gaps_m = "7": must be a number,': lambda: given(gaps_m='"7"'),
+    "line 5: gaps_m = true: must be a number": lambda: given(gaps_m="true"),
+    "line 5: gaps_m = {unifrom: [5, 9]}:": lambda: given(gaps_m="{unifrom: [5, 9]}"),
+    "line 5: gaps_m.uniform[1]: missing; two": lambda: given(gaps_m="{uniform: [5]}"),
+    "line 5: gaps_m.uniform = [5, 6, 7]:": lambda: given(gaps_m="{uniform: [5, 6, 7]}"),
+    "line 5: gaps_m.uniform = [9, 6]: low": lambda: given(gaps_m="{uniform: [9, 6]}"),
+    "line 5: gaps_m.choice: cannot be": lambda: given(gaps_m="{uniform: [5, 9], choice: [7]}"),
+    "line 5: gaps_m.normal.high: missing; a": lambda: given(gaps_m="{normal: {mean: 7, sd: 1, low: 5}}"),
+    "line 5: gaps_m.normal = {mean: 7, sd:": lambda: given(gaps_m="{normal: {mean: 7, sd: 0, low: 5, high: 9}}"),
+    "line 5: gaps_m.normal = {mean: 7, sd: 1, low: 9,": lambda: given(
         gaps_m="{normal: {mean: 7, sd: 1, low: 9, high: 9}}"
     ),
-    "line 5: gaps_m.normal = {mean: 7, sd: 1, low: 20, high: 99}: the untruncated distribution must": lambda: given(
+    "line 5: gaps_m.normal = {mean: 7, sd: 1, low: 20,": lambda: given(
         gaps_m="{normal: {mean: 7, sd: 1, low: 20, high: 99}}"
     ),
-    "line 5: gaps_m.choice = []: must not be empty": lambda: given(gaps_m="{choice: []}"),
-    "line 5: gaps_m.weights = [1]: must have as many entries as choice (2)": lambda: given(
-        gaps_m="{choice: [7, 8], weights: [1]}"
-    ),
-    "every weight must be above 0, and their sum finite": lambda: given(gaps_m="{choice: [7, 8], weights: [1, 0]}"),
-    "line 5: gaps_m.loguniform = [0, 1]: low must be above 0": lambda: given(gaps_m="{loguniform: [0, 1]}"),
-    "line 9: mass_t[1] (vehicle_2) = -5.5: must be finite and in (0, 1000] t": lambda: given(mass_t="[4.5, -5.5, 5.9]"),
-    "line 7: braking_capacity_mps2 = 0: must be finite and in (0, 100] m/s2": lambda: given(braking_capacity_mps2="0"),
-    "must not be above speed_limit_mps of vehicle_3, 40 m/s": lambda: given(speeds_mps="[1, 2, {choice: [3, 41]}]"),
-    "must not be above speed_limit_mps of vehicle_1, {uniform": lambda: given(speed_limit_mps="{uniform: [19, 40]}"),
-    "line 10: latency_s[2] (vehicle_3) = 8: must be below horizon_s (8 s)": lambda: given(latency_s="[0, 0.5, 8]"),
-    "line 12: restitution = 1.01: must be finite and in [0, 1]": lambda: given(restitution="1.01"),
-    "line 3: time_step_s = 9: must not be above horizon_s (8 s)": lambda: given(time_step_s="9"),
-    "line 4: horizon_s = -8: must be greater than 0": lambda: given(horizon_s="-8"),
-    "line 2: vehicles = 1: must be greater than or equal to 2": lambda: given(vehicles="1"),
-    "must be a whole number, written without a decimal point or an exponent": lambda: given(vehicles="3.0"),
-    "unknown vehicle; this scenario has vehicle_1 ...": lambda: given(roles="{vehicle_2: learner, vehicle_4: coast}"),
-    "line 13: roles.vehicel_2 = learner: unknown vehicle; did you mean vehicle_2?": lambda: given(
-        roles="{vehicel_2: learner}"
-    ),
-    "line 13: roles.vehicle_2 = Learner: agent 'Learner': must be name or name:argument": lambda: given(
-        roles="{vehicle_2: Learner}"
-    ),
-    "line 13: roles.vehicle_2 = learner:1: learner takes no argument": lambda: given(roles="{vehicle_2: learner:1}"),
-    "line 13: roles.vehicle_2 = 2: must be text": lambda: given(roles="{vehicle_2: 2}"),
-    "line 13: roles = [learner]: must be a mapping": lambda: given(roles="[learner]"),
-    "line 13: roles.vehicle_1 = constant: agent 'constant': constant needs a finite deceleration": lambda: given(
-        roles="{vehicle_1: constant, vehicle_2: learner}"
-    ),
-    "line 13: roles.vehicle_1 = constant:7: must not be above the braking_capacity_mps2 of vehicle_1": lambda: given(
-        roles="{vehicle_1: constant:7, vehicle_2: learner}"
-    ),
-    "line 13: roles.vehicle_1 = constant:-7: must not be above the driving_capacity_mps2 of vehicle_1": lambda: given(
-        roles="{vehicle_1: constant:-7, vehicle_2: learner}"
-    ),
-    "line 13: roles.vehicle_1 = {profile: []}: a profile must be a list of 1 to 64 pairs [start in s": lambda: given(
-        roles="{vehicle_1: {profile: []}, vehicle_2: learner}"
-    ),
-    'line 13: roles.vehicle_1 = "profile:0=3,1=6.5": must not be above the braking_capacity_mps2': lambda: given(
-        roles="{vehicle_1: {profile: [[0, 3], [1, 6.5]]}, vehicle_2: learner}"
-    ),
-    "such as [[0, 3], [1, 7]]; the first start must be 0, and each later start must be larger": lambda: given(
-        roles="{vehicle_1: {profile: [[0.5, 3]]}, vehicle_2: learner}"
-    ),
-    "[1, -1] is not a list of two numbers in [0, 3600]": lambda: given(
-        roles="{vehicle_1: {profile: [[0, 3], [1, -1]]}, vehicle_2: learner}"
-    ),
-    "line 13: roles.vehicle_1 = {profile: [[0, 3]], coast: 1}: must be learner, the name of a script": lambda: given(
-        roles="{vehicle_1: {profile: [[0, 3]], coast: 1}, vehicle_2: learner}"
-    ),
-    "line 13: roles.vehicle_3 = e_v2x_bm: with early_impacts: reject, a script must be full_brake": lambda: given(
-        roles="{vehicle_3: e_v2x_bm, vehicle_2: learner}"
-    ),
-    "a script must be full_brake, coast, constant:a or a profile; did you mean full_brake?": lambda: given(
-        roles="{vehicle_3: ful_brake, vehicle_2: learner}"
-    ),
-    "line 14: early_impacts = refuse: must be keep or reject": lambda: given(early_impacts="refuse"),
-    "must be 1 to 64 lower case letters, digits, - and _, beginning with a letter": lambda: given(name="Bad Name"),
-    "bad.yaml: speeds_mps: missing; write, for instance, speeds_mps: [20": lambda: given(speeds_mps=None, gaps_m="7"),
-    "line 15: time_gaps_s = 1: give either gaps_m or time_gaps_s, not both": lambda: given(
-        gaps_m="7", time_gaps_s="1", speeds_mps="20"
-    ),
-    "line 15: line_speed_mps = 20: give either speeds_mps or line_speed_mps, not both": lambda: given(
-        gaps_m="7", speeds_mps="20", line_speed_mps="20"
-    ),
-    "line 15: speed_deviations_mps = 0: can be used only with line_speed_mps, the speed to which": lambda: given(
-        gaps_m="7", speeds_mps="20", speed_deviations_mps="0"
-    ),
-    "line 15: time_gaps_s[1] (vehicle_2 to vehicle_3) = 61: must be finite and in (0, 60] s": lambda: given(
-        gaps_m=None, time_gaps_s="[1, 61]", speeds_mps="20"
-    ),
-    "line 15: time_gaps_s[1] (vehicle_2 to vehicle_3) = 60: gives gaps up to 11400 m at the speed of": lambda: given(
-        gaps_m=None, time_gaps_s="[1, 60]", speeds_mps="[20, 20, 190]", speed_limit_mps="200"
-    ),
-    "line 15: line_speed_mps = {uniform: [1, 38]}: with speed_deviations_mps vehicle_2 has a speed of": lambda: given(
-        speeds_mps=None,
-        gaps_m="7",
-        line_speed_mps="{uniform: [1, 38]}",
-        speed_deviations_mps="[0, {uniform: [-2, 2]}, 0]",
-    ),
-    "give either obstacle_gap_m or obstacle_margin_m": lambda: given(obstacle_margin_m="1.7", obstacle_gap_m="42"),
-    "line 15: obstacle_margin_m = 0: must be finite and in (0, 10000] m (metres)": lambda: given(obstacle_margin_m="0"),
-    "line 15: obstacle_margin_m = 5: puts the obstacle up to 20005 m ahead of vehicle_1": lambda: given(
-        obstacle_margin_m="5", braking_capacity_mps2="{uniform: [0.01, 5]}"
-    ),
-    "vehicle_1 can learn only with an obstacle ahead; add one, for": lambda: given(roles="{vehicle_1: learner}"),
-    "must be finite and in (0, 1e+06] m/s3 (metres per second cubed)": lambda: given(brake_rate_mps3="0"),
+    "line 5: gaps_m.weights = [1]: must have": lambda: given(gaps_m="{choice: [7, 8], weights: [1]}"),
+    "every weight must be above 0, and their": lambda: given(gaps_m="{choice: [7, 8], weights: [1, 0]}"),
+    "must not be above speed_limit_mps of": lambda: given(speed_limit_mps="{uniform: [19, 40]}"),
+    "line 10: latency_s[2] (vehicle_3) = 8:": lambda: given(latency_s="[0, 0.5, 8]"),
+    "line 4: horizon_s = -8: must be greater": lambda: given(horizon_s="-8"),
+    "unknown vehicle; this scenario has": lambda: given(roles="{vehicle_2: learner, vehicle_4: coast}"),
+    "line 13: roles.vehicel_2 = learner:": lambda: given(roles="{vehicel_2: learner}"),
+    "line 13: roles.vehicle_2 = Learner:": lambda: given(roles="{vehicle_2: Learner}"),
+    "line 13: roles.vehicle_2 = learner:1:": lambda: given(roles="{vehicle_2: learner:1}"),
 }
 
 
@@ -186,29 +89,10 @@ def test_key__is_refused_with_its_line_and_what_would_be_right(message: str) -> 
 
 
 VEHICLE_TYPES: dict[str, Callable[[], object]] = {
-    "line 15: vehicle_types.any: any means every type, so it cannot be a name; use": lambda: given(
-        vehicle_types="{any: {}}"
-    ),
-    "must not be empty; leave the key out if you do not need it": lambda: given(vehicle_types="{}"),
-    "must be a number or a distribution; leave the key out if": lambda: given(vehicle_types="{car: {mass_t: null}}"),
-    "line 15: vehicle_types.car.load = 2: a load must be in [0, 1]": lambda: given(vehicle_types="{car: {load: 2}}"),
-    "line 15: vehicle_types.car.weight = 0: must be greater than 0": lambda: given(vehicle_types="{car: {weight: 0}}"),
-    "line 10: latency_s = [0, 0.5, 0.8]: must be left out, because every vehicle type": lambda: given(
-        vehicle_types="{car: {latency_s: 3}}"
-    ),
-    "line 15: types = car: can be used only with the key vehicle_types, which declares": lambda: given(types="car"),
-    "line 16: types: has 2 entries; must have 3, one per vehicle, or be a single": lambda: given(
-        vehicle_types="{car: {}}", types="[car, car]"
-    ),
-    "line 16: types[1] = cra: unknown vehicle type cra; did you mean car?": lambda: given(
-        vehicle_types="{car: {}}", types="[car, cra, car]"
-    ),
-    "line 1: mass_t: vehicle type bus does not declare mass_t; declare mass_t in this type, or": lambda: given(
-        mass_t=None, vehicle_types="{car: {mass_t: 2}, bus: {braking_capacity_mps2: 5}}"
-    ),
-    "line 9: mass_t = {with_load: [1, 2]}: must be a number, {uniform: [low, high]}": lambda: given(
-        mass_t="{with_load: [1, 2]}"
-    ),
+    "line 15: vehicle_types.any: any means": lambda: given(vehicle_types="{any: {}}"),
+    "line 15: vehicle_types.car.load = 2: a": lambda: given(vehicle_types="{car: {load: 2}}"),
+    "line 10: latency_s = [0, 0.5, 0.8]:": lambda: given(vehicle_types="{car: {latency_s: 3}}"),
+    "line 9: mass_t = {with_load: [1, 2]}:": lambda: given(mass_t="{with_load: [1, 2]}"),
 }
 
 
@@ -219,33 +103,11 @@ def test_vehicle_types__that_say_too_little_or_twice_are_refused(message: str) -
 
 
 V2X: dict[str, Callable[[], object]] = {
-    "must be a preset: paper, clear, nominal, congested, blocked or sensors-only": lambda: given(v2x="papr"),
-    "preset paper generates no messages; leave it out": lambda: given(v2x="{loss_begins: 0.1}"),
-    "a vehicle that may never get a message must see the vehicle ahead; use senses: both or front": lambda: given(
-        v2x="{preset: clear, senses: none}"
-    ),
-    "line 15: v2x.loss_ends = 0: must be greater than or equal to 0.01": lambda: given(
-        v2x="{preset: clear, loss_ends: 0}"
-    ),
-    "line 15: v2x.sensing_s = [2, 1]: low must not be above high": lambda: given(
-        v2x="{preset: clear, sensing_s: [2, 1]}"
-    ),
-    "line 15: v2x.radio_s = 0.1: has no effect, because link_latency_s fixes the delay of messages": lambda: given(
-        v2x="{preset: clear, link_latency_s: 0.1, radio_s: 0.1}"
-    ),
-    "line 15: v2x.radio_s = 0.1: has no effect, because hears: none means that no vehicle gets": lambda: given(
-        v2x="{preset: clear, hears: none, radio_s: 0.1}"
-    ),
-    "senses: none means that no vehicle is in sight; leave it out": lambda: given(v2x="{sensing_s: [0.8, 1]}"),
-    "must be a preset (paper, clear, nominal, congested, blocked, sensors-only)": lambda: given(v2x="5"),
-    "v2x = {preset: blocked}: vehicle_3 may get its first news as late as 2.2 s; this time must be": lambda: given(
-        v2x="blocked", horizon_s="2"
-    ),
-    "needs a channel with separate messages; use a": lambda: given(v2x="{preset: paper, persistence: periodic}"),
-    "line 15: v2x.persistence = always: must be first or periodic": lambda: given(
-        v2x="{preset: nominal, persistence: always}"
-    ),
-    "persistence: perio...: a message takes 1500 time steps; at most 997 are possible, so shorten the": lambda: given(
+    "must be a preset: paper, clear,": lambda: given(v2x="papr"),
+    "line 15: v2x.sensing_s = [2, 1]: low": lambda: given(v2x="{preset: clear, sensing_s: [2, 1]}"),
+    "line 15: v2x.radio_s = 0.1: has no": lambda: given(v2x="{preset: clear, hears: none, radio_s: 0.1}"),
+    "must be a preset (paper, clear,": lambda: given(v2x="5"),
+    "persistence: perio...: a message takes": lambda: given(
         v2x="{preset: nominal, link_latency_s: 1.5, persistence: periodic}", time_step_s="1e-3", latency_s="0"
     ),
 }
@@ -258,43 +120,19 @@ def test_v2x__that_has_no_effect_or_leaves_somebody_without_news_is_refused(mess
 
 
 MIXTURES: dict[str, Callable[[], object]] = {
-    "mine.yaml, line 2: mixture = 3: must be a list": lambda: loaded("mixture: 3"),
-    "must not be empty; leave the key out if you do not need it": lambda: loaded("mixture: []"),
-    "mine.yaml, line 2: mixture[0].scenario: missing; write, for instance": lambda: loaded("mixture: [{weight: 1}]"),
-    "mixture[0].scenario = paper-randon: unknown scenario 'paper-randon'; did you mean 'paper-random'?": lambda: loaded(
-        "mixture:\n  - scenario: paper-randon"
-    ),
-    "mine.yaml, line 2: mixture[0].weight = 0: must be greater than 0": lambda: loaded(
-        "mixture: [{scenario: paper-random, weight: 0}]"
-    ),
-    "mine.yaml, line 2: mixture[0].scenario = mixture-delays: a mixture cannot contain another": lambda: loaded(
-        "mixture: [{scenario: mixture-delays}]"
-    ),
-    "mine.yaml, line 2: mixture[1]: paper-random is listed twice; list it once, with the sum of its weights": lambda: (
-        loaded("mixture: [{scenario: paper-random}, {scenario: paper-random}]")
-    ),
-    "mine.yaml, line 2: mixture: horizon_s must be the same in all scenarios of the mixture, but": lambda: loaded(
+    "mixture[0].scenario = paper-randon:": lambda: loaded("mixture:\n  - scenario: paper-randon"),
+    "mine.yaml, line 2: mixture[0].scenario": lambda: loaded("mixture: [{scenario: mixture-delays}]"),
+    "mine.yaml, line 2: mixture[1]:": lambda: loaded("mixture: [{scenario: paper-random}, {scenario: paper-random}]"),
+    "mine.yaml, line 2: mixture: horizon_s": lambda: loaded(
         "mixture: [{scenario: paper-random}, {scenario: stress-wide}]"
     ),
-    "mine.yaml, line 2: mixture: vehicles must be the same in all scenarios of the mixture, but paper-random": lambda: (
-        loaded("mixture: [{scenario: paper-random}, {scenario: cooperation-4-five}]")
+    "mine.yaml, line 2: mixture: vehicles": lambda: loaded(
+        "mixture: [{scenario: paper-random}, {scenario: cooperation-4-five}]"
     ),
-    "mine.yaml, line 2: mixture: vehicles = 5: must be 3, the number of vehicles in its scenarios; a": lambda: loaded(
-        "mixture: [{scenario: paper-random}]\nvehicles: 5"
-    ),
-    "mine.yaml: mixture[0] (paper-random), line 3: horizon_s = -8: must be greater than 0": lambda: loaded(
-        "mixture: [{scenario: paper-random}]\nhorizon_s: -8"
-    ),
-    "mine.yaml: mixture[0] (x), line 3: massx: unknown key; did you mean mass_t (tonnes)?": lambda: loaded(
-        "mixture: [{scenario: {name: x,\n   massx: 3}}]"
-    ),
-    "mine.yaml, line 2: mixture: v2x.persistence, and the delay of periodic messages, must be the": lambda: loaded(
+    "mine.yaml, line 2: mixture: vehicles =": lambda: loaded("mixture: [{scenario: paper-random}]\nvehicles: 5"),
+    "mine.yaml, line 2: mixture:": lambda: loaded(
         f"mixture: [{{scenario: {{name: a, {WHOLE}, v2x: nominal}}}},"
         f" {{scenario: {{name: b, {WHOLE}, v2x: {{preset: nominal, persistence: periodic}}}}}}]"
-    ),
-    "mine.yaml, line 1: brake_rate_mps3: vehicle type van does not declare brake_rate_mps3; declare": lambda: loaded(
-        "vehicle_types: {car: {mass_t: 1, brake_rate_mps3: 9}, van: {mass_t: 2}}\n"
-        + WHOLE.removesuffix(", mass_t: 1").replace(", ", "\n")
     ),
 }
 
@@ -307,41 +145,19 @@ def test_file_of_a_mixture_or_of_types__is_refused(message: str) -> None:
 
 
 CALLS: dict[str, Callable[[], object]] = {
-    "x.yaml: must be a mapping of keys to values": lambda: Scenario.from_document(parse_yaml("", "x.yaml")),
-    "scenario 'x': mixture[0].scenario = paper-random: must be the content of a scenario as a": lambda: Scenario(
-        name="x", mixture=[{"scenario": "paper-random"}]
-    ),
-    "scenario 'mixture-delays': is a mixture of scenarios, each of which declares its own mass_t;": lambda: (
-        DELAYS.quantities("mass_t")
-    ),
-    "initial_state: scenario 'mixture-delays' is a mixture, so it is unknown to which of": lambda: worlds_from_state(
-        DELAYS, {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}
-    ),
-    "scenario 'paper-random': mass_t[0] (vehicle_1) = -1: must be finite": lambda: PAPER.replace(mass_t=[-1, 2, 3]),
-    "scenario 'paper-random': objective = frontfirst: unknown objective": lambda: PAPER.replace(objective="frontfirst"),
-    "objective 'maximin:3': maximin takes no argument": lambda: PAPER.replace(objective="maximin:3"),
-    "learners: 3: must be the name of a vehicle (vehicle_1 ... vehicle_3) or its": lambda: PAPER.with_learners([3]),
+    "scenario 'mixture-delays': is a mixture": lambda: DELAYS.quantities("mass_t"),
+    "initial_state: scenario": lambda: worlds_from_state(DELAYS, {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}),
+    "learners: 3: must be the name of a": lambda: PAPER.with_learners([3]),
     "learners: vehicle_2 is listed twice": lambda: PAPER.with_learners(["vehicle_2", 1]),
-    "learners: 'vehicle_2': must be a list of vehicles": lambda: PAPER.with_learners("vehicle_2"),
-    "scenario 'paper-random': does not declare gaps_m; if gaps_m follows from other quantities": lambda: PAPER.replace(
-        time_gaps_s=1
-    ).quantities("gaps_m"),
-    "roles of a scenario cannot be changed; make a new scenario with": lambda: given(roles=None).roles.clear(),
-    "agent 'constant:6.01': brakes harder than the braking": lambda: ScriptSpec.parse("constant:6.01").command(
-        [7.0, 6.0], [3.0, 2.0]
-    ),
-    "agent 'constant:-2.01': drives harder than the driving": lambda: ScriptSpec.parse("constant:-2.01").command(
-        [7.0, 6.0], [3.0, 2.0]
-    ),
-    "agent 'constant:nan': constant needs a finite deceleration in m/s2 after the colon": lambda: ScriptSpec.parse(
-        "constant:nan"
-    ).command([7.0, 6.0], [3.0, 2.0]),
-    "agent 'full_brake:3': full_brake takes no argument": lambda: ScriptSpec.parse("full_brake:3").command(
-        [7.0, 6.0], [3.0, 2.0]
-    ),
-    "agent '': must be name or name:argument, for instance full_brake or constant:3.5": lambda: ScriptSpec.parse(""),
-    "scenario name '': must be 1 to 64 lower case letters, digits, - and _, beginning": lambda: new_scenario_text(""),
-    "missing.yaml: the file does not exist": lambda: load_scenario("missing.yaml"),
+    "learners: 'vehicle_2': must be a list": lambda: PAPER.with_learners("vehicle_2"),
+    "scenario 'paper-random': does not": lambda: PAPER.replace(time_gaps_s=1).quantities("gaps_m"),
+    "roles of a scenario cannot be changed;": lambda: given(roles=None).roles.clear(),
+    "agent 'constant:6.01': brakes harder": lambda: ScriptSpec.parse("constant:6.01").command([7.0, 6.0], [3.0, 2.0]),
+    "agent 'constant:-2.01': drives harder": lambda: ScriptSpec.parse("constant:-2.01").command([7.0, 6.0], [3.0, 2.0]),
+    "agent 'constant:nan': constant needs a": lambda: ScriptSpec.parse("constant:nan").command([7.0, 6.0], [3.0, 2.0]),
+    "agent 'full_brake:3': full_brake takes": lambda: ScriptSpec.parse("full_brake:3").command([7.0, 6.0], [3.0, 2.0]),
+    "agent '': must be name or": lambda: ScriptSpec.parse(""),
+    "scenario name '': must be 1 to 64 lower": lambda: new_scenario_text(""),
 }
 
 
@@ -358,16 +174,7 @@ def test_first_mistake__is_shown_with_the_number_of_others() -> None:
         given(braking_capacity_mps2="0", mass_t="0", restitution="2")
 
 
-ROLES = {
-    "__setitem__": ("vehicle_3", "learner"),
-    "__delitem__": ("vehicle_3",),
-    "__ior__": ({"vehicle_3": "learner"},),
-    "update": ({"vehicle_3": "learner"},),
-    "setdefault": ("vehicle_4", "learner"),
-    "pop": ("vehicle_3",),
-    "popitem": (),
-    "clear": (),
-}
+ROLES = {"__setitem__": ("vehicle_3", "learner"), "setdefault": ("vehicle_4", "learner"), "clear": ()}
 
 
 @pytest.mark.parametrize("method", ROLES)
@@ -386,12 +193,6 @@ def test_roles__of_a_copy_are_frozen(scenario: Scenario) -> None:
         scenario.roles.clear()
 
 
-@pytest.mark.parametrize("spec", ["Full_brake", "2fast", "full brake", "constant:", ":3", "constant: 3", "a\n", None])
-def test_agent_of_a_role__is_a_name_in_lower_case_and_an_argument(spec: object) -> None:
-    with refused(f"agent {spec!r}: must be name or name:argument"):
-        ScriptSpec.parse(spec)  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize("name", ["My Scenario", "-x", "x" * 65, "../x", "x\n"])
 def test_name_of_a_new_scenario__is_a_plain_word(name: str) -> None:
     with refused(f"scenario name {name!r}: must be 1 to 64 lower case letters, digits, - and _"):
@@ -405,14 +206,6 @@ def test_unknown_vehicle_or_scenario__is_told_what_is_near() -> None:
         load_scenario("paper-randon")
     with refused("unknown scenario 'zzz'; known: cooperation-0-sensors, ", UnknownName):
         load_scenario("zzz")
-
-
-@pytest.mark.parametrize(("near", "name"), [("near.yml", "near"), ("sub/near.yaml", "near")])
-def test_unknown_scenario__is_told_a_file_that_is_near(near: str, name: str, empty_folder: Path) -> None:
-    Path("sub").mkdir()
-    Path(near).touch()
-    with refused(f"unknown scenario '{name}'; did you mean {near}?", UnknownName):
-        load_scenario(name)
 
 
 def test_file__has_the_name_of_its_scenario(empty_folder: Path) -> None:

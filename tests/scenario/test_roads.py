@@ -14,7 +14,6 @@ from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.evaluation.identity import worlds_sha256
 from ethbrake_marl.evaluation.varying import states_of
-from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.ranges import ranges
 from ethbrake_marl.scenario.sampling import middle_world
 from ethbrake_marl.scenario.tables import worlds_from_state, worlds_from_table
@@ -107,19 +106,6 @@ def test_table_of_initial_states__gives_the_same_worlds() -> None:
     assert worlds_from_state(wet, state).friction.tolist() == [0.5]
 
 
-def test_mixture__where_only_some_tell_it_tells_no_friction() -> None:
-    told = PAPER.replace(name="wet", friction=0.4).declared()
-    mixed = eb.Scenario(name="road", mixture=[{"scenario": PAPER}, {"scenario": told}])
-    worlds = mixed.sample(40, 7).worlds
-    braking = worlds.vehicles.braking_capacity_mps2[:, 1]
-    assert sorted(set(worlds.friction.tolist())) == [0.4, np.inf]
-    assert sorted(set(braking.tolist())) == [9.81 * 0.4, 7.0]
-    columns = QUANTITY.columns(worlds)
-    assert "friction" not in columns
-    assert (columns["braking_capacity_2_mps2"] == braking).all()
-    assert [state["braking_capacity_2_mps2"] for state in states_of(worlds, mixed)] == braking.tolist()
-
-
 def test_table__has_one_row_for_each_world_of_which_none_is_torn() -> None:
     found = tabled(TABLE).sample(600, 7).worlds
     rows = np.stack([found.gaps_m[:, 0], found.speeds_mps[:, 1]], axis=1)
@@ -176,22 +162,6 @@ def test_recording__of_a_rejected_row_is_that_of_the_row_drawn_instead() -> None
     given = {"gaps_m": 9.0, "speeds_mps": 1.0, "latency_s": [0.0, 0.5, 0.8], "table": table}
     sample = eb.Scenario(**without(PAPER, *given), **given).replace(early_impacts="reject").sample(100, 7)
     assert sample.rejected > 20 and set(sample.recordings.tolist()) == {"far"}
-
-
-def test_recording__of_a_mixture_is_empty_where_a_scenario_has_none() -> None:
-    mixed = eb.Scenario(name="mixed", mixture=[{"scenario": PAPER}, {"scenario": tabled(NAMED).replace(name="named")}])
-    sample = mixed.sample(60, 7)
-    drawn = tabled(NAMED).sample(60, 7).recordings
-    expected = np.where(sample.scenarios == "named", drawn, "")
-    assert sample.recordings.tolist() == expected.tolist() and 10 < (expected == "").sum() < 50
-
-
-def test_recording__is_read_from_a_file_as_text(empty_folder: Path) -> None:
-    Path("rows.csv").write_text('recording,gap_1_m,gap_2_m\n"a, b.csv: 1-2-3",5,6\n 12 ,7,8\n')
-    declared = {**without(PAPER, "gaps_m"), "name": "mine", "early_impacts": "keep"}
-    table = {"file": "rows.csv", "columns": ["gap_1_m", "gap_2_m", "recording"]}
-    Path("mine.yaml").write_text(json.dumps({**declared, "table": table}))
-    assert eb.load_scenario(Path("mine.yaml")).table.rows == ((5.0, 6.0, "a, b.csv: 1-2-3"), (7.0, 8.0, "12"))
 
 
 def test_lognormal__is_truncated_as_in_the_textbook() -> None:

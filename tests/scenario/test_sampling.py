@@ -290,3 +290,9 @@ def test_columns__every_entry_of_a_world_has_its_own() -> None:
     worlds = PAPER.replace(vehicles=5, roles={"vehicle_2": "learner"}, **for_all).sample(7, 1).worlds
     assert len(np.unique(worlds.speeds_mps)) == 35
     assert worlds.gaps_m.shape == (7, 4)
+
+
+def test_mixture__draws_its_scenarios_by_their_weights() -> None:
+    parts = [{"scenario": name, "weight": weight} for name, weight in (("paper-delay-low", 1), ("paper-delay-high", 4))]
+    drawn = eb.load_scenario({"name": "weighed", "mixture": parts}).sample(2_000, 7).scenarios
+    assert np.mean(drawn == "paper-delay-high") == near(0.8, abs=0.03)

@@ -33,8 +33,6 @@ from ethbrake_marl.scenario.roles import ScriptSpec
 from ethbrake_marl.scenario.schema import scenario_json_schema
 from tests.contract.interfaces import LEVELS
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
-PAGE = (DOCS / "scenarios.md").read_text("utf-8")
 GIVEN = {
     "name": "given",
     "gaps_m": {"uniform": [5, 10]},
@@ -174,22 +172,6 @@ def test_folder__of_an_installed_package_is_inside_it(
     assert find() == (tmp_path / name if kind == "scenarios" else {})
 
 
-def test_json_schema__names_every_field_asks_for_one_of_two_ways_and_knows_no_null() -> None:
-    schema = json.loads(json.dumps(scenario_json_schema()))
-    assert set(schema["properties"]) == set(eb.Scenario.model_fields)
-    assert (schema["additionalProperties"], schema["required"]) == (False, ["name"])
-    assert schema["if"] == {
-        "not": {"anyOf": [{"required": ["mixture"]}, {"required": ["table"]}]}
-    }  # which say the rest
-    gaps, speeds, obstacle, *_, every = schema["then"]["allOf"]
-    assert [way["required"] for way in every["anyOf"]] == [["vehicle_types"], [*QUANTITY.needed]]
-    ways = [[way["required"] for way in pair["oneOf"]] for pair in (gaps, speeds)]
-    assert ways == [[["gaps_m"], ["time_gaps_s"]], [["speeds_mps"], ["line_speed_mps"]]]
-    assert obstacle == {"not": {"required": ["obstacle_gap_m", "obstacle_margin_m"]}}  # not both
-    assert schema["dependentRequired"] == {"speed_deviations_mps": ["line_speed_mps"]}
-    assert "null" not in json.dumps(schema) and schema["properties"]["time_step_s"]["default"] == 0.1
-
-
 def written(key: str, x: float, inside: float) -> list[dict[str, Any]]:
     """Scenarios with the number ``x`` in every place of a quantity, also of a type; ``inside`` is in its range."""
     low, high = sorted((x, inside))
@@ -230,34 +212,6 @@ def test_json_schema__a_number_is_in_range_exactly_where_the_reader_says_so(key:
             assert told == (good and not above_0,) * 2, content
 
 
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("gaps_m: {uniform: [5, 10]}", "gaps_km: 0.007"),
-        ("mass_t: [4.5, 5.5, 5.9]", "mass_t: [4.5, -5.5, 5.9]"),
-        ("speeds_mps: {uniform: [18, 22]}", "speeds_mps: {uniform: [18, 45]}"),
-        ("\n# Every gap and every speed is drawn independently.", "time_gaps_s: 1"),
-        ("speeds_mps: {uniform: [18, 22]}", "line_speed_mps: 39\nspeed_deviations_mps: {uniform: [-2, 2]}"),
-    ],
-)
-def test_page__shows_what_answers_a_mistake(old: str, new: str) -> None:
-    text = (shipped_folder() / "paper" / "paper-random.yaml").read_text()
-    with pytest.raises(InvalidInput) as caught:
-        eb.Scenario.from_document(parse_yaml(text.replace(old, new), "my.yaml"))
-    assert old in text and f"\n{caught.value}\n" in PAGE
-
-
-def test_scenario__has_defaults_for_what_it_leaves_out() -> None:
-    scenario = build()
-    assert scenario.vehicles == 3
-    assert scenario.time_step_s == 0.1
-    assert scenario.horizon_s == 8.0
-    assert scenario.speed_limit_mps == 40.0
-    assert scenario.restitution == 0.1
-    assert scenario.early_impacts == "keep"
-    assert dict(scenario.roles) == {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "full_brake"}
-
-
 def test_scenario__one_entry_stands_for_all() -> None:
     scenario = build(mass_t=5, gaps_m=[7, {"uniform": [5, 10]}])
     assert scenario.quantities("mass_t") == (5.0, 5.0, 5.0)
@@ -277,13 +231,6 @@ def test_replacement__changes_one_field_and_checks_again() -> None:
     assert scenario.replace(vehicles=5).sample(1, 0).worlds.N == 5
     assert scenario.replace(vehicles=5).learners == (1,)
     assert dict(scenario.replace(vehicles=2).roles) == {"vehicle_1": "full_brake", "vehicle_2": "learner"}
-
-
-@pytest.mark.parametrize("learners", [["vehicle_2", "vehicle_3"], [1, 2], (np.int64(2), "vehicle_2")])
-def test_learners__are_given_by_name_or_index(learners) -> None:
-    scenario = build(roles={"vehicle_1": "constant:3", "vehicle_2": "learner"}).with_learners(learners)
-    assert scenario.learners == (1, 2)
-    assert dict(scenario.roles) == {"vehicle_1": "constant:3", "vehicle_2": "learner", "vehicle_3": "learner"}
 
 
 def test_learners__whoever_is_left_out_or_no_longer_learns_brakes_fully() -> None:
@@ -336,29 +283,6 @@ def test_scenarios_of_the_paper__by_hand(name, gaps_m, speeds_mps, latency_s) ->
     assert (scenario.vehicles, scenario.restitution, scenario.early_impacts) == (3, 0.1, "reject")
     assert (scenario.time_step_s, scenario.horizon_s, scenario.speed_limit_mps) == (0.1, 8.0, 40.0)
     assert (scenario.learners, scenario.scripts) == ((1,), {0: "full_brake", 2: "full_brake"})
-
-
-@pytest.mark.parametrize(
-    ("name", "key"),
-    [("paper-random-brake-only", "driving_capacity_mps2"), ("paper-random-obstacle", "obstacle_margin_m")],
-)
-def test_variants_of_the_paper__differ_from_the_random_test_in_one_key(name, key) -> None:
-    beside = {"name", "title", "description", "source"}
-    plain, variant = (eb.load_scenario(each).model_dump(exclude=beside) for each in ("paper-random", name))
-    assert [each for each in plain if plain[each] != variant[each]] == [key]
-
-
-@pytest.mark.parametrize("path", ["wide.yaml", "wide.yml", "stress/wide"])
-def test_file_of_the_user__goes_before_a_shipped_scenario(path: str, empty_folder: Path) -> None:
-    Path(path).parent.mkdir(exist_ok=True)
-    Path(path).write_text(new_scenario_text("wide"))
-    assert eb.load_scenario(path).name == eb.load_scenario(Path(path)).name == "wide"
-    assert eb.load_scenario("stress-wide").name == "stress-wide"
-
-
-def test_examples_of_the_pages__are_valid_scenarios() -> None:
-    examples = re.findall(r"^```yaml\n(name:.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
-    assert [eb.Scenario.from_document(parse_yaml(text)).sample(10, 0).worlds.n for text in examples] == [10]
 
 
 PAPER = eb.load_scenario("paper-random")

@@ -1,8 +1,6 @@
 """What a message contains (``v2x: tells``): observations by hand, and who refuses to go on without a piece."""
 
-import json
 import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,12 +9,8 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import script_agents
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.identity import scenario_sha256
-from ethbrake_marl.game.features import FEATURES, register_feature
 from ethbrake_marl.game.observations import choose_observation, observe
-from ethbrake_marl.physics.messages import PIECES, USUAL_PIECES, Messages
-from ethbrake_marl.scenario.channel import CHANNELS, register_preset
-from ethbrake_marl.training.experiment import run_experiment
+from ethbrake_marl.physics.messages import PIECES, USUAL_PIECES
 from tests.fixtures.knowledge import alter_unreceived
 
 PAPER = eb.load_scenario("paper-random")
@@ -187,34 +181,6 @@ def test_contact__a_pair_reads_nothing_where_a_piece_is_missing() -> None:
     assert told["contact.brake_front_time"] == 0.0 and told["contact.brake_rear_time"] > 0.0
 
 
-def test_tells__is_part_of_a_scenario_and_of_a_preset() -> None:
-    told = PAPER.replace(v2x={"tells": ["speed", "place"]})
-    assert told.v2x.tells == ("place", "speed") and told.v2x.by_link and not told.v2x.drawn
-    assert "tells" not in PAPER.content(without=())["v2x"] and "tells" not in json.dumps(PAPER.declared())
-    assert eb.Scenario(**told.declared()) == told and eb.Scenario.of_dump(told.model_dump(mode="json")) == told
-    silent = PAPER.replace(v2x={"tells": []})
-    assert len({scenario_sha256(each) for each in (PAPER, told, silent)}) == 3
-    assert told.sample(4, 7).worlds.gaps_m.tolist() == PAPER.sample(4, 7).worlds.gaps_m.tolist()
-    register_preset("places-alone", {"preset": "nominal", "tells": ["place"]})
-    try:
-        assert PAPER.replace(v2x="places-alone").v2x.channel.tells == ("place",)
-    finally:
-        del CHANNELS["places-alone"]
-
-
-def test_tells__a_mixture_holds_scenarios_whose_messages_contain_different_pieces() -> None:
-    parts = [PAPER.replace(name=f"part-{k}", v2x={"tells": t}) for k, t in enumerate((["place"], [*USUAL_PIECES]))]
-    entries = [{"scenario": each.declared(), "weight": 1} for each in parts]
-    mixture = eb.Scenario(name="both", mixture=entries)
-    lacks = Messages.of(mixture.sample(60, 7).worlds).withhold_from(1)
-    assert lacks.any() and not lacks.all()
-    entries[1]["scenario"] = PAPER.replace(name="part-1").declared()
-    with pytest.raises(
-        InvalidInput, match=r"mixture: scenario part-0 has the key v2x\.tells, but scenario part-1 does not"
-    ):
-        eb.Scenario(name="both", mixture=entries)
-
-
 @pytest.mark.parametrize(
     ("v2x", "message"),
     [
@@ -266,66 +232,6 @@ def test_agents__who_looks_ahead_refuses_to_do_without_a_piece(spec: str, refuse
         InvalidInput, match=r"vehicle_3 do not contain its mass \(key v2x.tells\), .*, mass of the other vehicles are"
     ):
         evaluation()
-
-
-def test_agents__of_its_own_vehicle_nobody_needs_a_message() -> None:
-    own = PAPER.replace(v2x={"tells": {"vehicle_2": []}})
-    usual, told = (eb.evaluate(each.sample(6, 7), {"e": eb.make_agent("e_v2x_bm+step", scenario=each)}, scenario=each)
-                   for each in (PAPER, own))  # fmt: skip
-    assert told.outcome("e").total_harm.tolist() == usual.outcome("e").total_harm.tolist() and not told.hidden.any()
-
-
-def test_e_v2x_bm_pairwise__needs_no_mass_and_every_other_piece() -> None:
-    for piece in ("place", "speed", "braking_capacity", "latency"):
-        lacking = PAPER.replace(v2x={"tells": [each for each in USUAL_PIECES if each != piece]})
-        with pytest.raises(InvalidInput, match=f"vehicle_1 do not contain its {piece}"):
-            eb.evaluate(lacking.sample(2, 7), {"e": eb.make_agent("e_v2x_bm:pairwise")}, scenario=lacking)
-
-
-def test_shield__stands_before_a_team_only_if_all_its_vehicles_tell_all() -> None:
-    team = eb.load_scenario("cooperation-3-pair")
-    lacking = team.replace(v2x={**team.v2x.model_dump(exclude_none=True), "tells": {"vehicle_2": ["place", "speed"]}})
-    with pytest.raises(InvalidInput, match="shield: messages of vehicle_2 do not contain its braking_capacity"):
-        eb.shield(eb.parallel_env(lacking)).reset(seed=7)
-    alone = lacking.with_learners(["vehicle_2"])  # what it tells, its own shield does not need
-    eb.shield(eb.parallel_env(alone)).reset(seed=7)
-    more = team.replace(v2x={**team.v2x.model_dump(exclude_none=True), "tells": [*PIECES]})
-    bounds = [
-        eb.shield(eb.parallel_env(each)).reset(seed=7)[1]["vehicle_2"]["shield_bound_harm"] for each in (team, more)
-    ]
-    assert bounds[0] == bounds[1]
-
-
-def double_mass(worlds: eb.Worlds, vehicle: int, neighbour: int) -> np.ndarray:
-    """Twice the mass of the neighbour."""
-    return 2.0 * worlds.vehicles.mass_t[:, neighbour]
-
-
-def test_own_features__say_what_they_read_or_are_refused() -> None:
-    limits = {"unit": "t", "scale": 10.0, "low": 0.0, "high": 9.0, "of": "neighbour"}
-    register_feature("double_mass", double_mass, **limits)
-    register_feature("double_mass_read", double_mass, **limits, reads=["mass"])
-    try:
-        unsaid, said = ([f"rear_1.{name}", f"front_1.{name}"] for name in ("double_mass", "double_mass_read"))
-        assert seen_by(engine_of(LINE, unsaid), 1) == pytest.approx({unsaid[0]: 1.18, unsaid[1]: 0.9})
-        lacking = LINE.replace(v2x={"tells": {"vehicle_3": ["place"]}})
-        assert seen_by(engine_of(lacking, said), 1) == pytest.approx({said[0]: 0.0, said[1]: 0.9})
-        with pytest.raises(
-            InvalidInput, match=r"feature 'double_mass': may read everything that a message can contain, but messages"
-        ):
-            seen_by(engine_of(lacking, unsaid), 1)
-        with pytest.raises(InvalidInput, match="reads = 'mass': must be a list with some of the names place, speed"):
-            register_feature("double_mass_3", double_mass, **limits, reads="mass")
-    finally:
-        for name in ("double_mass", "double_mass_read"):
-            del FEATURES.loaded[name]
-
-
-def test_run__refuses_before_it_trains_because_its_baseline_and_its_shield_would(tmp_path: Path) -> None:
-    where = r"run, with the baseline e_v2x_bm and a shield: messages of vehicle_3 do not contain its mass"
-    with pytest.raises(InvalidInput, match=where):
-        run_experiment(LIGHT, tmp_path / "run", recipe=eb.load_recipe("ppo"), episodes=5)
-    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(

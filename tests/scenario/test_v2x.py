@@ -3,22 +3,16 @@
 import math
 from dataclasses import replace
 
-import gymnasium
 import numpy as np
 import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import script_agents
-from ethbrake_marl.engine.profiles import identities
 from ethbrake_marl.envs.making import make_engine
-from ethbrake_marl.evaluation.identity import worlds_sha256
-from ethbrake_marl.game.full_state import full_state, state_features
 from ethbrake_marl.game.observations import observe
 from ethbrake_marl.physics.columns import Packed
-from ethbrake_marl.physics.episode import CLOCK
-from ethbrake_marl.physics.messages import CHANNEL, Messages, chance
+from ethbrake_marl.physics.messages import Messages, chance
 from ethbrake_marl.scenario.channel import CHANNELS, PER_LINK, PRESETS, V2X, Channel, Equipage, Equipped, burst_periods
-from ethbrake_marl.scenario.tables import worlds_from_state
 from tests.fixtures.knowledge import alter_unreceived
 
 PAPER = eb.load_scenario("paper-random")
@@ -225,35 +219,6 @@ def test_age__is_a_feature_that_grows_between_messages() -> None:
     assert (growth > 0.09).any() and (growth < -0.05).any()
 
 
-def test_age__reads_0_over_a_channel_whose_news_stays_present() -> None:
-    scenario = BASE.replace(v2x="blocked", observation=AGED)
-    assert (np.array(driven(engine_of(scenario), 10))[..., 27:] == 0.0).all()
-
-
-def test_interfaces__see_the_same() -> None:
-    scenario = periodic("congested", base=BASE.replace(observation=AGED))
-    env = eb.parallel_env(scenario=scenario)
-    seen, infos = env.reset(seed=5)
-    engine = env.unwrapped.engine
-    assert Messages.of(engine.worlds).periodic.all() and not (engine.worlds.messages[:, CHANNEL.KEY] == 0.0).any()
-    for k in range(6):
-        for i, known in enumerate(engine.packed.known_from_s[0]):
-            assert infos[f"vehicle_{i + 1}"]["known_from_s"].tolist() == known.tolist()
-        if k < 5:
-            seen, *_, infos = env.step({"vehicle_2": np.array([-0.5], np.float32)})
-    np.testing.assert_array_equal(seen["vehicle_2"], engine.observe(1)[0])
-    np.testing.assert_array_equal(infos["vehicle_2"]["age_s"], ages_in(engine.worlds)[0, 1])
-    assert "known_from_s" not in eb.parallel_env(PAPER).reset(seed=5)[1]["vehicle_2"]
-    _, told = gymnasium.make_vec("EthBrake-v1", num_envs=3, scenario=scenario).reset(seed=5)
-    assert told["age_s"].shape == (3, 3) and (told["age_s"][:, 1] == 0.0).all()
-    vec = eb.make_sb3_vec_env(scenario, 3, seed=5)
-    alike = vec.reset()
-    for _ in range(90):  # through an automatic reset
-        alike, _, _, _ = vec.step(np.full((3, 1), -0.5, np.float32))
-    np.testing.assert_array_equal(alike, vec.engine.observe(1))
-    assert np.isfinite(alike).all() and vec.reset_infos[0]["age_s"].shape == (3,)
-
-
 def delayed(gaps_m):
     base = BASE.replace(gaps_m=gaps_m, speeds_mps=[20.0, 20.0, 20.0])
     return engine_of(periodic("paper", base, link_latency_s=0.2, senses="front", sensing_s=[5.0, 5.0]), n=1)
@@ -316,28 +281,6 @@ def test_observation__tells_own_parts_of_latencies_and_nothing_that_was_drawn() 
     ] == [[0.1, 0.0], [0.0, 0.1], [0.0, 0.0], [0.0, 0.0]]
 
 
-def test_full_state__has_the_latency_that_was_drawn() -> None:
-    blocked = channel_of("blocked")
-    worlds = blocked.sample(50, 7).worlds
-    at = [feature.name for feature in state_features(blocked)].index("vehicle_3.latency_left")
-    assert (full_state(worlds, blocked)[:, at] == worlds.vehicles.latency_s[:, 2].astype(np.float32)).all()
-
-
-def test_initial_state__of_a_channel_without_chance_has_its_news() -> None:
-    fixed, given = channel_of("nominal", link_latency_s=0.25, sensing_s=[1, 1]), {"gaps_m": [7, 7]}
-    assert worlds_from_state(fixed, {**given, "speeds_mps": [20, 18, 20]}).vehicles.latency_s.tolist() == [
-        [0.0, 0.25, 0.25]
-    ]
-
-
-def test_persistence__first_is_the_default_and_adds_nothing() -> None:
-    said, unsaid = BASE.replace(v2x={"preset": "blocked", "persistence": "first"}), BASE.replace(v2x="blocked")
-    one, other = said.sample(50, 3), unsaid.sample(50, 3)
-    assert one.worlds.messages.shape == (50, 0)
-    assert worlds_sha256(one.worlds, one.index) == worlds_sha256(other.worlds, other.index)
-    assert "persistence" not in unsaid.v2x.model_dump(mode="json")
-
-
 def test_fixed_delay__tells_what_was_sent_and_moves_it_on() -> None:
     # All at 20 m/s; one message every 0.1 s from the alert on, 0.2 s on its way, decisions at 0.5, 0.6, ..., and who
     # is behind is not in sight. Each message carries the sample of the moment at which it is sent, so whatever is
@@ -364,15 +307,6 @@ def test_fixed_delay__tells_what_was_sent_and_moves_it_on() -> None:
     assert round(float(engine.worlds.gaps_m[0, 1]), 6) == 9.03
 
 
-def test_identities__do_not_depend_on_the_news() -> None:
-    worlds = PAPER.sample(5, 7).worlds
-    clock, command = np.zeros((5, CLOCK.WIDTH)), -worlds.vehicles.braking_capacity_mps2
-    late = replace(worlds.vehicles, known_from_s=worlds.vehicles.known_from_s + 1.0)
-    plain, told = (identities(w, command, clock, np.array([1])) for w in (worlds, replace(worlds, vehicles=late)))
-    assert plain.tolist() == told.tolist()
-    assert len(set(plain.tolist())) == 5
-
-
 def test_periodic__the_first_news_and_the_motion_are_those_of_first() -> None:
     scenario = periodic("blocked")
     one, other = engine_of(scenario), engine_of(first_only(scenario))
@@ -390,10 +324,3 @@ def test_chance__is_uniform_and_of_its_own_for_every_link_and_message() -> None:
     assert (u < 1.0).all()
     assert abs(u.mean() - 0.5) < 0.03
     assert abs(np.corrcoef(u[0, :, :-1].ravel(), u[0, :, 1:].ravel())[0, 1]) < 0.1
-
-
-def test_mixture__its_scenarios_share_the_persistence() -> None:
-    members = [periodic(preset, BASE.replace(name=preset)) for preset in ("nominal", "blocked")]
-    mixed = eb.Scenario(name="mixed", mixture=[{"scenario": member} for member in members])
-    assert Messages.of(mixed.sample(30, 3).worlds).periodic.all()
-    driven(engine_of(mixed), 5)

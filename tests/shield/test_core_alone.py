@@ -53,7 +53,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     "unknown HybridShield option 'estimated'; known: allowance, bound, cap": lambda: eb.HybridShield(
         eb.parallel_env(), estimated=True
     ),
-    "unknown shield option 'robust'; known: allowance, bound, cap": lambda: eb.ShieldOptions(robust="interior"),
+    "unknown shield option 'uncertainty'; known: allowance, bound, cap": lambda: eb.ShieldOptions(uncertainty="x=1"),
     "unknown shield or search 'robust'; known: episode, episode:pairwise, step": lambda: make_agent(
         "coast+robust", scenario=PAPER
     ),

@@ -1,14 +1,11 @@
 """The guard in the engine: what it does is what was certified, to the last step, and what fails changes nothing."""
 
-import contextlib
 import copy
 import pickle
-from concurrent.futures import ThreadPoolExecutor
 
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.wrappers import Autoreset
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive, episode_engine
@@ -21,7 +18,6 @@ from ethbrake_marl.shields.guard import MovingAtHorizon
 from ethbrake_marl.shields.paper_hybrid import HybridAgent
 from ethbrake_marl.shields.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv
 from tests.fixtures.asked import Acts, Asked
-from tests.shield.attacks import above_later
 from tests.shield.plays import reported
 
 PAPER = eb.load_scenario("paper-random")
@@ -115,19 +111,6 @@ def test_ledger__harm_that_nobody_predicted_is_seen_before_the_next_decision(gro
     assert not info["shield_trusted"] and info["shield_reason"] == eb.ShieldReason.ASSUMPTION_BROKEN
 
 
-def test_autoreset__of_gymnasium_inside_is_left_alone():
-    env = ShieldedEnv(Autoreset(gymnasium.make("EthBrake-v1").unwrapped))
-    env.reset(seed=0)
-    for _ in range(3):
-        over = False
-        while not over:
-            *_, terminated, truncated, info = env.step(DRIVE)
-            over = terminated or truncated
-        assert info["shield_trusted"]
-        env.step(DRIVE)  # begins the next episode
-        assert env.attached.shield.memory.running.steps.tolist() == [0]
-
-
 @pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
 def test_clone__between_proposal_and_step_goes_on_apart(clone):
     env = eb.ShieldedVecEnv(eb.make_sb3_vec_env(PAPER, 4, seed=2))
@@ -139,33 +122,6 @@ def test_clone__between_proposal_and_step_goes_on_apart(clone):
     told, again = ([reported(row) for row in each.step_wait()[3]] for each in (env, other))
     assert told == again and "bound_harm" in told[0]
     assert env.attached.shield.memory.running.steps.tolist() == other.attached.shield.memory.running.steps.tolist()
-
-
-def test_reset__in_between_brings_the_proposal_to_another_episode_and_its_bound_holds():
-    env = eb.ShieldedVecEnv(eb.make_sb3_vec_env(PAPER, 2))
-    env.reset()
-    env.step_async(np.ones((2, 1), np.float32))
-    env.venv.reset()
-    assert all(row["shield_trusted"] for row in env.step_wait()[3])
-    assert env.attached.shield.memory.running.steps.tolist() == env.attached.engine.steps.tolist() == [1, 1]
-
-
-def test_threads__no_episode_gets_above_its_bound():
-    env = ShieldedVectorEnv(eb.EthBrakeVectorEnv(4, PAPER, autoreset_mode="NextStep"))
-    env.reset(seed=0)
-    trusted = []
-
-    def work():
-        for _ in range(60):
-            with contextlib.suppress(UncertifiedStep):
-                trusted.append(env.step(np.ones((4, 1)))[4]["shield_trusted"].all())
-
-    with ThreadPoolExecutor(3) as pool:
-        for done in [pool.submit(work) for _ in range(3)]:
-            done.result()
-    shield, engine = env.attached.shield, env.attached.engine
-    assert all(trusted) and shield.memory.running.steps.tolist() == engine.steps.tolist()
-    assert (engine.ledger.world_harm("first") <= shield.memory.first_bound).all()
 
 
 @Acts
@@ -182,11 +138,6 @@ def test_horizon__what_still_moves_then_is_told_and_warned_of_once():
         env.reset(seed=1)
     assert len(told) == 1
     assert [each.step(DRIVE)[-1]["shield_settles"] for each in (env, shielded())] == [False, True]
-
-
-def test_horizon__beyond_it_the_bound_says_nothing():
-    now, later = above_later("coast", 200)
-    assert now == 0.0 and later > 0.5
 
 
 # Mode episode: never worse than its baseline, in any world, and as predicted.

@@ -157,12 +157,6 @@ def test_search__finds_each_leak(name):
     assert found.first is not None and found.excess > 1e-6
 
 
-def test_trained_adversary__does_more_harm_under_the_shield_than_chance_does() -> None:
-    worlds = line(3).sample(80, 21).worlds
-    harm = {name: attack(line(3), worlds, ADVERSARIES[name]).realised.mean() for name in ("trained", "random_actions")}
-    assert harm["trained"] > harm["random_actions"]
-
-
 def test_allowance__keeps_what_it_grants_and_no_more():
     worlds = line(3).sample(60, 13).worlds
     strict, loose = (attack(line(3), worlds, ADVERSARIES["slow_drift"], allowance=a) for a in (0.0, 30.0))
@@ -364,11 +358,6 @@ def test_rollout__a_policy_that_does_otherwise_when_it_is_tried_out_gets_no_furt
     assert harm.tolist() == guarded.shield.bound.tolist() and (harm <= guarded.shield.predicted_harm).all()
 
 
-def test_later_rollouts__may_be_switched_off():
-    _, _, reasons, _ = driven(eb.LearnedAgent(Weights()), later_rollouts=False)
-    assert not (reasons == ShieldReason.POLICY_ROLLOUT).any()
-
-
 # ---------------------------------------------------------------- several shielded vehicles, decided together
 
 PAIR = eb.load_scenario("cooperation-3-pair")
@@ -509,20 +498,6 @@ def test_drive_chunks__is_what_the_shielded_team_does_whatever_the_chunk(monkeyp
     parts = drive_shielded(eb.make_agent("coast"), worlds, task)
     assert all(np.array_equal(*columns) for columns in zip(whole, parts, strict=True))
     assert Shielded.stack([whole, parts]).replaced.shape == (2, 12, 2)
-
-
-def test_evaluation__later_rollouts_of_the_team_let_more_of_it_through():
-    @Acts
-    def late(worlds, vehicle):
-        """Coasts for 0.3 s, then brakes fully."""
-        return np.where(worlds.time_s < 0.8, 0.0, -worlds.vehicles.braking_capacity_mps2[:, vehicle])
-
-    worlds, replaced = PAIR.sample(60, 11).worlds, {}
-    for later in (True, False):
-        episodes = drive(worlds, ShieldedDriver(eb.Team.of(late, (1, 2)), PAIR, later_rollouts=later).on((1, 2)), PAIR)
-        assert (episodes.ledger.world_harm("first") <= episodes.guarded.shield.predicted_harm).all()
-        replaced[later] = episodes.guarded.shield.interventions.sum()
-    assert replaced[True] < replaced[False]
 
 
 def test_plan__a_proposal_equal_to_it_costs_nothing_and_changes_nothing() -> None:

@@ -190,7 +190,7 @@ def optimise_pairwise(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
     Raises ``InvalidInput`` if ``vehicle`` is not in the line, if a vehicle moves backward, or if brakes build up
     gradually.
     """
-    worlds.refuse_build_up("the closed form of E-V2X-BM and planner")
+    worlds.refuse_build_up("the closed form of E-V2X-BM")
     return closed_form(worlds, vehicle)
 
 
@@ -212,7 +212,7 @@ def pairwise_harm(worlds: Worlds, deceleration_mps2: ArrayLike) -> Floats:
 
     Raises ``InvalidInput`` for a deceleration that is negative or not finite, and for brakes that build up gradually.
     """
-    worlds.refuse_build_up("the closed form of E-V2X-BM and planner")
+    worlds.refuse_build_up("the closed form of E-V2X-BM")
     onset = onset_s(worlds, 0)
     deceleration = np.array(np.broadcast_to(np.asarray(deceleration_mps2, np.float64), worlds.speeds_mps.shape))
     good = (deceleration >= 0.0) & np.isfinite(deceleration)

@@ -6,7 +6,7 @@ estimated world in which every unknown quantity has its median, and promises not
 smallest or largest value. If the true world is one of the corners, the harm in the true world up to the horizon is at
 most the bound at the first decision. This bound holds for two reasons: a later message only removes corners that
 contradict the message, and a new plan replaces the present plan only if the new plan is better in the remaining
-corners.
+corners. If the true world lies between the corners, the harm can exceed the bound.
 
 Arguments that several methods share: ``worlds`` are the true worlds, ``estimated`` the estimated worlds at the same
 time, ``rows`` [m] the indices of episodes in the batch, and ``way_m`` is the distance that the shielded vehicle has
@@ -23,11 +23,11 @@ from itertools import product
 import numpy as np
 
 from ethbrake_marl.agents.driving import script_agents
+from ethbrake_marl.agents.received import Received
 from ethbrake_marl.engine.memory import renew_memory, take_memory
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, count_of
-from ethbrake_marl.extensions.certified.enclosure import CORNERS, INTERIOR, checked_robust
-from ethbrake_marl.extensions.certified.estimated import Ranges, Told
+from ethbrake_marl.extensions.certified.estimated import Ranges
 from ethbrake_marl.extensions.certified.estimating_agents import Odometer
 from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import MOST_CORNERS, Uncertainty
@@ -81,10 +81,8 @@ class EstimatedShield:
         scenario: the scenario of the worlds; a mixture of scenarios raises ``InvalidInput``.
         vehicle: index of the shielded vehicle.
         harm_count: ``first`` or ``total``.
-        robust: worlds in which actions are certified. None: only the median world. ``corners``: the median world and
-            all corners of the ranges of the unknown quantities; more than ``MOST_CORNERS`` corners raise
-            ``InvalidInput``. ``interior``: all worlds between the corners that are possible at the first decision; with
-            ``interior``, later information does not restart the shield.
+        robust: worlds in which actions are certified. False: only the median world. True: the median world and all
+            corners of the ranges of the unknown quantities; more than ``MOST_CORNERS`` corners raise ``InvalidInput``.
         others: scripts of the other vehicles by vehicle index; None: the scripts of the scenario.
 
     """
@@ -95,11 +93,10 @@ class EstimatedShield:
         vehicle: int,
         *,
         harm_count: HarmCount = "first",
-        robust: str | None = None,
+        robust: bool = False,
         others: Mapping[int, Script] | None = None,
     ) -> None:
-        self.scenario, self.vehicle = scenario, vehicle
-        self.robust = None if robust is None else checked_robust(robust, "estimated")
+        self.scenario, self.vehicle, self.robust = scenario, vehicle, robust
         self.predicted_harm: Floats = np.zeros(0)
         self.interventions: Ints = np.zeros(0, np.int64)  # [n] number of interventions so far in the running episodes
         self.decision: Decision | None = None  # last decision
@@ -113,7 +110,7 @@ class EstimatedShield:
         self._impact_s: Floats = np.zeros((0, 0))  # [n, N] time of the last predicted impact of each vehicle
         self._ranges = Ranges.of(scenario, vehicle, self._others)
         numbers = len(self._ranges.uncertain)
-        if self.robust is not None and 2**numbers > MOST_CORNERS:
+        if robust and 2**numbers > MOST_CORNERS:
             raise InvalidInput(
                 f"robust:estimated: scenario {scenario.name!r} has {numbers} unknown quantities of other vehicles;"
                 f" their smallest and largest values make {2**numbers} combinations (corners), but at most"
@@ -122,10 +119,7 @@ class EstimatedShield:
         self.shield = self._make()
 
     def _make(self) -> RobustShield:
-        certain = self.robust or CORNERS
-        return RobustShield(
-            self.scenario, self.vehicle, harm_count=self._harm_count, others=self._others, robust=certain
-        )
+        return RobustShield(self.scenario, self.vehicle, harm_count=self._harm_count, others=self._others)
 
     @property
     def members(self) -> int:
@@ -213,21 +207,19 @@ class EstimatedShield:
         ``due`` [n] is True for worlds that have a decision now.
         """
         shield, vehicle = self.shield, self.vehicle
-        known = Told.to(worlds, vehicle)
+        known = Received.by(worlds, vehicle)
         heard = np.concatenate([known.heard, known.reacts], axis=1)
         fresh, started = np.isnan(self._heard[:, 0]), shield.memory.running is not None
-        keeps, anew = np.zeros_like(known.known), fresh
-        if self.robust != INTERIOR:  # in interior mode, plans are certified once, at the first decision
-            if started:
-                self._note_impacts(worlds)
-            keeps = self._keeps(known, worlds.time_s)
-            surprised = self._is_surprised(estimated, known.known & ~keeps) if started else fresh
-            anew = fresh | surprised | (heard != self._heard).any(axis=1)
+        if started:
+            self._note_impacts(worlds)
+        keeps = self._keeps(known, worlds.time_s)
+        surprised = self._is_surprised(estimated, known.known & ~keeps) if started else fresh
+        anew = fresh | surprised | (heard != self._heard).any(axis=1)
         rows = np.flatnonzero(due & anew)
         rows = rows if started else np.arange(worlds.n)
         if not rows.size:
             return
-        before = copy.copy(shield) if started and self.robust != INTERIOR else None
+        before = copy.copy(shield) if started else None
         keeps = keeps & ~fresh[:, np.newaxis]
         self._begin_shield(worlds.take(rows), estimated.take(rows), way_m[rows], rows, keeps[rows], before)
         if before is not None and (held_before := rows[~fresh[rows]]).size:
@@ -260,7 +252,7 @@ class EstimatedShield:
             parts.append(self._ranges.estimate(worlds, way_m, share, foretold))
         self.shield.begin(parts[0], rows, possible=Uncertainty.interleaved(parts))
 
-    def _keeps(self, received: Told, time_s: Floats) -> Bools:
+    def _keeps(self, received: Received, time_s: Floats) -> Bools:
         """Return a mask [n, N]: True for each vehicle whose predicted state replaces its received state.
 
         The mask is True for a vehicle that is unknown, and for a vehicle whose last message is older than the vehicle's
@@ -315,5 +307,5 @@ class EstimatedShield:
 
     def _corners(self) -> list[dict[tuple[str, int], float]]:
         uncertain = self._ranges.uncertain
-        shares = [] if self.robust is None else product((0.0, 1.0), repeat=len(uncertain))
+        shares = product((0.0, 1.0), repeat=len(uncertain)) if self.robust else []
         return [dict(zip(uncertain, each, strict=True)) for each in shares]

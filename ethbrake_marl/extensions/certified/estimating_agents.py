@@ -9,9 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.protocol import Agent, AgentAround, Knowledge, Source
+from ethbrake_marl.agents.received import Received
 from ethbrake_marl.engine.memory import Memory, ask_script, begin_script, renew_memory
 from ethbrake_marl.engine.scripts import Script
-from ethbrake_marl.extensions.certified.estimated import Ranges, Told
+from ethbrake_marl.extensions.certified.estimated import Ranges
 from ethbrake_marl.physics.messages import LATENCY
 from ethbrake_marl.physics.state import Floats, Vehicles, Worlds
 from ethbrake_marl.scenario.schema import Scenario
@@ -46,7 +47,7 @@ class Odometer(NamedTuple):
 
 
 class Estimating(AgentAround):
-    """Agent whose vehicle is controlled by another agent, ``policy``, on the basis of the estimated world.
+    """Agent whose vehicle is controlled by another agent, ``policy``, which starts in the estimated world.
 
     The policy starts at its first decision, with the information received by then. The policy restarts in a world when
     the vehicle learns of a further vehicle, or when a message over a channel says that another vehicle reacts. The
@@ -57,13 +58,12 @@ class Estimating(AgentAround):
         policy: any agent that reads the state of the line.
         scenario: the scenario, which declares the ranges of all unknown quantities; a mixture of scenarios raises
             ``InvalidInput``.
-        shows: if True, the policy sees the estimated world at every decision; if False, only when the policy starts.
 
     """
 
-    def __init__(self, policy: Agent, scenario: Scenario, *, shows: bool = False) -> None:
+    def __init__(self, policy: Agent, scenario: Scenario) -> None:
         super().__init__(policy, f"{policy.name}:estimated")
-        self.scenario, self._shows = scenario, shows
+        self.scenario = scenario
         self._ranges: dict[int, Ranges] = {}  # ranges by the index of the agent's vehicle
         Ranges.of(scenario, 0, {})  # raises InvalidInput for a mixture
 
@@ -100,8 +100,7 @@ class Estimating(AgentAround):
             policy = begun if policy is None else renew_memory(policy, rows, begun)  # the first call covers all rows
             if isinstance(policy, Mapping) and "predicted_harm" in policy:
                 predicted = np.where(np.isnan(memory["heard"][:, 0]), policy["predicted_harm"], predicted)
-        shown = self._estimate(worlds, vehicle, way.way_m) if self._shows else worlds
-        command, policy = ask_script(self.policy, shown, policy, vehicle)
+        command, policy = ask_script(self.policy, worlds, policy, vehicle)
         return command, {"way": way, "heard": heard, "predicted_harm": predicted, "policy": policy}
 
     def _shown_at_first(self, estimated: Worlds) -> Worlds:
@@ -110,11 +109,11 @@ class Estimating(AgentAround):
     def _heard(self, worlds: Worlds, vehicle: int) -> Floats:
         """Return a summary of the information that ``vehicle`` has received about each vehicle, [n, 2 N].
 
-        The first N columns contain the amount of information about each vehicle (``Told.heard``). The other N columns
-        contain a 1 for each vehicle whose reaction was reported in a message but not predicted, otherwise 0. The policy
-        restarts in worlds in which this summary changes.
+        The first N columns contain the amount of information about each vehicle (``Received.heard``). The other N
+        columns contain a 1 for each vehicle whose reaction was reported in a message but not predicted, otherwise 0.
+        The policy restarts in worlds in which this summary changes.
         """
-        known = Told.to(worlds, vehicle)
+        known = Received.by(worlds, vehicle)
         # a received latency predicts the reaction, unless a channel may delay the reaction
         unforetold = known.reacts & (self.scenario.v2x.delays | ~known.pieces[..., LATENCY])
         return np.concatenate([known.heard, unforetold], axis=1)

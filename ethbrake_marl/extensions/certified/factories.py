@@ -11,7 +11,6 @@ from ethbrake_marl.agents.e_v2x_bm.coupled import make_e_v2x_bm
 from ethbrake_marl.agents.protocol import Agent, Driver, Source, Team
 from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.certified.enclosure import CORNERS, checked_robust
 from ethbrake_marl.extensions.certified.estimating_agents import Estimating, EstimatingHybrid
 from ethbrake_marl.extensions.certified.options import RobustOptions, mode_uncertainty
 from ethbrake_marl.extensions.certified.uncertainty import UNCERTAINTY_EXAMPLE
@@ -21,29 +20,27 @@ from ethbrake_marl.shields.factories import shield_episodes
 
 
 def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
-    """Return the shield ``+robust`` or ``+robust:interior`` around ``policy``.
+    """Return the shield ``+robust`` around ``policy``.
 
-    The shield certifies actions for the corners of the box of possible worlds (``argument`` is ``corners`` or None), or
-    for its whole interior (``argument`` is ``interior``).
-    """
-    where = f"agent {settings.spec!r}"
-    robust, uncertainty = checked_robust(argument or CORNERS, where), settings.uncertainty
-    return ShieldedDriver(
-        policy, settings.needed_scenario(), mode="robust", harm_count=settings.harm_count, where=where, robust=robust,
-        uncertainty=mode_uncertainty("robust", uncertainty, where),
-    )  # fmt: skip
-
-
-def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
-    """Return the shield ``+robust:estimated`` or ``+robust:interior:estimated``.
-
-    The shield certifies actions in the estimated world, and also for other values of the quantities that its vehicle
-    did not receive, within the ranges of these quantities. ``argument`` is as in ``shield_robustly``.
+    The shield certifies actions in the corners of the box of possible worlds, not between them. ``argument`` is not
+    used.
     """
     where = f"agent {settings.spec!r}"
     return ShieldedDriver(
         policy, settings.needed_scenario(), mode="robust", harm_count=settings.harm_count, where=where,
-        robust=checked_robust(argument or CORNERS, where), estimated=True,
+        uncertainty=mode_uncertainty("robust", settings.uncertainty, where),
+    )  # fmt: skip
+
+
+def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
+    """Return the shield ``+robust:estimated``.
+
+    The shield certifies actions in the estimated world, and in the corners of the ranges of the quantities that its
+    vehicle did not receive, not between these corners. ``argument`` is not used.
+    """
+    return ShieldedDriver(
+        policy, settings.needed_scenario(), mode="robust", harm_count=settings.harm_count,
+        where=f"agent {settings.spec!r}", estimated=True,
     )  # fmt: skip
 
 
@@ -88,14 +85,14 @@ def make_estimating_e_v2x_bm(argument: str | None, settings: AgentSettings) -> A
 
 ROBUST = Part(
     shield_robustly,
-    form="+robust[:interior]",
-    about="as +step for uncertain quantities: certified in the corners of their intervals; interior: in all worlds",
+    form="+robust",
+    about="as +step for uncertain quantities: certified in the corners of their intervals, not between them",
     knows=Source.MODEL,
     needs={"uncertainty": UNCERTAINTY_EXAMPLE},
     options=RobustOptions,
 )
 
-ESTIMATED_ROBUST = Part(shield_robustly_as_estimated, about="for all quantities that were not received")
+ESTIMATED_ROBUST = Part(shield_robustly_as_estimated, about="in the corners of the ranges of what was not received")
 
 ESTIMATED_STEP = Part(shield_steps_as_estimated, about="certified in the estimated world")
 

@@ -71,7 +71,7 @@ class EstimatedGuard(ShieldGuard):
         bound that may also hold in the true world.
         """
         estimated: EstimatedShield = memory.shield
-        robust, shield = estimated.robust is not None, estimated.shield
+        robust, shield = estimated.robust, estimated.shield
         infos = self._of_step(ruling) | why(ruling)
         infos |= {"bound_harm": np.inf, "settles": False, "estimated": True, "trusted": robust}
         if ruling is not None:

@@ -10,7 +10,6 @@ from ethbrake_marl.agents.protocol import Agent, Source
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.certified.enclosure import CORNERS, INTERIOR, checked_robust
 from ethbrake_marl.extensions.certified.estimated_shield import EstimatedShield
 from ethbrake_marl.extensions.certified.guards import EstimatedGuard, RobustGuard, RobustMode
 from ethbrake_marl.extensions.certified.robust_step import RobustShield
@@ -24,12 +23,13 @@ from ethbrake_marl.shields.options import ShieldOptions, check_mode, misplaced, 
 class RobustOptions(ShieldOptions):
     """``eb.ShieldOptions`` with further settings for incomplete knowledge.
 
+    Mode ``robust`` certifies actions in the reported world and in the corners, where every uncertain quantity is at one
+    end of its interval. The bound does not cover the worlds between the corners (see ``RobustShield``).
+
     Args:
         mode: a mode of ``eb.ShieldOptions``, or ``robust``, which extends mode ``step`` to uncertain worlds. None means
             ``robust`` if ``uncertainty`` is given, otherwise ``step``.
         uncertainty: for mode ``robust``, an interval around each uncertain quantity, such as ``"gaps_m=0.5"``.
-        robust: worlds in which mode ``robust`` certifies actions: ``corners`` (fast) means only the ends of the
-            intervals, and ``interior`` means all values in the intervals.
         estimated: if True, certify actions in the estimated world, which uses only the information that the vehicle
             received and the scenario's ranges. Allowed only in modes ``step`` and ``robust``, with one learner, and
             without ``uncertainty``, ``allowance``, ``cap``, ``logging`` and ``shares``.
@@ -43,7 +43,6 @@ class RobustOptions(ShieldOptions):
     """
 
     uncertainty: Uncertainty | str | None = None
-    robust: str = CORNERS
     estimated: bool = False
 
     def __post_init__(self) -> None:
@@ -63,16 +62,13 @@ class RobustOptions(ShieldOptions):
         uncertainty = None if self.estimated else mode_uncertainty(mode, self.uncertainty, where)
         object.__setattr__(self, "uncertainty", uncertainty)
         super().__post_init__()
-        if checked_robust(self.robust, where) == INTERIOR and mode != "robust":
-            raise misplaced("robust", self.robust, mode, ["robust"], where)
 
     @property
     def written(self) -> str:
         """Text after the ``+`` in the spec of an agent that has a shield with these settings, such as
-        ``robust:interior:estimated`` for ``ppo+robust:interior:estimated``.
+        ``robust:estimated`` for ``ppo+robust:estimated``.
         """
-        robust = "" if self.robust == CORNERS else f":{self.robust}"
-        return f"{self.mode}{robust}{':estimated' if self.estimated else ''}"
+        return f"{self.mode}{':estimated' if self.estimated else ''}"
 
     @property
     def adds(self) -> Source:
@@ -89,12 +85,12 @@ class RobustOptions(ShieldOptions):
         """
         if self.estimated:
             assert isinstance(vehicle, int)
-            robust = self.robust if self.mode == "robust" else None
+            robust = self.mode == "robust"
             return EstimatedShield(scenario, vehicle, harm_count=self.harm_count, robust=robust, others=others)
         if self.mode == "robust":
             return RobustShield(
                 scenario, vehicle, harm_count=self.harm_count, allowance=self.allowance, others=others, cap=self.cap,
-                uncertainty=checked_uncertainty(self.uncertainty), robust=self.robust, logging=self.logging,
+                uncertainty=checked_uncertainty(self.uncertainty), logging=self.logging,
             )  # fmt: skip
         return super().shield(scenario, vehicle, others)
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.extensions.cooperation.joint_optimum import measure, questions
 from ethbrake_marl.extensions.cooperation.levels import Json, Plan, common_worlds
-from ethbrake_marl.extensions.cooperation.page import write_ablation
+from ethbrake_marl.extensions.cooperation.results import write_ablation
 from ethbrake_marl.extensions.search.best_harm import best_harm, chunks_left
 from ethbrake_marl.extensions.studies.trainings import Timed, train_all
 from ethbrake_marl.game.harm import HARM_COUNTS
@@ -23,11 +23,11 @@ from ethbrake_marl.training.team import load_team
 def run_ablation(
     plan: Plan, jobs: int = 1, machine: str = "", tell: OnProgress | None = None
 ) -> tuple[Json, list[Path]] | None:
-    """Do all training runs of an ablation, evaluate the trained policies, and write the page, tables and figures.
+    """Do all training runs of an ablation, evaluate the trained policies, and write results and figure.
 
     ``jobs`` is the number of training runs at the same time, and of threads in the search for joint optima. ``machine``
     describes the computer; it is stored with the results. Returns the content of ``ablation.json``, and the paths of
-    the page, the Markdown file and the figures. Returns None if Ctrl-C stopped the training runs. Output files of an
+    the JSON file, the CSV file and the figure. Returns None if Ctrl-C stopped the training runs. Output files of an
     earlier call are replaced. Raises the exceptions of ``StudyFolder.work``, ``train_all`` and ``measure``.
     """
     with plan.study_folder().work():

@@ -70,15 +70,15 @@ def ablate_command(
     """Compare several levels of cooperation in the same worlds.
 
     The command first prints an estimate of its running time. The command then trains policies at all levels, compares
-    the levels, and writes ablation.html, ablation.md, ablation.csv, ablation.json and three figures. After an
-    interruption, repeat the command to continue.
+    the levels, and writes ablation.json, ablation.csv and the figure ablation.png. After an interruption, repeat the
+    command to continue.
 
-    With --sweep, the levels are copies of one scenario in which one key has different values. The command then draws
-    two figures, with the values of this key on the x axis and the harm on the y axis.
+    With --sweep, the levels are copies of one scenario in which one key has different values.
     """
     with Out(as_json=as_json, remains=REMAINS) as out:
         from ethbrake_marl.extensions.cooperation.ablation import HOW_MEASURED, ablation_cost, run_ablation
         from ethbrake_marl.extensions.cooperation.levels import plan_ablation
+        from ethbrake_marl.extensions.cooperation.results import tables
         from ethbrake_marl.extensions.studies.machine import this_machine
 
         if sweep is not None and len(sweep) > 1:
@@ -100,11 +100,10 @@ def ablate_command(
         written = run_ablation(plan, jobs or 1, str(this_machine()), out.show_progress)
         if written is None:
             out.interrupted(f"interrupted; {REMAINS}")
-        results, (page, text, *figures) = written
+        results, paths = written
         alarms = [Text(line, "bold red") for line in results["undertrained"]]
-        out.result(results, text.read_text("utf-8"), *alarms, end="")
-        drawn = f"; figures: {', '.join(map(str, figures))}" if figures else ""
-        out.note(f"page: {page}; tables: {text}{drawn}")
+        out.result(results, *tables(results), results["conditions"], *alarms)
+        out.note(f"results: {', '.join(map(str, paths))}")
 
 
 ABLATE = Part(

@@ -127,7 +127,7 @@ def sweep_levels(name: str, sweep: str, settings: Sequence[Override], recipes: S
         key = values[0].key
         raise InvalidInput(
             f"--sweep {key}: this is a key of a recipe, but only a key of a scenario can be swept; to vary a recipe,"
-            " use ethbrake study sweep"
+            " write a recipe for each value, and use train/sweep.py"
         )
     key, path = scenario[0].key, scenario[0].path
     if path[0] in _LINE:
@@ -200,7 +200,8 @@ def quantity(name: str, worlds: Worlds) -> Floats:
     return values
 
 
-SETTINGS = "settings.json"  # file name in the ablation's folder
+# file names in the ablation's folder
+SETTINGS, JSON, CSV, FIGURE = "settings.json", "ablation.json", "ablation.csv", "ablation.png"
 
 _QUICK = {"seeds": 2, "steps_per_learner": 200_000, "episodes": 500, "search_episodes": 40, "budget": 2_000}
 
@@ -267,8 +268,9 @@ class Plan:
     def study_folder(self) -> StudyFolder:
         """Return the ablation's ``StudyFolder``, which refuses a folder that contains results of other settings."""
         advice = f"give another folder (--output); to reuse its trained policies, give a copy without {SETTINGS}"
-        written = (*FIGURES, *SWEEP_FIGURES, *(f"ablation.{ending}" for ending in ("html", "md", "csv", "json")))
-        return StudyFolder(self.folder, "an ablation", self.settings(), record=SETTINGS, advice=advice, writes=written)
+        return StudyFolder(
+            self.folder, "an ablation", self.settings(), record=SETTINGS, advice=advice, writes=(JSON, CSV, FIGURE)
+        )
 
     def optimum_folder(self, level: Level) -> Path:
         """Return the folder of the search for a level's joint optimum."""
@@ -358,20 +360,3 @@ def plan_ablation(
 TOLERANCE = 1e-6  # m2/s2; a vehicle counts as worse off if its harm rises by more than this
 
 HARM = {"first": "first-impact harm", "total": "total harm"}
-
-FIGURES = {  # file of each figure of ``ablation_figures``: its title and its description
-    "ablation.png": (
-        "Harm against cooperation",
-        "Both harms at each level, between full braking and the joint optimum.",
-    ),
-    "ablation-changes.png": ("What each step is worth", "Change of both harms from one level to the next."),
-    "ablation-who-pays.png": ("Who pays", "Change of the harm of each vehicle, under both counts."),
-}
-
-SWEEP_FIGURES = {  # file of each figure of a sweep: its title and its description
-    "ablation.png": (
-        "Harm against the number",
-        "Both harms at each value, between full braking and the joint optimum.",
-    ),
-    "ablation-who-bears.png": ("Who bears it", "Harm of each vehicle at each value, under both counts."),
-}

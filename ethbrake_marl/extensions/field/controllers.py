@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.protocol import Source
+from ethbrake_marl.agents.received import Received
 from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, unknown_name
-from ethbrake_marl.extensions.certified.estimated import Told
 from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.physics.messages import ACCELERATION, MEASURED, Messages, refuse_untold
 from ethbrake_marl.physics.state import Bools, Floats, Worlds
@@ -59,16 +59,17 @@ class Seen(NamedTuple):
 
         ``step_s`` is the time between two decisions, s.
         """
-        told, own, none = Told.to(worlds, vehicle), worlds.command_mps2[:, vehicle], np.zeros(worlds.n)
-        gap, front, force = told.obstacle_m, none, none
+        received, own, none = Received.by(worlds, vehicle), worlds.command_mps2[:, vehicle], np.zeros(worlds.n)
+        gap, front, force = received.obstacle_m, none, none
         if vehicle:
             k = vehicle - 1
-            age, then, force = worlds.time_s - told.at_s[:, k], told.speed_mps[:, k], told.command_mps2[:, k]
+            age = worlds.time_s - received.at_s[:, k]
+            then, force = received.speed_mps[:, k], received.command_mps2[:, k]
             brakes = force < 0.0
             age = np.minimum(age, np.where(brakes, np.maximum(then, 0.0) / np.where(brakes, -force, 1.0), np.inf))
             front = np.where(age > 0.0, np.maximum(then + force * age, 0.0), then)
-            known = told.known[:, k] & told.pieces[:, k, ACCELERATION]
-            gap = np.where(known, told.place_m[:, k] + 0.5 * (then + front) * age, np.inf)
+            known = received.known[:, k] & received.pieces[:, k, ACCELERATION]
+            gap = np.where(known, received.place_m[:, k] + 0.5 * (then + front) * age, np.inf)
         return cls(np.maximum(gap, _TOUCHING_M), worlds.speeds_mps[:, vehicle], front, force, own, step_s)
 
     @property

@@ -1,18 +1,17 @@
-"""Proven lower bounds on harm: no commands of the controlled vehicles lead to less harm.
+"""Proven lower bounds on harm: no commands of the controlled vehicle lead to less harm.
 
-Most files look at one controlled vehicle and its two neighbours. The front vehicle is also called *leader*, the
-controlled vehicle *follower*. The *front pair* is the front and the controlled vehicle; the *rear pair* is the
-controlled and the rear vehicle. The *first contact* is the first contact of the controlled vehicle with either
-neighbour. The *extreme command* is full drive after a first contact with the front vehicle, and full braking after a
-first contact with the rear vehicle.
+The files look at one controlled vehicle and its two neighbours, with brakes that act at once and a free road ahead. The
+front vehicle is also called *leader*, the controlled vehicle *follower*. The *front pair* is the front and the
+controlled vehicle; the *rear pair* is the controlled and the rear vehicle. The *first contact* is the first contact of
+the controlled vehicle with either neighbour. The *extreme command* is full drive after a first contact with the front
+vehicle, and full braking after a first contact with the rear vehicle.
 
 These arguments have the same meaning in all files, unless a docstring says otherwise. The index l marks the front
 vehicle, f the controlled vehicle and r the rear vehicle; v is a speed (m/s), a > 0 a braking capacity and u >= 0 a
 driving capacity (m/s2). Time 0 is the moment at which the controlled vehicle may act; all times are in s after time 0.
 
 - ``at``: state of one world at time 0, [LINE.WIDTH]; ``line.LINE`` says what each number is.
-- ``kind``: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up: ``RAMPED_FRONT`` or
-  ``RAMPED_REAR``).
+- ``kind``: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST``.
 - ``time``: time of the contact.
 - ``early``, ``late``: earliest and latest time of the first contact.
 - ``soft``, ``hard``: smallest and largest closing speed of the first contact, m/s. ``closing`` is another name of
@@ -23,8 +22,7 @@ driving capacity (m/s2). Time 0 is the moment at which the controlled vehicle ma
 - ``best``: smallest harm that the search has reached so far, m2/s2.
 - ``enough``: lower bound on the harm that is proven in another way, m2/s2. A function returns 0 if the harm that it
   proves for some first contact is not above ``enough``.
-- ``plan``, ``other``: working memory for the motions of two vehicles, arrays from ``plans.empty_plan`` (with brake
-  build-up: from ``ramps.empty_legs``); overwritten.
-- ``heap``: working memory for the search of ``branch_and_bound``, [CELLS, NEAR]: one row for each cell, which here is a
-  set of first contacts; overwritten.
+- ``plan``, ``other``: working memory for the motions of two vehicles, arrays from ``plans.empty_plan``; overwritten.
+- ``heap``: working memory for the search of ``branch_and_bound``, [CELLS, HEAP_WIDTH]: one row for each cell, which
+  here is a set of first contacts; overwritten.
 """

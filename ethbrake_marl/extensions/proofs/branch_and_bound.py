@@ -1,7 +1,7 @@
 """Find the smallest harm over all first contacts with one neighbour, by branch and bound.
 
 A first contact has a time and a closing speed. The harm of a first contact is its squared closing speed plus the harm
-that must follow (``obstacle.after``). A *cell* is a set of first contacts: a range of times and a range of closing
+that must follow (``followers.after``). A *cell* is a set of first contacts: a range of times and a range of closing
 speeds. The search halves cells until the smallest bound of any cell is close to the smallest harm that the search has
 reached. docs/internals/proofs/lower-bound.md has the proof.
 
@@ -13,22 +13,20 @@ from __future__ import annotations
 
 import math
 
-from ethbrake_marl.extensions.proofs.line import FRONT_FIRST, LINE, RAMPED_FRONT, follower, leader
+from ethbrake_marl.extensions.proofs.followers import after
+from ethbrake_marl.extensions.proofs.line import FRONT_FIRST, LINE, follower, leader
 from ethbrake_marl.extensions.proofs.meetings import gentlest
-from ethbrake_marl.extensions.proofs.obstacle import CELL, after, after_at_obstacle
-from ethbrake_marl.extensions.proofs.ramped_meetings import gentlest_ramped_between
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Floats
 
+CELL = 1e-3  # relative and absolute (m2/s2) precision of a minimum
+
 CELLS = 600  # size of the heap, which limits the number of divisions
 
-# Columns of a cell on the heap: bound (m2/s2); range of times (s); range of closing speeds (m/s); for contacts with the
-# rear vehicle also the range of its lead over its own full braking (m).
-HARM, EARLY, LATE, SOFT, HARD, NEAR, FAR, HEAP_WIDTH = range(8)
+# columns of a cell on the heap: bound (m2/s2); range of times (s); range of closing speeds (m/s)
+HARM, EARLY, LATE, SOFT, HARD, HEAP_WIDTH = range(6)
 
 _SPLITS = 64  # largest number of cells at the start of the search, one for each decision step
-
-_PART_S = 0.05  # length of a cell at the start of the search with brake build-up, s
 
 _TRIED = 8  # number of first contacts evaluated before the search
 
@@ -41,8 +39,6 @@ def gentlest_between(kind: int, at: Floats, early: float, late: float) -> float:
     brakes harder than the controlled vehicle, the smallest closing speed may rise by at most the difference of the two
     braking capacities in each second.
     """
-    if kind >= RAMPED_FRONT:
-        return gentlest_ramped_between(kind, at, early, late)
     least = gentlest(kind, at, late)[0]
     if kind == FRONT_FIRST and at[LINE.A_L] > at[LINE.A_F] and early * at[LINE.A_L] < at[LINE.V_L]:
         least -= (at[LINE.A_L] - at[LINE.A_F]) * (late - early)
@@ -104,10 +100,7 @@ def harm_of(
     if end > late:
         lack = lacking(kind, at, early, late, gentlest_between(kind, at, early, late), hard, begin)
     follows = after(kind, at, early, late, hard, max(end, late), lack, plan, other)
-    follows = max(follows, floor)
-    if kind == FRONT_FIRST:
-        follows = after_at_obstacle(at, early, late, soft, hard, follows, plan, other)
-    return soft * soft + follows
+    return soft * soft + max(follows, floor)
 
 
 @compiled
@@ -166,10 +159,9 @@ def divide(
     if (late - early) * (at[LINE.U_F] + at[LINE.A_F] + at[LINE.A_L]) > hard - soft and early < middle < late:
         closing = max(soft, gentlest(kind, at, middle)[0])
         met = harm_of(kind, at, middle, middle, closing, closing, floor, plan, other)
-        later = max(soft, gentlest_between(kind, at, middle, late)) if kind >= RAMPED_FRONT else soft
-        if later < hard:
-            least = harm_of(kind, at, middle, late, later, hard, floor, plan, other)
-            count = put(heap, count, max(least, harm), middle, late, later, hard)
+        if soft < hard:
+            least = harm_of(kind, at, middle, late, soft, hard, floor, plan, other)
+            count = put(heap, count, max(least, harm), middle, late, soft, hard)
         soft, late = max(soft, gentlest_between(kind, at, early, middle)), middle
     else:
         middle = 0.5 * (soft + hard)
@@ -219,10 +211,8 @@ def least_harm(
 def next_split(kind: int, at: Floats, time: float, last: float) -> float:
     """Return the next time (s) after ``time`` at which a decision is due or the front vehicle comes to rest; at most
     ``last``.
-
-    With brake build-up, the result is at most ``_PART_S`` later than ``time``.
     """
-    until = last if kind < RAMPED_FRONT else min(last, time + _PART_S)
+    until = last
     if at[LINE.TIME_STEP] > 0.0:
         until = min(until, (math.floor(time / at[LINE.TIME_STEP] + 1e-6) + 1.0) * at[LINE.TIME_STEP])
     stand = at[LINE.V_L] / at[LINE.A_L]

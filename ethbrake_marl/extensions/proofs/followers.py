@@ -15,12 +15,10 @@ from __future__ import annotations
 import math
 
 from ethbrake_marl.extensions.proofs.flights import largest_lead, widest_flight
-from ethbrake_marl.extensions.proofs.line import LINE, follower, leader
+from ethbrake_marl.extensions.proofs.line import FRONT_FIRST, LINE, follower, leader
 from ethbrake_marl.extensions.proofs.plans import fill_braking, fill_drive_then_brake, fill_plan, fill_window, walk
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Floats
-
-STRUCK_M = 1e-6  # a leader nearer to the obstacle than this counts as in contact with it
 
 HELD_M = 1e-6  # largest rounding error of the gap to the leader
 
@@ -159,8 +157,7 @@ def after_front(
 ) -> float:
     """Return the smallest squared closing speed (m2/s2) of the rear pair after a first contact with the front vehicle.
 
-    The result is the largest of several lower bounds. If an obstacle may throw the vehicles back, the bounds that use
-    the centre of mass of the front and the controlled vehicle do not hold, and are left out.
+    The result is the largest of several lower bounds.
     """
     share, rest = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE]
     v_l, way_l = leader(at, early)
@@ -173,33 +170,12 @@ def after_front(
     fill_braking(other, onset, at[LINE.A_R])
     behind = max(at[LINE.GAP_L] + at[LINE.GAP_R] + way_l - way_r, 0.0)
     squared = walk(behind, speed, plan, v_r, other, onset + v_r / at[LINE.A_R])[2]
-    if at[LINE.OBSTACLE] < math.inf:
-        return squared
     held = held_by_leader(at, early, late, closing, plan, other)
     squared = max(squared, held * held)
     if rest < at[LINE.RESTITUTION] * share:
         return squared
     pushed = pushed_by_leader(at, early, late, closing, end, lack, plan, other)
     return max(squared, pushed * pushed)
-
-
-@compiled
-def obstacle_harm(at: Floats, late: float, closing: float) -> float:
-    """Return the smallest squared speed (m2/s2) at which the front vehicle hits the obstacle after a push from behind.
-
-    The push comes at ``late`` or earlier, with a closing speed of at least ``closing``. After the push, the front
-    vehicle is slowed only by its own brakes. The result is 0 if the front vehicle already stands at the obstacle,
-    because the push is then one impact of both vehicles and the obstacle.
-    """
-    if not STRUCK_M < at[LINE.OBSTACLE] - at[LINE.V_L] * at[LINE.V_L] / (2.0 * at[LINE.A_L]) < math.inf:
-        return 0.0
-    push = (1.0 - at[LINE.FRONT_SHARE]) * (1.0 + at[LINE.RESTITUTION]) * closing
-    lacks = 2.0 * at[LINE.A_L] * at[LINE.OBSTACLE] - at[LINE.V_L] * at[LINE.V_L]
-    v = leader(at, late)[0] + push
-    squared = max((2.0 * v - push) * push - lacks, 0.0)
-    if 0.0 < at[LINE.UNTIL] <= late + (v - math.sqrt(squared)) / at[LINE.A_L]:
-        return 0.0
-    return float(squared)
 
 
 @compiled(apart=True)
@@ -271,3 +247,36 @@ def slowed_by_rear(at: Floats, early: float, closing: float, gap: float, plan: F
     fill_braking(other, 0.0, pooled)
     until = walk(gap, v_l, plan, speed, other, speed / pooled)[1]
     return max(speed - mean * until - max(v_l - at[LINE.A_L] * until, 0.0), 0.0) if until < math.inf else 0.0
+
+
+@compiled(apart=True)
+def after_rear(
+    at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
+) -> float:
+    """Return the smallest squared closing speed (m2/s2) of the front pair after the rear vehicle's first contact."""
+    share, rest = at[LINE.REAR_SHARE], 1.0 - at[LINE.REAR_SHARE]
+    v_l, way_l = leader(at, early)
+    v_r, way_r = follower(at, early)
+    speed = v_r - rest * closing
+    if share * (1.0 + at[LINE.RESTITUTION]) <= 1.0:
+        speed += share * at[LINE.RESTITUTION] * closing
+    speed = max(speed - max(at[LINE.A_R] - at[LINE.A_F], 0.0) * (late - early), 0.0)
+    gap = max(at[LINE.GAP_L] + at[LINE.GAP_R] + way_l - way_r, 0.0)
+    least = gap - max(follower(at, late)[1] - way_r - (leader(at, late)[1] - way_l), 0.0)
+    squared = braking_after(gap, least, v_l, at[LINE.A_L], speed, at[LINE.A_F], plan, other)
+    if at[LINE.A_F] >= at[LINE.A_R]:
+        pushed = pushed_by_rear(at, early, late, closing, end, lack, gap, plan, other)
+        pushed = max(pushed, slowed_by_rear(at, early, closing, gap, plan, other))
+        squared = max(squared, pushed * pushed)
+    return squared
+
+
+@compiled(apart=True)
+def after(
+    kind: int, at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats,
+    other: Floats,
+) -> float:  # fmt: skip
+    """Return the smallest harm (m2/s2) of the contact with the second neighbour that must follow a first contact."""
+    if kind == FRONT_FIRST:
+        return after_front(at, early, late, closing, end, lack, plan, other)
+    return after_rear(at, early, late, closing, end, lack, plan, other)

@@ -36,26 +36,12 @@ class _Line(NamedTuple):
     REAR_SHARE: int = 12  # m_r / (m_f + m_r), with the masses m
     RESTITUTION: int = 13  # coefficient of restitution
     TIME_STEP: int = 14  # time between decisions, s; the first decision is now. 0 if commands may change at any time
-    # gap from the leader to an obstacle ahead that it does not reach by itself, m; infinite without an obstacle
-    OBSTACLE: int = 15
-    # present acceleration of the front vehicle, m/s2 (this column and the next six only with brake build-up)
-    FORCE_L: int = 16
-    FALL_L: int = 17  # rate at which the acceleration of the front vehicle falls, m/s3
-    FORCE_F: int = 18  # present acceleration of the controlled vehicle, m/s2
-    FALL_F: int = 19  # rate at which the acceleration of the controlled vehicle falls, m/s3
-    RISE_F: int = 20  # rate at which the acceleration of the controlled vehicle rises, m/s3
-    FORCE_R: int = 21  # present acceleration of the rear vehicle, m/s2
-    FALL_R: int = 22  # rate at which the acceleration of the rear vehicle falls, m/s3
-    UNTIL: int = 23  # horizon (s); 0 if unknown
-    WALL: int = 24  # OBSTACLE if an impact with the obstacle counts and the rear vehicle brakes fully; else 0
-    WIDTH: int = 25  # number of columns
+    WIDTH: int = 15  # number of columns
 
 
 LINE = _Line()
 
 FRONT_FIRST, REAR_FIRST = 0, 1  # neighbour with which the controlled vehicle has its first contact
-
-RAMPED_FRONT, RAMPED_REAR = 2, 3  # neighbour of the first contact, with brake build-up
 
 HALVINGS = 60
 
@@ -84,5 +70,3 @@ FRONT_BOUND, REAR_BOUND, COMBINED_BOUND, BOUNDS = range(4)
 TOUCH_HARM = 2.0 * BOUND.TOUCH_SPEED_MPS * BOUND.TOUCH_SPEED_MPS
 
 TOUCHING_M = 1e-9  # a smaller gap counts as contact, because of rounding
-
-FORCE_HALVINGS, ROUGHLY = 12, 20  # bisections of a force, and of a time, for results that need not be exact

@@ -7,15 +7,15 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.extensions.proofs.avoidability import avoidability, check_covered, largest_behind, spare_gap
-from ethbrake_marl.extensions.proofs.branch_and_bound import CELLS, NEAR, least_harm
-from ethbrake_marl.extensions.proofs.followers import obstacle_harm
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.proofs.avoidability import avoidability, largest_behind, spare_gap
+from ethbrake_marl.extensions.proofs.branch_and_bound import CELLS, HEAP_WIDTH, least_harm
+from ethbrake_marl.extensions.proofs.followers import after
 from ethbrake_marl.extensions.proofs.line import (
     BOUNDS,
     COMBINED_BOUND,
@@ -37,10 +37,7 @@ from ethbrake_marl.extensions.proofs.meetings import (
     stays_ahead,
     stays_behind,
 )
-from ethbrake_marl.extensions.proofs.obstacle import after, after_at_obstacle, beyond_rear
-from ethbrake_marl.extensions.proofs.plans import empty_plan, fill_braking, fill_drive_then_brake, walk
-from ethbrake_marl.extensions.proofs.ramped_bound import bound_ramped, ramped_states
-from ethbrake_marl.extensions.proofs.ramped_meetings import (
+from ethbrake_marl.extensions.proofs.onset import (
     LEAST_PART,
     LowerBound,
     at_onset_of,
@@ -48,6 +45,7 @@ from ethbrake_marl.extensions.proofs.ramped_meetings import (
     onset_states,
     rounding,
 )
+from ethbrake_marl.extensions.proofs.plans import empty_plan, fill_braking, fill_drive_then_brake, walk
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.jit import by_parts, compiled
 from ethbrake_marl.physics.motion import solo_motion
@@ -81,7 +79,7 @@ def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) ->
     """
     if kind == FRONT_FIRST:
         return stays_ahead(at, gentlest_front(at, time)[1], time, plan, other)
-    return stays_behind(at, braking_to_rear(at, time, 0.0), time, plan, other)
+    return stays_behind(at, braking_to_rear(at, time), time, plan, other)
 
 
 @compiled(apart=True)
@@ -157,10 +155,7 @@ def front_first(
     least = gentlest_front(at, min(time, last))[0] if time > first else 0.0
     front = max(least, 0.5 * math.sqrt(squared))
     rear = max(math.sqrt(squared) - front, 0.0)
-    beyond = 0.0
-    if at[LINE.WALL] > 0.0:
-        beyond = beyond_rear(at, time, time, rear, obstacle_harm(at, time, least), plan, other)
-    return min(best, front * front + rear * rear + beyond)
+    return min(best, front * front + rear * rear)
 
 
 @compiled(apart=True)
@@ -174,8 +169,6 @@ def soft_harm(
     while soft * soft < best:
         hard = soft + 0.02 * (1.0 + soft)
         follows = max(after(kind, at, early, late, hard, late, 0.0, plan, other), floor)
-        if kind == FRONT_FIRST:
-            follows = after_at_obstacle(at, early, late, soft, hard, follows, plan, other)
         best = min(best, soft * soft + follows)
         soft = hard
     return best
@@ -287,7 +280,7 @@ def bound_worlds(
         out: [n, BOUNDS] output: the columns FRONT_BOUND, REAR_BOUND and COMBINED_BOUND, m2/s2.
 
     """
-    plan, other, heap = empty_plan(), empty_plan(), np.empty((CELLS, NEAR))
+    plan, other, heap = empty_plan(), empty_plan(), np.empty((CELLS, HEAP_WIDTH))
     for k in range(states.shape[0]):
         front, rear = 0.0, 0.0
         if has_front[k]:
@@ -301,8 +294,6 @@ def bound_worlds(
             if at[LINE.A_F] < at[LINE.A_L] and at[LINE.V_F] < at[LINE.V_L]:
                 squared = min(squared, 2.0 * (at[LINE.A_L] - at[LINE.A_F]) * at[LINE.GAP_L])
             front = squared if time < until[k] and squared > TOUCH_HARM else 0.0
-            if front > 0.0 and at[LINE.WALL] > 0.0:
-                front += obstacle_harm(at, time, math.sqrt(squared))
         if has_rear[k]:
             squared, time = rear_bound(states[k], plan, other)
             rear = squared if time < until[k] and squared > TOUCH_HARM else 0.0
@@ -325,10 +316,7 @@ def lower_bound(
     The fields of the result satisfy ``harm = early + max((front_pair + rear_pair), combined)``. Each term of this
     formula is lowered by the largest possible rounding error (``rounding``). ``combined`` is 0 in worlds in which
     contact can be avoided. Harm that may come only after ``horizon_s`` counts as 0. The function covers the same lines
-    as ``avoidability``.
-
-    If brakes build up, the bound holds for commands that change at any time, and it is weaker (smaller). ``contact``,
-    the verdict on avoidable contact, is None if brakes build up in any of the worlds.
+    as ``avoidability``, without an obstacle ahead.
 
     Args:
         worlds: the ``n`` worlds in their present state.
@@ -346,48 +334,22 @@ def lower_bound(
     step below ``LEAST_TIME_STEP_S``, and for a horizon that is not finite or lies before the vehicle may act.
 
     """
-    check_asked("lower_bound", harm_count, horizon_s, time_step_s)
-    slow = worlds.vehicles.build_up
-    if worlds.vehicles.in_pieces.any():
-        worlds.refuse_build_up("lower_bound")
-    if slow.any() and not slow.all():
-        asked = partial(
-            lower_bound, vehicle=vehicle, harm_count=harm_count, horizon_s=horizon_s, scripts=scripts,
-            time_step_s=time_step_s,
-        )  # fmt: skip
-        order = np.argsort(np.concatenate([np.flatnonzero(slow), np.flatnonzero(~slow)]))
-        halves = asked(worlds.take(slow)), asked(worlds.take(~slow))
-        each = ((part.harm, part.early, part.front_pair, part.rear_pair, part.combined) for part in halves)
-        harm, early, front, rear, combined = (np.concatenate(columns)[order] for columns in zip(*each, strict=True))
-        return LowerBound(harm, early, front, rear, combined, None)
-    if slow.any():
-        check_covered(worlds, vehicle, scripts)
-        verdict, reason = None, np.full(worlds.n, 2)  # assume unavoidable contact; ``bound_ramped`` checks it
-    else:
-        verdict = avoidability(worlds, vehicle, scripts=scripts)
-        reason = verdict.reason
-    at_onset, start, early, counts = at_onset_of("lower_bound", worlds, np.array([vehicle]), harm_count, horizon_s)
+    check_asked(harm_count, horizon_s, time_step_s)
+    if (ahead := np.isfinite(worlds.obstacle_gap_m)).any():
+        raise InvalidInput(
+            f"lower_bound: world {int(np.argmax(ahead))} has an obstacle ahead; the bound is proven without an obstacle"
+        )
+    verdict = avoidability(worlds, vehicle, scripts=scripts)
+    at_onset, start, early, counts = at_onset_of(worlds, vehicle, harm_count, horizon_s)
     none = np.zeros(worlds.n, dtype=np.bool_)
     has_front = counts[:, vehicle - 1] if vehicle > 0 else none
     has_rear = counts[:, vehicle] if vehicle < worlds.N - 1 else none
-    struck = at_onset.obstacle_hit & (harm_count == "first")  # further impacts with the obstacle do not count
-    unavoidable = has_front & has_rear & (reason >= 2) & ~struck
+    unavoidable = has_front & has_rear & (verdict.reason >= 2)
     out = np.empty((worlds.n, BOUNDS))
-    arguments: tuple[Any, ...] = (has_front, has_rear, unavoidable, out)
-    kernel: Callable[..., None] = bound_worlds
-    if slow.any():
-        # the bound does not cover a neighbour that still drives because of an earlier command
-        left_alone = np.delete(at_onset.command_mps2, vehicle, axis=1).max(axis=1) <= 0.0
-        arguments = (has_front, has_rear & left_alone, unavoidable & left_alone, out)
-        arguments, kernel = (ramped_states(at_onset, vehicle, horizon_s - start), *arguments), bound_ramped
-    else:
-        states = onset_states(at_onset, vehicle, time_step_s)
-        ahead = states[:, LINE.OBSTACLE]
-        states[:, LINE.WALL] = np.where(np.isfinite(ahead) & ~struck, ahead, 0.0)
-        states[:, LINE.UNTIL] = horizon_s - start
-        arguments = (states, horizon_s - start, *arguments)
+    states = onset_states(at_onset, vehicle, time_step_s)
+    arguments: tuple[Any, ...] = (states, horizon_s - start, has_front, has_rear, unavoidable, out)
     threads = min(os.cpu_count() or 1, worlds.n // LEAST_PART + 1)
-    by_parts(lambda part: kernel(*(array[part] for array in arguments)), worlds.n, threads)
+    by_parts(lambda part: bound_worlds(*(array[part] for array in arguments)), worlds.n, threads)
     parts = (early, *(out[:, column] for column in (FRONT_BOUND, REAR_BOUND, COMBINED_BOUND)))
     early, front, rear, combined = (np.maximum(part - rounding(worlds, vehicle), 0.0) for part in parts)
     return LowerBound(early + np.maximum(front + rear, combined), early, front, rear, combined, verdict)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 
-from ethbrake_marl.extensions.proofs.line import AHEAD_M, FRONT_FIRST, HALVINGS, LINE, RAMPED_FRONT, follower, leader
+from ethbrake_marl.extensions.proofs.line import AHEAD_M, FRONT_FIRST, HALVINGS, LINE, follower, leader
 from ethbrake_marl.extensions.proofs.plans import (
     fill_brake_then_drive,
     fill_braking,
@@ -21,7 +21,6 @@ from ethbrake_marl.extensions.proofs.plans import (
     time_to_limit,
     walk,
 )
-from ethbrake_marl.extensions.proofs.ramped_meetings import gentlest_ramped
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Floats
 
@@ -72,13 +71,11 @@ def braked_then_driven(at: Floats, brake: float, time: float) -> tuple[float, fl
 
 
 @compiled(apart=True)
-def braking_to_rear(at: Floats, time: float, further: float) -> float:
+def braking_to_rear(at: Floats, time: float) -> float:
     """Return how long (s) the controlled vehicle must brake before it drives, so that it has contact with the rear
     vehicle at ``time``.
-
-    The rear vehicle is farther ahead than if it braked fully, by the distance ``further`` (m).
     """
-    place = follower(at, time)[1] - at[LINE.GAP_R] + further
+    place = follower(at, time)[1] - at[LINE.GAP_R]
     low, high = 0.0, time
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
@@ -98,7 +95,7 @@ def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
     first and then drives. The duration of the braking is returned as infinite if the vehicle reaches its speed limit by
     ``time``.
     """
-    brake = braking_to_rear(at, time, 0.0)
+    brake = braking_to_rear(at, time)
     speed = braked_then_driven(at, brake, time)[1]
     return max(follower(at, time)[0] - speed, 0.0), brake if speed < at[LINE.LIMIT_F] else math.inf
 
@@ -107,11 +104,7 @@ def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
 def gentlest(kind: int, at: Floats, time: float) -> tuple[float, float]:
     """Return the smallest closing speed (m/s) of a first contact at ``time``, and how long (s) the controlled vehicle
     drives or brakes first.
-
-    With brake build-up, the second result (the duration) is always 0.
     """
-    if kind >= RAMPED_FRONT:
-        return gentlest_ramped(kind, at, time), 0.0
     return gentlest_front(at, time) if kind == FRONT_FIRST else gentlest_rear(at, time)
 
 

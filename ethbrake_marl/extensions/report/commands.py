@@ -21,7 +21,9 @@ from ethbrake_marl.registry import Part
 
 
 def watch_command(
-    output: Annotated[Path, typer.Option(metavar="FILE.gif|FILE.mp4|FILE.svg", help="File for the film.")],
+    output: Annotated[
+        Path, typer.Option(metavar="FILE.gif|FILE.mp4|FILE.png", help="File for the film; .png: three moments of it.")
+    ],
     agents: AgentsOption = "e_v2x_bm",
     scenario: ScenarioOption = "paper-random",
     world: Annotated[int, typer.Option(help="Number of the world in the evaluation list.", min=0)] = 0,
@@ -31,7 +33,8 @@ def watch_command(
 ) -> None:
     """Write a real-time film of agents that drive the same world.
 
-    The film shows the road to scale, the commands, the impacts and the harm.
+    The film shows the road to scale, the commands, the impacts and the harm. A PNG file shows three moments: the alert,
+    the hardest impact, and the end.
     """
     # imported here, because matplotlib takes a second to load and most commands do not draw
     from ethbrake_marl.extensions.report.film import check_film, film

@@ -16,7 +16,7 @@ from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_h
 from ethbrake_marl.envs.rendering import COLOURS
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.conditions import Conditions
-from ethbrake_marl.extensions.report.style import GREY, finish, name_axes, new_figure, style_axes
+from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, name_axes, new_figure, style_axes
 from ethbrake_marl.extensions.search.best_harm import scripted_commands
 from ethbrake_marl.extensions.search.limits import Limits, Unproven, known_limits
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
@@ -156,6 +156,7 @@ _REGIMES = {  # colour and meaning of each regime
 }
 
 
+@in_our_style
 def deceleration_figure(curve: DecelerationCurve, *, title: str = "") -> Figure:
     """Draw predicted and simulated harm of one world against the constant deceleration of one vehicle.
 
@@ -204,7 +205,7 @@ def deceleration_figure(curve: DecelerationCurve, *, title: str = "") -> Figure:
         for (_, _, colour, dashes), harm in zip(_COUNTS, (first, total), strict=True):
             axes.axhline(harm, color=colour, linewidth=0.9, linestyle=dashes, alpha=0.7)
         proof = limits.proof
-        least = f"; proven lower bound {proof.harm[0]:.2f}"
+        least = "" if proof.harm is None else f"; proven lower bound {proof.harm[0]:.2f}"
         text = " (avoidable)" if proof.avoidable is not None and proof.avoidable[0] else least
         axes.annotate(
             f"best known harm: {first:.2f} first-impact, {total:.2f} total{text}", (0.0, max(first, total)),

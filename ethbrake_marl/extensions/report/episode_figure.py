@@ -14,10 +14,11 @@ from ethbrake_marl.envs.rendering import vehicle_colour
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.record import EpisodeRecord
-from ethbrake_marl.extensions.report.style import DASHES, GREY, finish, label_text, name_axes, new_panels
+from ethbrake_marl.extensions.report.style import DASHES, GREY, finish, in_our_style, label_text, name_axes, new_panels
 from ethbrake_marl.game.harm import HARM_COUNTS
 
 
+@in_our_style
 def trajectories(records: Mapping[str, EpisodeRecord], *, caption: str = "") -> Figure:
     """Draw positions with impacts, gaps, and commands of the controlled vehicles over time.
 

@@ -1,14 +1,10 @@
-"""The report of ``ethbrake run``: an HTML page, three figures, and results of the policy on the other two tests.
-
-Other extensions can add sections to the page: see ``register_run_section``.
-"""
+"""The report of ``ethbrake run``: an HTML page, three figures, and results of the policy on the other two tests."""
 
 from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -24,6 +20,7 @@ from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise
 from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.report.episode_figure import trajectories
+from ethbrake_marl.extensions.report.learners import learners_sheets
 from ethbrake_marl.extensions.report.page import Part, Section
 from ethbrake_marl.extensions.report.paper_rows import is_papers_test, with_paper_rows
 from ethbrake_marl.extensions.report.report import Report
@@ -36,7 +33,6 @@ from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.game.rewards import RewardParams
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.progress import OnProgress, Progress
-from ethbrake_marl.registry import Registry
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.training.experiment import (
     HYBRID,
@@ -51,30 +47,6 @@ from ethbrake_marl.training.progress import objective_in_words
 BESIDE = ("full_brake", "e_v2x_bm")  # agents shown together with the policy in the figures and the other two tests
 
 MOST_WORLDS = 2_000  # largest number of worlds in each of the other two tests
-
-
-@dataclass(frozen=True, slots=True)
-class RunSection:
-    """Section that an extension adds to the report of a run."""
-
-    title: str  # heading of the section
-    body: tuple[str | Sheet, ...]  # paragraphs and tables, which the command also prints
-    interrupted: str = ""  # work that Ctrl-C stopped, as in ``RunReport.interrupted``; "": no work was stopped
-
-
-MakeSection = Callable[[Experiment, OnProgress], RunSection | None]  # None: no section for this run
-
-
-def register_run_section(name: str, make: MakeSection) -> None:
-    """Register a function that adds a section to the report of every ``ethbrake run``, below the results.
-
-    ``name`` must be unique. ``make`` returns the section for a run, or None if the report needs no such section. An
-    installed package can instead declare an entry point in the group ``ethbrake_marl.run_sections``.
-    """
-    RUN_SECTIONS.add(name, make, lambda other: other is make)
-
-
-RUN_SECTIONS: Registry[MakeSection] = Registry("section of a run's report", "run_sections", register_run_section)
 
 
 def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
@@ -95,7 +67,7 @@ def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
     if beside:
         flat = [row for table in beside.values() for row in table]
         write_results(folder, "other_tests", flat, experiment.harm_count)
-    sections = [made for name in RUN_SECTIONS if (made := RUN_SECTIONS[name](experiment, tell)) is not None]
+    learners = learners_sheets(evaluation) if experiment.learned == TRAINED_TEAM else []
     begin("figures")
     config = read_object(experiment.run.config)
     figures = write_figures(
@@ -110,15 +82,12 @@ def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
     )
     begin("page and episodes")
     page = folder / "report.html"
-    report = _page(experiment, rows, beside, figures, sections, config)
+    report = _page(experiment, rows, beside, figures, learners, config)
     report.driven(experiment.agents).write(page, force=True)
     begin("")
-    printed = [part for section in sections for part in section.body]
     with_rows = " and the paper's rows" if is_papers else ""
     return RunReport(
-        (brief(rows, beside), *rows.tables()[1:], *printed),
-        f"report with all measures{with_rows}: {page}",
-        ", ".join(section.interrupted for section in sections if section.interrupted),
+        (brief(rows, beside), *rows.tables()[1:], *learners), f"report with all measures{with_rows}: {page}"
     )
 
 
@@ -205,7 +174,7 @@ def _page(
     rows: SummaryTable,
     beside: Mapping[str, SummaryTable],
     figures: Sequence[Part],
-    sections: Sequence[RunSection],
+    learners: Sequence[Sheet],
     config: Mapping[str, Any],
 ) -> Report:
     trained, evaluation, harm_count = experiment.trained, experiment.evaluation, experiment.harm_count
@@ -240,10 +209,7 @@ def _page(
         rows,
         evaluation,
         focus=experiment.learned,
-        sections=[
-            Section(each.title, [part if isinstance(part, str) else Part.table(part) for part in each.body])
-            for each in sections
-        ],
+        sections=[Section("Several learners", list(map(Part.table, learners)))],
         figures=figures,
         tests=[(TESTS[name].partition(":")[0], TESTS[name], other) for name, other in beside.items()],
         harm_count=harm_count,

@@ -1,4 +1,4 @@
-"""Films of episodes in real time: pictures of the environment as GIF or MP4, or an animated drawing as SVG."""
+"""Films of episodes in real time as GIF or MP4, and strips of three moments as PNG."""
 
 from __future__ import annotations
 
@@ -14,23 +14,22 @@ from ethbrake_marl.agents.protocol import Driver, Team
 from ethbrake_marl.envs.rendering import Frame, Scene
 from ethbrake_marl.envs.trace import Trace
 from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of, need
-from ethbrake_marl.extensions.report.moving_drawing import animate_films
 from ethbrake_marl.physics.state import Worlds
 from ethbrake_marl.scenario.schema import Scenario
 
 Films = Mapping[str, Sequence[Scene]]  # scenes of each film of one world, by title
 
-FILM_FPS = 25
-
-MOST_FILMS = 12  # largest number of films in one file, one below the other
+FILM_FPS = 25  # scenes per second; a divisor of 100, because a GIF stores times in hundredths of a second
 
 MOST_PICTURES = 2_500  # largest number of pictures of all films together; they need 1.8 GB of memory
 
 _COLOURS = 64
 
+_ROAD = 160  # height in pixels of title, gaps and road, the upper part of a scene's picture
 
-def film_scenes(world: Worlds, agent: Driver, *, scenario: Scenario, fps: float = FILM_FPS) -> list[Scene]:
-    """Simulate one episode, and return its scenes: ``fps`` scenes per second from the alert on, and the final scene.
+
+def film_scenes(world: Worlds, agent: Driver, *, scenario: Scenario) -> list[Scene]:
+    """Simulate one episode, and return its scenes: 25 scenes per second from the alert on, and the final scene.
 
     Raises ``InvalidInput`` if there is not exactly one world, and ``PhysicsError`` if it cannot be simulated.
 
@@ -48,7 +47,7 @@ def film_scenes(world: Worlds, agent: Driver, *, scenario: Scenario, fps: float 
     if engine.roster.failed:
         raise PhysicsError(engine.roster.failed)
     end = float(engine.worlds.time_s[0])
-    times = np.append(np.arange(int(np.ceil(end * fps - 1e-9))) / fps, end)
+    times = np.append(np.arange(int(np.ceil(end * FILM_FPS - 1e-9))) / FILM_FPS, end)
     shown: list[Scene] = []
     for motion in trace.motions(engine):
         start, until = float(motion.start.time_s[0]), float(motion.until_s[0])
@@ -58,42 +57,27 @@ def film_scenes(world: Worlds, agent: Driver, *, scenario: Scenario, fps: float 
 
 
 def film(world: Worlds, agents: Mapping[str, Driver], ending: str, *, scenario: Scenario) -> bytes:
-    """Let several agents drive the same world; return a film of their episodes as the bytes of a file.
+    """Let several agents drive the same world; return films of their episodes as the bytes of one file.
 
-    The keys of ``agents`` are the titles above their films. Raises the exceptions of ``film_scenes`` and
-    ``film_bytes``.
+    The films play in real time, one below the other. A film that ends before the longest one shows its last scene
+    until the end of the file. The keys of ``agents`` are the titles above their films. ``ending`` is the ending of the
+    file name: ``.gif`` or ``.mp4`` for a film, ``.png`` for three moments of it: the alert, the hardest impact under
+    any of the agents, and the end. Raises the exceptions of ``film_scenes`` and ``check_film``, and ``InvalidInput`` if
+    the films have more than ``MOST_PICTURES`` pictures.
     """
-    check_film(ending, len(agents))
+    check_film(ending)
     films = {title: film_scenes(world, agent, scenario=scenario) for title, agent in agents.items()}
-    return film_bytes(films, ending)
-
-
-def film_bytes(films: Films, ending: str, *, fps: int = FILM_FPS) -> bytes:
-    """Return the bytes of a GIF, MP4 or SVG file that shows films of one world in real time, one below the other.
-
-    A film that ends before the longest film shows its last scene until the end of the file. GIF and SVG files repeat
-    endlessly. The keys of ``films`` are titles. ``ending`` is the ending of the file name: ``.gif``, ``.mp4`` or
-    ``.svg``. ``fps`` is the number of scenes per second. Raises ``InvalidInput`` if there are no films, more than
-    ``MOST_FILMS`` films or more than ``MOST_PICTURES`` pictures, if ``ending`` is unknown, or if 100 is not a multiple
-    of ``fps`` (a GIF stores times in hundredths of a second). Raises ``MissingExtra`` for an MP4 file if the library
-    imageio-ffmpeg is not installed.
-    """
-    check_film(ending, len(films))
-    if not films or not all(films.values()):
-        raise InvalidInput("film_bytes: there are no scenes; give at least one film with at least one scene")
-    if not fps > 0 or 100 % fps:
-        raise InvalidInput(f"film_bytes: fps = {fps}: 100 must be a multiple of fps; give 10, 20, 25 or 50")
     pictures = len(films) * max(map(len, films.values()))
     if pictures > MOST_PICTURES:
         raise InvalidInput(
-            f"film of {len(films)} agents for {pictures // len(films) / fps:g} s: the film needs {pictures:,} pictures,"
-            f" but at most {MOST_PICTURES:,} are allowed; give fewer agents, or a scenario with a shorter horizon_s"
+            f"film of {len(films)} agents: needs {pictures:,} pictures, but at most {MOST_PICTURES:,} are allowed; give"
+            " fewer agents, or a scenario with a shorter horizon_s"
         )
-    return _WRITERS[ending](films, fps)
+    return _WRITERS[ending](films)
 
 
-def check_film(ending: str, films: int = 1) -> None:
-    """Raise ``InvalidInput`` if ``film_bytes`` cannot write a file with this ``ending``, or this number of ``films``.
+def check_film(ending: str) -> None:
+    """Raise ``InvalidInput`` if ``film`` cannot write a file with this ``ending``.
 
     Raises ``MissingExtra`` for an MP4 file if the library imageio-ffmpeg is not installed.
     """
@@ -101,8 +85,6 @@ def check_film(ending: str, films: int = 1) -> None:
         raise InvalidInput(f"film with the file ending {ending!r}: the ending must be one of {', '.join(_WRITERS)}")
     if ending == ".mp4":
         need("imageio_ffmpeg")
-    if films > MOST_FILMS:
-        raise InvalidInput(f"film: {films} agents are too many; give at most {MOST_FILMS} agents")
 
 
 def _stacked(films: Films) -> Iterator[Frame]:
@@ -112,25 +94,25 @@ def _stacked(films: Films) -> Iterator[Frame]:
         yield np.concatenate([scene.frame() for scene in each])
 
 
-def _write_gif(films: Films, fps: int) -> bytes:
+def _write_gif(films: Films) -> bytes:
     from PIL import Image
 
     pictures = [
         Image.fromarray(frame).quantize(_COLOURS, method=Image.Quantize.FASTOCTREE) for frame in _stacked(films)
     ]
     buffer = io.BytesIO()
-    pictures[0].save(buffer, "GIF", save_all=True, append_images=pictures[1:], duration=1000 // fps, loop=0)
+    pictures[0].save(buffer, "GIF", save_all=True, append_images=pictures[1:], duration=1000 // FILM_FPS, loop=0)
     return buffer.getvalue()
 
 
-def _write_mp4(films: Films, fps: int) -> bytes:
+def _write_mp4(films: Films) -> bytes:
     from imageio_ffmpeg import write_frames
 
     frames = list(_stacked(films))
     height, width, _ = frames[0].shape
     with TemporaryDirectory() as folder:
         path = Path(folder) / "film.mp4"
-        writer = write_frames(str(path), (width, height), fps=fps, quality=8)
+        writer = write_frames(str(path), (width, height), fps=FILM_FPS, quality=8)
         writer.send(None)
         for frame in frames:
             writer.send(frame)
@@ -138,8 +120,22 @@ def _write_mp4(films: Films, fps: int) -> bytes:
         return path.read_bytes()
 
 
-_WRITERS: dict[str, Callable[[Films, int], bytes]] = {
-    ".gif": _write_gif,
-    ".mp4": _write_mp4,
-    ".svg": lambda films, fps: animate_films(films, fps=fps).encode(),
-}
+def _write_png(films: Films) -> bytes:
+    from PIL import Image
+
+    last = max(map(len, films.values())) - 1
+    impacts = [
+        (hit.closing_mps, -k) for shown in films.values() for k, scene in enumerate(shown) for hit in scene.struck
+    ]
+    hardest = -max(impacts, default=(0.0, 0))[1]  # number of the first scene that shows the hardest impact
+    rows = []
+    for title, shown in films.items():
+        for scene in (shown[min(k, len(shown) - 1)] for k in sorted({0, hardest, last})):
+            told = f"{title}, harm {scene.total_harm:.1f} m2/s2"
+            rows.append(scene._replace(title=told).frame()[:_ROAD])
+    buffer = io.BytesIO()
+    Image.fromarray(np.concatenate(rows)).quantize(_COLOURS).save(buffer, "PNG", optimize=True)
+    return buffer.getvalue()
+
+
+_WRITERS: dict[str, Callable[[Films], bytes]] = {".gif": _write_gif, ".mp4": _write_mp4, ".png": _write_png}

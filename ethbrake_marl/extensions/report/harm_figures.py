@@ -10,11 +10,19 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, PercentFormatter
 
 from ethbrake_marl.envs.rendering import COLOURS
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.summary_row import SummaryRow
-from ethbrake_marl.extensions.report.style import TITLES, finish, label_text, name_axes, new_panels, plain, series_style
-from ethbrake_marl.extensions.report.svg import SLIM_IN
+from ethbrake_marl.extensions.report.page import SLIM_IN
+from ethbrake_marl.extensions.report.style import (
+    TITLES,
+    finish,
+    in_our_style,
+    label_text,
+    name_axes,
+    new_panels,
+    plain,
+    series_style,
+)
 from ethbrake_marl.extensions.search.limit_measures import best_known_words
 from ethbrake_marl.extensions.search.regret import regrets_of
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
@@ -28,6 +36,7 @@ _PARTS = (
 )
 
 
+@in_our_style
 def harm_by_agent(
     rows: Sequence[SummaryRow],
     harm_count: HarmCount = "first",
@@ -36,11 +45,8 @@ def harm_by_agent(
     """Draw the mean harm of each agent as a bar with its 95 % interval.
 
     A vertical line marks the mean best known harm. Markers show the agent's mean harm in other tests; ``elsewhere`` has
-    the results of each test under its title. The figure is narrow enough for the screen of a phone. Raises
-    ``InvalidInput`` if ``rows`` is empty.
+    the results of each test under its title. The figure is narrow enough for the screen of a phone.
     """
-    if not rows:
-        raise InvalidInput("harm_by_agent: there are no rows; give the summary of at least one agent")
     figure, (axes,) = new_panels((SLIM_IN, 0.9 + 0.24 * len(rows)))
     name = {"first": "first_impact_harm", "total": "total_harm"}[harm_count]
     for k, row in enumerate(rows):
@@ -70,6 +76,7 @@ def _name_rows(axes: Axes, agents: Sequence[str], most: int = 40) -> None:
     axes.invert_yaxis()
 
 
+@in_our_style
 def regret_distribution(evaluation: Evaluation) -> Figure:
     """Draw, for every x, the fraction of worlds in which an agent's regret exceeds x, for each agent and harm count.
 
@@ -98,19 +105,16 @@ def regret_distribution(evaluation: Evaluation) -> Figure:
     return finish(figure, caption, panels[0], columns=5)
 
 
+@in_our_style
 def harm_in_parts(evaluation: Evaluation) -> Figure:
     """Draw the mean harm of each agent as a bar of three parts.
 
     The parts are the best known harm, the regret in worlds with unavoidable contact, and the regret in worlds with
-    avoidable contact. Raises ``InvalidInput`` if no proof says in which worlds contact is avoidable.
+    avoidable contact. The evaluation needs a proof, for each world, whether contact is avoidable.
     """
     regrets = regrets_of(evaluation)
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
-    if regrets is None or avoidable is None:
-        raise InvalidInput(
-            "harm_in_parts: the figure needs, for each world, a proof whether contact is avoidable; give an evaluation"
-            " whose scenario the proofs cover"
-        )
+    assert regrets is not None and avoidable is not None
     figure, panels = new_panels((10.0, 1.4 + 0.36 * len(evaluation.outcomes)), columns=2, sharey=True)
     for axes, count in zip(panels, HARM_COUNTS, strict=True):
         for k, outcome in enumerate(evaluation.outcomes.values()):

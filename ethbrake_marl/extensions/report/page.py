@@ -21,13 +21,17 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from ethbrake_marl.envs.rendering import BODY_M
-from ethbrake_marl.errors import InvalidInput, plain_text
+from ethbrake_marl.errors import plain_text
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.extensions.report.player import DATA, PLAYER_SCRIPTS, Played
 from ethbrake_marl.files.sheet import Sheet
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+SLIM_IN = 3.8  # a figure of this width can be read on a phone without scrolling
+
+_NARROW_PT = 540.0  # figures up to this width have one panel
 
 _STAY = "\u00a0"  # no-break space
 
@@ -122,46 +126,35 @@ class Part:
         return cls(Markup(sheet.html() + "\n"))
 
     @classmethod
-    def drawing(
-        cls,
-        figure: Figure | bytes,
-        title: str,
-        description: str,
-        *,
-        alone: bool = False,
-        known: str = "",
-        where: object = "",
-    ) -> Part:
-        """Return a part that shows a figure with a title and a description.
+    def drawing(cls, figure: Figure | bytes, title: str, description: str) -> Part:
+        """Return a part that shows a figure, or the bytes of an SVG file, with a title and a description.
 
-        The caption of the figure becomes text of the page below the figure, because the text of a wide figure is too
-        small on a phone. Raises ``InvalidInput`` if ``figure`` is an SVG file that this package did not write.
-
-        Args:
-            figure: figure of matplotlib, or the bytes of an SVG file that this package wrote.
-            title: title above the figure.
-            description: description of what the figure shows.
-            alone: True: the figure, for instance a map, keeps its own colours on a white background; False: the figure
-                gets the light or dark colours of the page.
-            known: text that is omitted from the caption, because the page shows it elsewhere.
-            where: path of the SVG file, for error messages.
-
+        The caption of a figure becomes text of the page, because the text of a wide figure is too small on a phone.
         """
-        from ethbrake_marl.extensions.report.svg import inline_svg
+        from ethbrake_marl.extensions.report.style import picture_bytes
 
-        try:
-            svg, caption = inline_svg(figure, f"{title}. {description}", recolour=not alone)
-        except InvalidInput as error:
-            raise InvalidInput(f"{where}: {error}") from None
-        for text in (known.strip(), description):
-            caption = caption.replace(text, "").strip() if text else caption
-        below = Markup('<p class="quiet">{}</p>').format(shown(caption)) if caption else Markup()
+        caption = Markup()
+        if isinstance(figure, bytes):
+            svg = figure
+        else:
+            text = figure.get_supxlabel()
+            figure.supxlabel("")
+            svg = picture_bytes(figure, "figure.svg")
+            figure.supxlabel(text)
+            caption = Markup('<p class="quiet">{}</p>').format(shown(" ".join(text.split()))) if text else caption
+        size = re.search(rb'width="([0-9.]+)pt"', svg)
+        width_pt = float(size[1]) if size else 0.0
+        kind = "broad" if width_pt > _NARROW_PT else "slim" if width_pt <= 72.0 * SLIM_IN + 0.1 else ""
         return cls(
             Markup(
                 "<figure><figcaption><strong>{}</strong> <span>{}</span></figcaption>"
-                '<div class="drawing{}" tabindex="0" role="group" aria-label="{}">{}</div>{}</figure>\n'
-            ).format(shown(title), shown(description), " map" * alone, shown(title), Markup(svg), below)
-        )
+                '<div class="drawing" tabindex="0" role="group" aria-label="{}">'
+                '<img class="{}" alt="{}" src="data:image/svg+xml;base64,{}"></div>{}</figure>\n'
+            ).format(
+                shown(title), shown(description), shown(title), kind, shown(f"{title}. {description}"),
+                base64.b64encode(svg).decode(), caption,
+            )
+        )  # fmt: skip
 
     @classmethod
     def player(

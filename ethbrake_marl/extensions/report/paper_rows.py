@@ -5,11 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.measure_sets import BASELINE
 from ethbrake_marl.evaluation.notes import Note
-from ethbrake_marl.evaluation.summary import RowsBeside, SummaryTable, summarise
+from ethbrake_marl.evaluation.summary import RowsBeside, SummaryTable
 from ethbrake_marl.extensions.report.three_tests import is_as_shipped
 from ethbrake_marl.scenario.task import Task
 
@@ -75,27 +72,6 @@ def is_papers_test(task: Task, seed: int | None) -> bool:
     """
     scenario = task.scenario
     return scenario.name in _SHOWN_WITH and seed is not None and task.vehicles == (1,) and is_as_shipped(scenario)
-
-
-def check_papers_test(task: Task, seed: int | None) -> None:
-    """Raise ``InvalidInput`` if an evaluation cannot be compared with the paper's rows (see ``is_papers_test``)."""
-    if not is_papers_test(task, seed):
-        raise InvalidInput(
-            f"paper: the paper's results are for Vehicle 2 in the shipped scenario {' or '.join(_SHOWN_WITH)}, but here"
-            f" the scenario is {task.scenario.name!r}, the controlled vehicles are {task.names}, and the worlds"
-            f" {'have no seed' if seed is None else 'are an evaluation list'};"
-            f" {'pass the seed of the evaluation list to evaluate, or ' if seed is None else ''}leave paper out"
-        )
-
-
-def summarise_beside_paper(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTable:
-    """Return the summary of an evaluation, with the rows of the paper's tables below the agents.
-
-    Raises ``InvalidInput`` if the evaluation cannot be compared with the paper's rows. ``baseline`` is the agent with
-    which all others are compared.
-    """
-    check_papers_test(evaluation.task, evaluation.seed)
-    return with_paper_rows(summarise(evaluation, baseline=baseline))
 
 
 def with_paper_rows(table: SummaryTable) -> SummaryTable:

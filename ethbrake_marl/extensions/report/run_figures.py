@@ -13,7 +13,15 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.evaluation.summary_row import SummaryRow
-from ethbrake_marl.extensions.report.style import band, finish, label_text, name_axes, new_panels, series_style
+from ethbrake_marl.extensions.report.style import (
+    band,
+    finish,
+    in_our_style,
+    label_text,
+    name_axes,
+    new_panels,
+    series_style,
+)
 
 _PANELS = (
     ("first_impact_harm", "First-impact harm (m²/s²)"),
@@ -26,6 +34,7 @@ _POLICY_NUMBER = 3  # index of the colour of the trained policy
 _POLICY = COLOURS[_POLICY_NUMBER]
 
 
+@in_our_style
 def learning_curve(
     points: Sequence[Mapping[str, float]],
     *,
@@ -35,8 +44,6 @@ def learning_curve(
 ) -> Figure:
     """Draw first-impact harm, total harm and collision rate of a policy or team against the number of training steps.
 
-    Raises ``InvalidInput`` if ``points`` is empty.
-
     Args:
         points: evaluations, earliest first; each has ``steps``, ``first_impact_harm``, ``total_harm`` and
             ``collision_rate``.
@@ -45,8 +52,6 @@ def learning_curve(
         caption: text below the figure.
 
     """
-    if not points:
-        raise InvalidInput("learning_curve: there are no points; give at least one evaluation during the training")
     figure, panels = new_panels((10.0, 3.9), columns=3)
     steps = [point["steps"] for point in points]
     for axes, (name, label) in zip(panels, _PANELS, strict=True):
@@ -64,15 +69,15 @@ def learning_curve(
     return finish(figure, caption, panels[0])
 
 
-def harm_against_total_gap(evaluation: Evaluation, *, agents: Sequence[str] | None = None, bins: int = 12) -> Figure:
+@in_our_style
+def harm_against_total_gap(evaluation: Evaluation, *, bins: int = 12) -> Figure:
     """Draw mean first-impact harm and mean total harm against the sum of the gaps at the alert.
 
     The figure has a line for each agent, with a band that shows the 95 % interval of the mean. Raises ``InvalidInput``
-    if an agent is unknown or ``bins`` is below 1.
+    if ``bins`` is below 1.
 
     Args:
         evaluation: evaluation of the agents.
-        agents: names of the agents to draw; None: all agents.
         bins: number of intervals of equal width into which the sum of the gaps is divided.
 
     """
@@ -85,7 +90,7 @@ def harm_against_total_gap(evaluation: Evaluation, *, agents: Sequence[str] | No
     sum_of_gaps = " + ".join(gaps) if len(gaps) <= 3 else f"d1 + … + {gaps[-1]}"
     figure, panels = new_panels((10.0, 4.6), columns=2, sharey=True)
     for axes, (name, label) in zip(panels, _PANELS[:2], strict=True):
-        for number, agent in enumerate(evaluation.outcomes if agents is None else agents):
+        for number, agent in enumerate(evaluation.outcomes):
             harm, style = getattr(evaluation.outcome(agent), name), series_style(number)
             estimates = [mean(harm[group], None if by is None else by[group]) for group in groups]
             at = [float(gap[group].mean()) for group in groups]

@@ -18,6 +18,7 @@ from ethbrake_marl.evaluation.varying import drawn_alike
 from ethbrake_marl.extensions.report.style import (
     GREY,
     finish,
+    in_our_style,
     label_text,
     name_axes,
     new_figure,
@@ -51,6 +52,7 @@ def write_worlds(path: Path, scenario: Scenario, sample: Sample, *, seed: int, f
     write_picture(path, worlds_figure(scenario, sample, seed=seed), force=force)
 
 
+@in_our_style
 def worlds_figure(scenario: Scenario, sample: Sample, *, seed: int) -> Figure:
     """Draw distributions and scatter plots of the quantities that vary between the worlds, and three worlds to scale.
 

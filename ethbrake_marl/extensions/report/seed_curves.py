@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethodFormatter
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.report.style import GREY, band, finish, name_axes, new_panels, series_style
+from ethbrake_marl.extensions.report.style import GREY, band, finish, in_our_style, name_axes, new_panels, series_style
 from ethbrake_marl.physics.state import Floats
 
 
@@ -39,6 +39,7 @@ class SeedCurve:
         return cls(np.array(common, np.float64), np.array(values, np.float64))
 
 
+@in_our_style
 def seed_curves(
     panels: Mapping[str, Mapping[str, SeedCurve]],
     *,
@@ -51,8 +52,6 @@ def seed_curves(
 
     A band around each line shows plus and minus one standard deviation over the seeds.
 
-    Raises ``InvalidInput`` if there are no panels, or if a panel has no curves.
-
     Args:
         panels: label of a quantity -> name of a recipe -> values of the quantity.
         logarithmic: labels of the quantities with a logarithmic axis; a panel with a value that is not positive gets a
@@ -62,8 +61,6 @@ def seed_curves(
         known: best known value of each quantity, by label, drawn as a dashed line.
 
     """
-    if not panels or not all(panels.values()):
-        raise InvalidInput("seed_curves: a quantity has no curves; give at least one curve for each quantity")
     figure, every = new_panels((5.0 * len(panels), 4.2), columns=len(panels))
     for axes, (label, curves) in zip(every, panels.items(), strict=True):
         for number, (recipe, curve) in enumerate(curves.items()):

@@ -7,14 +7,13 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import matplotlib
+import matplotlib.style
 from matplotlib.axes import Axes
-from matplotlib.backend_bases import RendererBase
 from matplotlib.figure import Figure
 from matplotlib.font_manager import findfont, get_font
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from ethbrake_marl.envs.rendering import COLOURS
 from ethbrake_marl.errors import InvalidInput, plain_text
@@ -26,13 +25,14 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 DASHES: tuple[str | tuple[int, tuple[int, ...]], ...] = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1, 1, 1)), "-", "--")
 
+# Decorator of every function that draws a figure: a user's matplotlibrc or style has no effect on our figures.
+in_our_style = matplotlib.style.context("default")
+
 GREY = "#555555"
 
 ALARM = "#b00020"
 
 DPI = 150
-
-CAPTION = "caption"  # id of the caption's group in an SVG
 
 CAPTION_PT = 7.5
 
@@ -47,18 +47,6 @@ _NO_DATES: dict[str, dict[str, None]] = {  # metadata to omit, because they diff
 
 class ShownFigure(Figure):
     """Figure that a notebook displays without pyplot."""
-
-    def draw(self, renderer: RendererBase) -> None:
-        """Draw the figure with matplotlib's ``renderer``.
-
-        When matplotlib saves a figure, it calls ``draw`` twice and uses only the second picture. Therefore the first
-        call only computes the layout.
-        """
-        engine = self.get_layout_engine()
-        if self.axes and isinstance(engine, ConstrainedLayoutEngine) and self.canvas.is_saving():
-            engine.execute(self)
-        else:
-            super().draw(renderer)
 
     def _repr_png_(self) -> bytes:
         return picture_bytes(self, "shown.png")
@@ -126,21 +114,15 @@ def name_axes(axes: Axes, title: str = "", x: str = "", y: str = "") -> None:
 
 
 def finish(
-    figure: Figure,
-    caption: str,
-    legend: Axes | None = None,
-    *,
-    columns: int = 6,
-    fontsize: float = 9,
-    loc: Literal["outside upper left", "outside upper right"] = "outside upper left",
+    figure: Figure, caption: str, legend: Axes | None = None, *, columns: int = 6, fontsize: float = 9
 ) -> Figure:
     """Add a caption and the legend of one panel (None: no legend) to a figure, and return the figure.
 
-    ``columns``, ``fontsize`` and ``loc`` are for the legend.
+    ``columns`` and ``fontsize`` are for the legend.
     """
     if legend is not None:
         named = legend.get_legend_handles_labels()
-        figure.legend(*named, loc=loc, ncols=columns, frameon=False, fontsize=fontsize)
+        figure.legend(*named, loc="outside upper left", ncols=columns, frameon=False, fontsize=fontsize)
     add_caption(figure, caption)
     return figure
 
@@ -153,8 +135,7 @@ def band(axes: Axes, x: Sequence[float] | Floats, low: Any, high: Any, style: Ma
 def add_caption(figure: Figure, text: str) -> None:
     """Write ``text`` below the figure, in a small font."""
     width = int(figure.get_figwidth() * _CHARACTERS_PER_INCH)
-    label = figure.supxlabel(textwrap.fill(text, width), x=0.01, ha="left", fontsize=CAPTION_PT, color=GREY)
-    label.set_gid(CAPTION)
+    figure.supxlabel(textwrap.fill(text, width), x=0.01, ha="left", fontsize=CAPTION_PT, color=GREY)
 
 
 def picture_ending(path: str | Path) -> str:
@@ -176,9 +157,8 @@ def picture_bytes(figure: Figure, path: str | Path) -> bytes:
     ending = picture_ending(path)
     buffer = io.BytesIO()
     # fonts are embedded, as outlines in SVG and as TrueType in PDF
-    with matplotlib.rc_context(
-        {"savefig.facecolor": "white", "svg.hashsalt": "ethbrake", "svg.fonttype": "path", "pdf.fonttype": 42}
-    ):
+    own = {"savefig.facecolor": "white", "svg.hashsalt": "ethbrake", "svg.fonttype": "path", "pdf.fonttype": 42}
+    with matplotlib.style.context(["default", own]):
         figure.savefig(buffer, format=ending[1:], dpi=DPI, metadata=_NO_DATES[ending])
     return buffer.getvalue()
 

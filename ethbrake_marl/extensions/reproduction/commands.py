@@ -37,10 +37,6 @@ def reproduce_command(
             help="Largest number of worlds for a figure or table; the paper uses 10,000.", min=2, max=PAPER_EPISODES
         ),
     ] = PAPER_EPISODES,
-    docs: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.json", help="JSON file for a copy of all results; figures go into the same folder."),
-    ] = None,
     cost: Annotated[
         bool, typer.Option("--cost", help="Print how much work is left and how long it will take, and exit.")
     ] = False,
@@ -70,9 +66,7 @@ def reproduce_command(
             return
         if full:
             need("torch")
-        asked = Reproduction(
-            "full" if full else "quick", output, episodes, out.show_progress, str(this_machine()), docs
-        )
+        asked = Reproduction("full" if full else "quick", output, episodes, out.show_progress, str(this_machine()))
         out.note(asked.cost(chosen))
         if cost:
             return

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from ethbrake_marl.envs.rendering import vehicle_colour
 from ethbrake_marl.evaluation.record import EpisodeRecord
-from ethbrake_marl.extensions.report.style import GREY, band, finish, name_axes, new_panels, series_style
+from ethbrake_marl.extensions.report.style import GREY, band, finish, in_our_style, name_axes, new_panels, series_style
 from ethbrake_marl.files.sheet import Estimate
 
 _ARROW_STEPS = 10  # time steps between arrows, as in the paper
@@ -20,6 +20,7 @@ _ARROW_STEPS = 10  # time steps between arrows, as in the paper
 _ROW_CHARACTERS = 52  # characters in a line of a row's label
 
 
+@in_our_style
 def estimates_figure(
     panels: Mapping[str, Mapping[str, Mapping[Any, Estimate]]], *, y_label: str, caption: str, x_label: str = ""
 ) -> Figure:
@@ -50,6 +51,7 @@ def estimates_figure(
     return finish(figure, caption, every[0], columns=3)
 
 
+@in_our_style
 def road_figure(records: Mapping[str, EpisodeRecord], *, caption: str) -> Figure:
     """Draw the positions of all vehicles on the road, as in the paper's figure.
 
@@ -86,6 +88,7 @@ def _in_pairs(panels: int, height_in: float, x: str, y: str) -> tuple[Figure, li
     return figure, every
 
 
+@in_our_style
 def profiles_figure(panels: Mapping[str, Mapping[str, EpisodeRecord]], *, caption: str) -> Figure:
     """Draw the command of the controlled vehicle against time, in one or more panels.
 
@@ -102,6 +105,7 @@ def profiles_figure(panels: Mapping[str, Mapping[str, EpisodeRecord]], *, captio
     return finish(figure, caption, every[0], columns=4)
 
 
+@in_our_style
 def changes_figure(changes: Mapping[str, Mapping[str, Estimate]], *, x_label: str, caption: str) -> Figure:
     """Draw the effects of several changes with their 95 % intervals, one row for each change.
 

@@ -28,7 +28,6 @@ from ethbrake_marl.extensions.reproduction.verdicts import (
     summarise_verdicts,
 )
 from ethbrake_marl.files.sheet import Estimate, Sheet, Shown, csv_text as csv_of
-from ethbrake_marl.files.store import check_target
 from ethbrake_marl.progress import OnProgress
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
@@ -50,14 +49,6 @@ class Reproduction:
     episodes: int = MOST_EPISODES  # largest number of worlds for a figure or table; the paper has 10,000
     tell: OnProgress = lambda progress: None  # function that receives the progress
     machine: str = ""  # description of the machine, which is stored with the results
-    docs: Path | None = None  # JSON file to which all results are written; None: no such file
-
-    def __post_init__(self) -> None:
-        """Raise ``InvalidInput`` if the file ``docs`` cannot be written, or if its name does not end in ``.json``."""
-        if self.docs is not None:
-            if self.docs.suffix != ".json":
-                raise InvalidInput(f"{self.docs}: the name of the file must end in .json")
-            check_target(self.docs, force=True)
 
     def seeds_of(self, wanted: Collection[str]) -> list[tuple[Group, str, list[Path]]]:
         """Return the training runs of some groups, for each recipe as (group, name of the recipe, folder of each seed).

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,8 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.spec import split_names
-from ethbrake_marl.errors import InvalidInput, count_of
+from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.identity import result_identity, worlds_sha256
 from ethbrake_marl.evaluation.seeds import interquartile_mean
 from ethbrake_marl.extensions.report.seed_curves import SeedCurve, seed_curves
@@ -26,7 +23,7 @@ from ethbrake_marl.game.harm import HARM_COUNTS
 from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.progress import OnProgress
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
+from ethbrake_marl.training.recipe import TrainingRecipe
 from ethbrake_marl.training.run_folder import RunDirectory
 from ethbrake_marl.training.training import Training
 
@@ -56,25 +53,6 @@ class LearningCurves(NamedTuple):
     plan: Sequence[tuple[TrainingRecipe, int]]  # each recipe with its number of seeds; the seeds are 0, 1, ...
     folder: Path  # folder of the trainings, the figure and the tables
     against: Against = "steps"  # quantity on the x axis: ``steps`` (of training) or ``cpu`` (processor time)
-
-    @staticmethod
-    def parse(text: str) -> list[tuple[TrainingRecipe, int]]:
-        """Read a text such as ``ppo:5,sac:3``, and return each recipe with its number of seeds.
-
-        A recipe is the name of a shipped recipe, or the path of a recipe file. Raises ``InvalidInput`` if the text does
-        not have this form, or if two recipes have the same name.
-        """
-        curves = []
-        for part in split_names(text, lambda part: os.path.isfile(part.rpartition(":")[0])):
-            match = re.fullmatch(r"(.+):([1-9][0-9]{0,3})", part)
-            if match is None:
-                raise InvalidInput(
-                    f"recipes {text!r}: {part!r} must have the form RECIPE:SEEDS (number of seeds), for instance ppo:5"
-                )
-            curves.append((load_recipe(match[1]), int(match[2])))
-        if len({recipe.name for recipe, _ in curves}) < len(curves):
-            raise InvalidInput(f"recipes {text!r}: two recipes have the same name; give each recipe only once")
-        return curves
 
     def train(
         self, *, steps: int | None = None, settings: Sequence[str] = (), jobs: int = 1, tell: OnProgress | None = None

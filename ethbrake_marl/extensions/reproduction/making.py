@@ -21,7 +21,7 @@ from ethbrake_marl.extensions.reproduction.folder import (
     json_text,
 )
 from ethbrake_marl.extensions.reproduction.items import ITEMS, read_results
-from ethbrake_marl.extensions.reproduction.pages import render_page, write_docs
+from ethbrake_marl.extensions.reproduction.pages import render_page
 from ethbrake_marl.extensions.reproduction.verdicts import summarise_verdicts
 from ethbrake_marl.extensions.studies.folder import StudyFolder
 from ethbrake_marl.files.plain import read_object
@@ -83,10 +83,7 @@ def make_items(asked: Reproduction, items: Sequence[Item], *, force: bool = Fals
             if stored.get(item.name) != trained:
                 _make_item(asked, item, trained)
                 write_file(asked.folder / "index.html", render_page(asked.folder, read_results(asked.folder)).encode())
-        results = read_results(asked.folder)
-    if asked.docs is not None:
-        write_docs(asked.docs, asked.folder, results)
-    return results, finished
+        return read_results(asked.folder), finished
 
 
 def _make_item(asked: Reproduction, item: Item, trained: Sequence[str]) -> None:

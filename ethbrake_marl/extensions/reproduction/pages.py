@@ -1,8 +1,7 @@
-"""Output of a reproduction: one self-contained HTML page, and a JSON file with all results."""
+"""Output of a reproduction: one self-contained HTML page."""
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,7 +15,6 @@ from ethbrake_marl.extensions.reproduction.items import ITEMS
 from ethbrake_marl.extensions.reproduction.verdicts import HOW_JUDGED, MOST_EPISODES
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.sheet import Column, Sheet, Shown
-from ethbrake_marl.files.store import write_output
 
 _TITLE = "The paper, made again"
 
@@ -55,7 +53,7 @@ def _account(results: Sequence[Result]) -> tuple[str, str, str, list[str]]:
 def render_page(folder: Path, results: Sequence[Result]) -> str:
     """Return the page with all results as HTML text. ``folder`` contains their figures.
 
-    Raises ``InvalidInput`` if a figure is missing, or if its file is not an SVG figure of this package.
+    Raises ``InvalidInput`` if a figure is missing.
     """
     lead, command, count, few = _account(results)
     _, *names = Page.anchors(["Overview", *(result.title for result in results)])
@@ -86,8 +84,8 @@ def _section(folder: Path, result: Result) -> Section:
     facts = Part.facts({name: value for name, value in account.items() if value})
     body: list[str | Part] = [result.what, facts, *result.notes]
     for drawn in result.figures:
-        file = folder / result.name / f"{drawn.stem}.svg"
-        body.append(Part.drawing(read_plain(file, LIMIT_BYTES), drawn.title, drawn.text, where=file))
+        picture = read_plain(folder / result.name / f"{drawn.stem}.svg", LIMIT_BYTES)
+        body.append(Part.drawing(picture, drawn.title, drawn.text))
     for item in ITEMS:
         if item.name == result.name and item.play is not None:
             body += [Part.heading("Episodes"), item.play()]
@@ -112,21 +110,3 @@ def _section(folder: Path, result: Result) -> Section:
 def _outcome(word: str) -> Markup:
     """Return the outcome of a verdict, such as "agrees", as HTML with a symbol and a colour."""
     return Markup('<span class="outcome {}">{}</span>').format(word.replace(" ", "-"), word)
-
-
-FIGURES, PREFIX = "figures", "reproduction-"  # folder and file prefix of the figures of docs/reproduction.json
-
-
-def write_docs(file: Path, folder: Path, results: Sequence[Result]) -> None:
-    """Write the results to a JSON file, and copies of the figures in ``folder`` to a folder ``figures`` next to it.
-
-    Existing files are replaced.
-    """
-    figures = file.parent / FIGURES
-    figures.mkdir(exist_ok=True)
-    for result in results:
-        for drawn in result.figures:
-            data = read_plain(folder / result.name / f"{drawn.stem}.svg", LIMIT_BYTES)
-            write_output(figures / f"{PREFIX}{drawn.stem}.svg", data, force=True)
-    content = json.dumps([each.in_words() for each in results], indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-    write_output(file, content.encode(), force=True)

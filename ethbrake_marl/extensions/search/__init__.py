@@ -1,1 +1,1 @@
-"""Search for the best commands: best known harm and its tables, the agents ``planner`` and ``+search``."""
+"""Search for the best commands: best known harm and its tables, the agents ``best_harm`` and ``+search``."""

@@ -12,7 +12,7 @@ from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.engine.memory import Memory
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import check_whole_number
-from ethbrake_marl.extensions.search.planner import MOST_CANDIDATES, Outlook
+from ethbrake_marl.extensions.search.outlook import MOST_CANDIDATES, Outlook
 from ethbrake_marl.extensions.search.refine import refine
 from ethbrake_marl.game.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics.episode import CLOCK

@@ -23,7 +23,7 @@ from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.protocol import Agent, Driver, fixed_commands
 from ethbrake_marl.engine.profiles import MOST_PHASES, ProfileProblem, Profiles, profile_problem
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError, check_one_learner
-from ethbrake_marl.extensions.proofs.ramped_meetings import onset_states
+from ethbrake_marl.extensions.proofs.onset import onset_states
 from ethbrake_marl.extensions.search.extreme_profiles import extreme_profiles
 from ethbrake_marl.extensions.search.problem import Found, minimising, search_profiles
 from ethbrake_marl.extensions.search.tables import COUNTS, LEFT_OUT, LOWERED, OBJECTIVE, BestHarmTable, BestKnown

@@ -50,11 +50,11 @@ class LimitMeasures(MeasureSet):
             about="Lower bound, mean over the worlds: no commands do less harm (proven).",
         ),
         Measure(
-            "best_known_minus_proven_first", lambda _, r: r.first_impact_harm - r.limits.proof.harm,
+            "best_known_minus_proven_first", lambda _, r: r.above_proven(r.first_impact_harm),
             about="Best known first-impact harm minus the proven lower bound, mean over the worlds.",
         ),
         Measure(
-            "best_known_minus_proven_total", lambda _, r: r.total_harm - r.limits.proof.harm,
+            "best_known_minus_proven_total", lambda _, r: r.above_proven(r.total_harm),
             about="Best known total harm minus the proven lower bound, mean over the worlds.",
         ),
         Measure(
@@ -142,7 +142,7 @@ class LimitMeasures(MeasureSet):
         row, first, total = rows[0], rows[0]["best_known_first_impact_harm"], rows[0]["best_known_total_harm"]
         if first is None or total is None:
             return []
-        lines = [_unavoidable(row), _best(row, first.value, total.value)]
+        lines = [line for line in (_unavoidable(row), _best(row, first.value, total.value)) if line]
         known = row.more[NAME]["known_best_share"]
         if known is not None and known < 1.0:
             lines.append(
@@ -169,7 +169,9 @@ def _unavoidable(row: SummaryRow) -> str:
     share = Column("", digits=1, scale=100.0, unit=" %")
     contact, impact = (share.show(row[name]).in_words for name in ("unavoidable_rate", "impact_proven_rate"))
     if row["unavoidable_rate"] is None:
-        return f"In {impact} of the worlds, no {command} avoids an impact (proven)."
+        return ""
+    if row["impact_proven_rate"] is None:
+        return f"In {contact} of the worlds, no {command} avoids contact (proven)."
     between = row.more[NAME]["impact_unproven"]
     text = f"In {contact} of the worlds, no {command} avoids contact; in {impact}, none avoids an impact (both proven)."
     return text + ("" if between is None else Between(**between).text)
@@ -180,14 +182,17 @@ def _best(row: SummaryRow, first: float, total: float) -> str:
 
     ``first`` and ``total`` are the means of the best known first-impact and total harm, m2/s2.
     """
-    least = 0.0 if row["proven_harm"] is None else row["proven_harm"].value
+    text = f"Mean best known harm: {first:.2f} first-impact, {total:.2f} total."
+    if row["proven_harm"] is None:
+        return text
+    least = row["proven_harm"].value
     gaps = [
         f"{best - least:.2f} ({f'{100 * (best - least) / best:.1f} %' if best > 0.0 else DASH})"
         for best in (first, total)
     ]
     return (
-        f"Mean best known harm: {first:.2f} first-impact, {total:.2f} total. Proven lower bound: {least:.2f}."
-        f" Best known harm minus this bound: {gaps[0]} first-impact, {gaps[1]} total."
+        f"{text} Proven lower bound: {least:.2f}. Best known harm minus this bound: {gaps[0]} first-impact,"
+        f" {gaps[1]} total."
     )
 
 

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.extensions.proofs.avoidability import avoidability
 from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
-from ethbrake_marl.extensions.proofs.team_bound import team_bound
 from ethbrake_marl.extensions.search.shipped import best_known
 from ethbrake_marl.game.harm import HARM_COUNTS
 from ethbrake_marl.physics.motion import stopping_distances
@@ -39,12 +38,12 @@ class Proof:
 
     avoidable: Bools | None  # True if some command avoids all contact; None if that is not known
     reason: NDArray[np.str_] | None  # reason if unavoidable: "early", "front" or "rear"; "" if avoidable
-    harm: Floats  # lower bound on the harm of any command, under either count (m2/s2)
+    harm: Floats | None  # lower bound on the harm of any command, under either count (m2/s2); None: nothing is proven
 
     @property
-    def impact(self) -> Bools:
-        """True for worlds in which no commands avoid an impact, [n]."""
-        return np.asarray(self.harm > 0.0, np.bool_)
+    def impact(self) -> Bools | None:
+        """True for worlds in which no commands avoid an impact, [n]; None: nothing is proven."""
+        return None if self.harm is None else np.asarray(self.harm > 0.0, np.bool_)
 
     @property
     def contact(self) -> Bools | None:
@@ -99,31 +98,28 @@ def known_limits(worlds: Worlds, task: Task) -> Limits | Unproven:
 def prove(worlds: Worlds, task: Task) -> Proof | Unproven:
     """Return what is proven about each world at the alert: whether contact is avoidable, and a lower bound on harm.
 
-    Returns ``Unproven`` if the proofs do not cover ``task``.
+    The bound covers one controlled vehicle with brakes that act at once and a free road ahead. Returns ``Unproven`` if
+    the proofs do not cover ``task``.
     """
     because = unproven_because(worlds, task)
     if because is not None:
         return Unproven(because)
-    horizon_s, time_step_s = task.scenario.horizon_s, task.scenario.time_step_s
-    if _is_team(task):
-        harm = team_bound(worlds, task.vehicles, horizon_s=horizon_s, time_step_s=time_step_s).harm
-        if undecided_because(worlds, task) is not None:
-            return Proof(None, None, harm)
+    if undecided_because(worlds, task) is not None:
+        return Proof(None, None, None)
+    if len(task.vehicles) > 1 or np.isfinite(worlds.obstacle_gap_m).any():
         contact = avoidability(worlds, _DRIVEN)
-        return Proof(contact.avoidable, contact.reason_name, harm)
-    bound = lower_bound(worlds, task.vehicle, horizon_s=horizon_s, time_step_s=time_step_s)
-    if bound.contact is None:
-        return Proof(None, None, bound.harm)
+        return Proof(contact.avoidable, contact.reason_name, None)
+    bound = lower_bound(worlds, task.vehicle, horizon_s=task.scenario.horizon_s, time_step_s=task.scenario.time_step_s)
     return Proof(bound.contact.avoidable, bound.contact.reason_name, bound.harm)
 
 
 def unproven_because(worlds: Worlds, task: Task) -> str | None:
-    """Return, as a clause, the reason why nothing is proven for ``task``; None if a lower bound on harm is proven."""
+    """Return, as a clause, the reason why the limits do not cover ``task``; None if they do."""
     if worlds.vehicles.in_pieces.any() or (_is_team(task) and worlds.vehicles.build_up.any()):
         return _uneven_because(worlds)
     if not _is_team(task):
         return _uncovered_because(worlds, task)
-    return _script_because(task, "harm is bounded")
+    return _script_because(task, "the best known harm holds")
 
 
 def undecided_because(worlds: Worlds, task: Task) -> str | None:

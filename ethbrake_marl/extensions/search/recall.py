@@ -2,33 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
 from ethbrake_marl.agents.driving import record_commands
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.making import make_agent
-from ethbrake_marl.agents.protocol import Source, fixed_commands
+from ethbrake_marl.agents.protocol import Agent, Source, fixed_commands
 from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.engine.memory import Memory
-from ethbrake_marl.engine.profiles import TIME_STEP_S, ProfileProblem, Profiles
+from ethbrake_marl.engine.profiles import TIME_STEP_S, Profiles
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, renumbered
-from ethbrake_marl.extensions.search.planner import MOST_CANDIDATES, Outlook, budget_of
+from ethbrake_marl.extensions.search.outlook import MOST_CANDIDATES, Outlook, budget_of
 from ethbrake_marl.extensions.search.problem import search_profiles
 from ethbrake_marl.extensions.search.refine import refine
+from ethbrake_marl.extensions.search.shipped import shipped_profiles
 from ethbrake_marl.game.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics.episode import CLOCK
-from ethbrake_marl.physics.state import Bools, Floats, Worlds
+from ethbrake_marl.physics.state import Floats, Worlds
+from ethbrake_marl.registry import Part
 from ethbrake_marl.scenario.schema import Scenario
 
 PROFILE_BUDGET = 20_000  # candidates in a world that is in no table
 
 START = "universal"  # policy whose episode a search also starts from
-
-Recall = Callable[[ProfileProblem, HarmCount], tuple[Profiles, Bools]]
-"""Function that returns the stored profiles [n] of a problem and a mask [n]: True for worlds that have a profile."""
 
 
 class BestHarm:
@@ -42,7 +41,6 @@ class BestHarm:
     ``InvalidInput`` if the command of another vehicle's script is not fixed at the alert.
 
     Args:
-        recall: function that returns the stored profiles, see ``Recall``.
         scenario: scenario of the worlds; the agent minimises the scenario's objective (if it is not ``total``, the
             agent uses no stored profile and searches every world). If ``scenario`` is None, the agent minimises the
             harm of the line, and does not search a second time.
@@ -58,7 +56,6 @@ class BestHarm:
 
     def __init__(
         self,
-        recall: Recall,
         *,
         scenario: Scenario | None = None,
         harm_count: HarmCount = "first",
@@ -69,33 +66,14 @@ class BestHarm:
         if not budget >= 1:
             raise InvalidInput(f"best_harm: budget = {budget}: the number of profiles to try must be at least 1")
         check_harm_count(harm_count)
-        self._recall, self._budget, self._scenario = recall, budget, scenario
+        self._budget, self._scenario = budget, scenario
         self._outlook = Outlook(harm_count, horizon_s, time_step_s, "total" if scenario is None else scenario.objective)
-
-    @classmethod
-    def make(cls, argument: str | None, settings: AgentSettings, recall: Recall) -> BestHarm:
-        """Return the agent ``best_harm`` or ``best_harm:CANDIDATES``.
-
-        ``argument`` is the number of profiles that a search simulates, as text; None: ``PROFILE_BUDGET``. Raises
-        ``InvalidInput`` if ``argument`` is not a whole number from 1 to ``MOST_CANDIDATES``.
-        """
-        budget = PROFILE_BUDGET if argument is None else budget_of(argument)
-        if budget is None:
-            raise InvalidInput(
-                f"agent 'best_harm:{argument}': after the colon, give the number of profiles to try in each world,"
-                f" from 1 to {MOST_CANDIDATES:,}, for instance best_harm:{PROFILE_BUDGET}"
-            )
-        return cls(
-            recall, scenario=settings.scenario, harm_count=settings.harm_count, horizon_s=settings.horizon_s,
-            time_step_s=settings.time_step_s,
-            budget=budget if settings.most_candidates is None else min(budget, settings.most_candidates),
-        )  # fmt: skip
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         """Read the stored profiles, search the worlds without a stored profile, and return the commands as memory."""
         others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)
         problem, outlook = self._outlook.problem(alert, vehicle, others), self._outlook
-        profiles, known = self._recall(problem, outlook.harm_count)
+        profiles, known = shipped_profiles(problem, outlook.harm_count)
         if outlook.objective != "total":  # the stored profiles minimise the harm of the line
             known = np.zeros(alert.n, np.bool_)
         harm, commands = problem.values(profiles)[outlook.harm_count], self._stepwise(profiles)
@@ -137,3 +115,32 @@ class BestHarm:
         n = len(profiles.ends)
         steps = [profiles.at(np.full(n, step))[:, 0] for step in range(self._outlook.decisions)]
         return np.stack(steps, axis=1)
+
+
+def make_best_harm(argument: str | None, settings: AgentSettings) -> Agent:
+    """Return the agent ``best_harm`` or ``best_harm:CANDIDATES``.
+
+    ``argument`` is the number of profiles that a search simulates, as text; None: ``PROFILE_BUDGET``. Raises
+    ``InvalidInput`` if ``argument`` is not a whole number from 1 to ``MOST_CANDIDATES``.
+    """
+    budget = PROFILE_BUDGET if argument is None else budget_of(argument)
+    if budget is None:
+        raise InvalidInput(
+            f"agent 'best_harm:{argument}': after the colon, give the number of profiles to try in each world,"
+            f" from 1 to {MOST_CANDIDATES:,}, for instance best_harm:{PROFILE_BUDGET}"
+        )
+    return BestHarm(
+        scenario=settings.scenario, harm_count=settings.harm_count, horizon_s=settings.horizon_s,
+        time_step_s=settings.time_step_s,
+        budget=budget if settings.most_candidates is None else min(budget, settings.most_candidates),
+    )  # fmt: skip
+
+
+BEST_HARM = Part(  # target of the entry point in pyproject.toml
+    make_best_harm,
+    form="best_harm[:CANDIDATES]",
+    about="drives the best known profile; searches at the alert if no profile is stored",
+    knows=Source.MODEL,
+)
+
+RUNGS = ("best_harm",)  # agents that ``--agents ladder`` adds above the core's

@@ -58,10 +58,14 @@ class Regrets:
 
     @property
     def between(self) -> Between | None:
-        """Summary of the worlds with unavoidable contact but no proven impact; None if avoidability is unknown."""
-        if self.avoidable is None:
+        """Summary of the worlds with unavoidable contact but no proven impact; None if one of both is not proven."""
+        if self.avoidable is None or self.limits.proof.impact is None:
             return None
         return Between.of(~self.avoidable, self.limits.proof.impact, self.first_impact_harm, self.total_harm)
+
+    def above_proven(self, best: Floats) -> Floats | None:
+        """Return best known harm minus the proven lower bound, [n] m2/s2; None if no bound is proven."""
+        return None if self.limits.proof.harm is None else best - self.limits.proof.harm
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +111,7 @@ KNOWN_OF_WORLDS: dict[str, Callable[[Outcome, Regrets], Values | None]] = {
     "best_known_first_impact_harm": lambda _, r: r.first_impact_harm,
     "best_known_total_harm": lambda _, r: r.total_harm,
     "best_known_source": lambda _, r: r.source,
-    "impact_proven": lambda _, r: r.limits.proof.impact + 0,
+    "impact_proven": lambda _, r: None if r.limits.proof.impact is None else r.limits.proof.impact + 0,
     "proven_harm": lambda _, r: r.limits.proof.harm,
     "regret_first_impact_harm": lambda o, r: r.regret(o, "first"),
     "regret_total_harm": lambda o, r: r.regret(o, "total"),
@@ -124,8 +128,6 @@ def limits_of(evaluation: Evaluation) -> Limits | Unproven:
 
 
 def _limits(evaluation: Evaluation) -> Limits | Unproven:
-    if evaluation.host:
-        return Unproven(f"{evaluation.host} simulated the worlds; the proofs assume the physics of this package")
     limits = known_limits(evaluation.worlds, evaluation.task)
     if isinstance(limits, Limits) and limits.warning:
         warnings.warn(limits.warning, IncompleteTable, stacklevel=4)

@@ -1,4 +1,4 @@
-"""The shipped tables of best known harm, and the agent that drives the command profiles in these tables."""
+"""The shipped tables of best known harm."""
 
 from __future__ import annotations
 
@@ -7,15 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ethbrake_marl.agents.protocol import Agent, Source
-from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.engine.profiles import ProfileProblem, Profiles
 from ethbrake_marl.extensions.search.best_harm import task_problem
-from ethbrake_marl.extensions.search.recall import BestHarm
 from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.physics.state import Bools, Floats, Worlds
-from ethbrake_marl.registry import Part
 from ethbrake_marl.scenario.task import Task
 
 TABLES = Path(__file__).with_name("_tables")
@@ -58,21 +54,3 @@ def shipped_profiles(problem: ProfileProblem, harm_count: HarmCount) -> tuple[Pr
         profiles.commands_mps2[here] = stored.commands_mps2[here]
         known |= here
     return profiles, known
-
-
-def make_best_harm(argument: str | None, settings: AgentSettings) -> Agent:
-    """Return the agent ``best_harm`` or ``best_harm:CANDIDATES``, which drives the shipped profile of each world.
-
-    In a world without a shipped profile, the agent searches at the alert.
-    """
-    return BestHarm.make(argument, settings, shipped_profiles)
-
-
-BEST_HARM = Part(  # target of the entry point in pyproject.toml
-    make_best_harm,
-    form="best_harm[:CANDIDATES]",
-    about="drives the best known profile; searches at the alert if no profile is stored",
-    knows=Source.MODEL,
-)
-
-RUNGS = ("planner", "best_harm")  # agents that ``--agents ladder`` adds above the core's

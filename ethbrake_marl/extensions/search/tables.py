@@ -88,11 +88,6 @@ class BestHarmTable:
         """Write the table to the file ``path``; if writing fails, the old file stays unchanged."""
         write_file(path, table_bytes(self))
 
-    @property
-    def left_out(self) -> Mapping[str, str]:
-        """Worlds that are missing because their simulation failed: number of the world -> reason of the failure."""
-        return dict(self.header.get(LEFT_OUT, {}))
-
     def rows(self, identity: UInt64s) -> NDArray[np.int64]:
         """Return the row in the table, [m], of each world with hash ``identity`` [m]; -1: not in the table."""
         order = np.argsort(self.identity, kind="stable")
@@ -141,25 +136,20 @@ class BestHarmTable:
         return Profiles(ends, np.where(known[:, np.newaxis, np.newaxis], stored.commands_mps2, 0.0)), known
 
     def improved(
-        self, identity: UInt64s, harm_count: HarmCount, harm: Floats, profiles: Profiles | None = None
+        self, identity: UInt64s, harm_count: HarmCount, harm: Floats, profiles: Profiles
     ) -> tuple[BestHarmTable, Bools]:
         """Return a copy of the table with the smaller values from ``harm``, and a mask [m] of the changed worlds.
 
         A value in ``harm`` replaces the value in the table only if it is smaller by more than ``TOLERANCE``. Worlds
-        that are not in the table are ignored. Raises ``InvalidInput`` if the table does not contain ``harm_count``, or
-        if ``harm`` and ``identity`` have different shapes.
+        that are not in the table are ignored. Raises ``InvalidInput`` if the table does not contain ``harm_count``.
 
         ``identity`` [m] are the hashes of the worlds, ``harm`` [m] is their harm in m2/s2, and ``profiles`` [m] are
-        command profiles with this harm; None: the table gets the harm without profiles.
+        command profiles with this harm.
         """
         if harm_count not in self.best:
             raise InvalidInput(
                 f"harm_count = {harm_count!r}: the table does not contain this harm count; it contains"
                 f" {', '.join(map(repr, self.best))}"
-            )
-        if harm.shape != identity.shape:
-            raise InvalidInput(
-                f"harm has the shape {harm.shape}; give one number for each world, shape {identity.shape}"
             )
         rows = self.rows(identity)
         old = self.best[harm_count]
@@ -167,10 +157,6 @@ class BestHarmTable:
         at = rows[better]
         new_harm = old.harm.copy()
         new_harm[at] = harm[better]
-        if profiles is None:
-            profiles = Profiles(
-                np.zeros((len(harm), 1), np.int64), np.zeros((len(harm), 1, old.profiles.commands_mps2.shape[2]))
-            )
         profiles_, new = Profiles.padded([old.profiles, profiles], 1)
         profiles_.ends[at] = new.ends[better]
         profiles_.commands_mps2[at] = new.commands_mps2[better]

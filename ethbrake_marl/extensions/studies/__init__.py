@@ -1,1 +1,1 @@
-"""Studies of many training runs or many worlds: the commands ``ethbrake study sweep``, ``tune`` and ``falsify``."""
+"""Studies of many training runs or many worlds, and the command ``ethbrake study falsify``."""

@@ -1,4 +1,4 @@
-"""The commands ``study sweep`` and ``study tune`` for many training runs, and ``study falsify`` for many worlds."""
+"""The group of commands ``study``, and its command ``study falsify``, which searches for an agent's worst worlds."""
 
 from __future__ import annotations
 
@@ -10,186 +10,30 @@ from typing import Annotated, Any
 import typer
 
 from ethbrake_marl import evaluation, training
-from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, SettingsOption, example, schema_option
+from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, SettingsOption, example
 from ethbrake_marl.cli.evaluate import read_task
-from ethbrake_marl.errors import InvalidInput, count_of, need
+from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.files.sheet import Sheet
 
 REMAINS = "the same command continues the work in this folder"
 
 ROUNDING = 1e-6  # m2/s2
 
-MOST_WORKERS = 4096
-
 FolderOption = Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for all results.")]
-
-RetriesOption = Annotated[
-    int, typer.Option(help="Number of further attempts if the process of a training run dies.", min=0, max=100)
-]
-
-DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Print the planned training runs, and start none.")]
-
-ClusterOption = Annotated[
-    str,
-    typer.Option(metavar="local|ADDRESS", help="local: start Ray on this machine; ADDRESS: use a running Ray cluster."),
-]
 
 study_group = typer.Typer(
     rich_markup_mode=None,
     add_completion=False,
     help="Compare many policies; search for an agent's worst worlds.",
-    epilog=example("study sweep sweep.yaml --output runs/sweep", "study ablate --quick --output runs/ablation-quick"),
+    epilog=example(
+        "study falsify --agent ppo --output worst.yaml", "study ablate --quick --output runs/ablation-quick"
+    ),
 )
 
 
-@study_group.command("sweep", epilog=example("study sweep sweep.yaml --output runs/sweep"))
-def sweep_command(
-    file: Annotated[
-        Path, typer.Argument(metavar="SWEEP.yaml", help="File with the list or grid of jobs (training runs).")
-    ],
-    output: FolderOption,
-    jobs: Annotated[
-        int | None,
-        typer.Option(
-            help="Number of jobs that run at once, each in one process with one thread.",
-            show_default="one for each core",
-            min=1,
-            max=MOST_WORKERS,
-        ),
-    ] = None,
-    ray: ClusterOption = "local",
-    retries: RetriesOption = 2,
-    dry_run: DryRunOption = False,
-    schema: schema_option("ethbrake_marl.extensions.studies.sweep", "SweepPlan", "sweep") = False,  # type: ignore[valid-type]  # made here
-    as_json: JsonOption = False,
-) -> None:
-    """Do the training runs in a file, and write a table of results.
-
-    After an interruption, the same command continues: finished jobs are not trained again, and unfinished jobs continue
-    from their last checkpoint. If a job failed, the exit status is 1, and failures.csv says why.
-    """
-    with Out(as_json=as_json, remains=REMAINS) as out:
-        from ethbrake_marl.extensions.studies.sweep import SweepPlan
-
-        plan = SweepPlan.read(file)
-        plan.folder(output).check()
-        if dry_run:
-            states = plan.states(output)
-            lines = ([f"{job['state']:8}", job["job"], *map("=".join, job["set"].items())] for job in states)
-            out.result(states, *map("  ".join, lines))
-            return
-        need("ray")
-        result = plan.run(output, jobs=jobs, ray=ray, retries=retries, tell=out.show_progress)
-        counts = {"jobs": result.jobs, "finished": result.finished, "failed": result.failed}
-        out.result({**counts, "interrupted": result.interrupted, "table": str(result.table)})
-        summary = f"{result.finished:,} of {result.jobs:,} jobs finished; table: {result.table}"
-        if result.failed:
-            summary += f"; {result.failed:,} failed, for the reasons in {output / 'failures.csv'}"
-        _end_study(out, summary, interrupted=result.interrupted, failed=result.failed > 0)
-
-
-@study_group.command(
-    "tune", epilog=example("study tune tuning.yaml --output runs/tuning --trials 30 --export best.yaml")
-)
-def tune_command(
-    file: Annotated[
-        Path,
-        typer.Argument(metavar="TUNING.yaml", help="File that describes a training run and the settings to search."),
-    ],
-    output: FolderOption,
-    trials: Annotated[
-        int,
-        typer.Option(help="Total number of trials in the folder, trials of earlier runs included.", min=1, max=10_000),
-    ] = 30,
-    jobs: Annotated[
-        int,
-        typer.Option(
-            help="Number of trials that run at once, one process each. This number changes which values are tried.",
-            min=1,
-            max=MOST_WORKERS,
-        ),
-    ] = 1,
-    ray: ClusterOption = "local",
-    retries: RetriesOption = 2,
-    export: Annotated[
-        Path | None,
-        typer.Option(metavar="NAME.yaml", help="File to write: a recipe with the settings of the best trial."),
-    ] = None,
-    dry_run: DryRunOption = False,
-    schema: schema_option("ethbrake_marl.extensions.studies.tuning", "TuningPlan", "tuning") = False,  # type: ignore[valid-type]  # made here
-    force: ForceOption = False,
-    as_json: JsonOption = False,
-) -> None:
-    """Search for the best settings of a training recipe.
-
-    A trial is one training run. The harm of a trial is measured on the list of worlds that FILE describes. After an
-    interruption, the same command continues: finished trials are not trained again, and unfinished trials continue. The
-    exit status is 1 if no trial has finished.
-    """
-    with Out(as_json=as_json, force=force, remains=REMAINS) as out:
-        need("optuna")
-        from ethbrake_marl.extensions.studies.tuning import TuningPlan
-
-        plan = TuningPlan.read(file)
-        plan.folder(output).check()
-        if export is not None:  # raise now what would be raised at the end
-            if export.suffix != ".yaml":
-                raise InvalidInput(f"--export {export}: the file name of a recipe must end in .yaml")
-            plan.best_recipe({}, export, "")
-            out.force = out.force or plan.has_exported(output, export)  # the same command may continue
-            out.check(export)
-        if dry_run:
-            own = plan.own_values()
-            space = {key: dimension.model_dump(mode="json") for key, dimension in plan.file.search.items()}
-            now = {
-                key: "the ranges exclude the recipe's own values" if own is None else f"the recipe has {own[key]}"
-                for key in space
-            }
-            started, steps, example = len(plan.proposals(output)), plan.recipe.total_steps, plan.example()
-            out.result(
-                {
-                    **{"search": space, "own_values": own, "trials": trials, "begun": started, "total_steps": steps},
-                    **{"scenario": plan.file.scenario, "recipe": plan.file.recipe, "example": example},
-                },
-                f"{count_of(trials, 'trial')} ({started:,} of them begun): recipe {plan.file.recipe} in scenario"
-                f" {plan.file.scenario}; {steps:,} decisions per trial that is not pruned",
-                *(f"{key}  {dimension}  ({now[key]})" for key, dimension in plan.file.search.items()),
-                f"{'the first trial' if own else 'example of a trial'}: {example}",
-            )
-            return
-        need("ray")
-        result = plan.run(output, trials, jobs=jobs, ray=ray, retries=retries, tell=out.show_progress)
-        counted = ", ".join(f"{number:,} {state}" for state, number in sorted(result.counts.items()))
-        summary, best, shown, lines = f"trials: {counted or 'none'}; table: {result.table}", result.best, None, []
-        export = None if best is None or result.interrupted else export  # an interrupted tuning exports at its end
-        if best is not None:
-            measure = training.RunDirectory.chosen_by([best.figures], plan.recipe.reward.harm_count)
-            shown = {"trial": best.number, "measure": measure, "harm": best.harm, "values": best.values}
-            unit = "" if measure == training.RunDirectory.OBJECTIVE else " m²/s²"  # objectives have different units
-            lines = [f"best: trial {best.number}, {measure} {best.harm:.4f}{unit}"]
-            lines += [f"  {key} = {value}" for key, value in best.values.items()]
-            if export is not None:
-                source = f"trial {best.number}, {best.harm!r} on the list of seed {plan.file.measure.seed}"
-                out.write(export, plan.best_recipe(best.values, export, f"ethbrake study tune: {source}"))
-                summary += f"; recipe: {export}"
-        best_row = {
-            "best": shown,
-            "trials": result.counts,
-            "interrupted": result.interrupted,
-            "table": str(result.table),
-            "exported": None if export is None else str(export),
-        }
-        out.result(best_row, *lines)
-        _end_study(out, summary, interrupted=result.interrupted, failed=best is None)
-
-
-def _end_study(out: Out, summary: str, *, interrupted: bool, failed: bool) -> None:
-    """Print ``summary``, and exit with status 130 if the study was interrupted, 1 if it failed, else 0."""
-    if interrupted:
-        out.interrupted(f"interrupted; {summary}; {REMAINS}")
-    out.note(summary)
-    if failed:
-        raise typer.Exit(1)
+@study_group.callback()
+def _group() -> None:
+    """Make this app a group of commands although it has only one; other extensions add theirs."""
 
 
 @study_group.command("falsify", epilog=example("study falsify --agent ppo --against e_v2x_bm --output worst.yaml"))

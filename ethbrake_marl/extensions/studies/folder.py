@@ -1,4 +1,4 @@
-"""The folder of a study, for instance of a sweep or of a reproduction of the paper.
+"""The folder of a study, for instance of an ablation or of a reproduction of the paper.
 
 Only one process at a time may work in the folder, and all processes must use the same settings.
 """
@@ -23,7 +23,7 @@ class StudyFolder:
 
     Args:
         path: folder, which ``work`` creates if necessary.
-        kind: words for the content of the folder in messages, such as ``a sweep``.
+        kind: words for the content of the folder in messages, such as ``an ablation``.
         question: all settings and software versions on which the results depend, as plain data. If the folder stores
             other settings, ``check`` and ``work`` raise ``InvalidInput``. None: the folder stores no common settings,
             because each result stores its own.

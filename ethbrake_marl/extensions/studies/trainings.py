@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.parallel import run_each
@@ -20,9 +20,6 @@ from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.training.run_folder import RunDirectory
 from ethbrake_marl.training.team import load_team
 from ethbrake_marl.training.training import Training, check_same_training
-
-if TYPE_CHECKING:
-    from ethbrake_marl.training.callback import StopAt
 
 
 def train_all(trainings: Sequence[TrainingJob], jobs: int = 1, tell: OnProgress | None = None) -> bool:
@@ -80,11 +77,10 @@ class TrainingJob:
         steps = status.get("steps", 0)
         return max(total - (steps if isinstance(steps, int) else 0), 1)
 
-    def finish(self, tell: OnProgress | None = None, *, stop_at: StopAt | None = None) -> bool | None:
-        """Start or continue the training run until it ends. Return True, or None if it was stopped early.
+    def finish(self, tell: OnProgress | None = None) -> bool | None:
+        """Start or continue the training run until it ends. Return True, or None if Ctrl-C stopped it.
 
-        ``stop_at`` is called with each evaluation; it returns a reason to stop, or None to continue. Raises the
-        exceptions of ``train`` and ``resume``.
+        Raises the exceptions of ``train`` and ``resume``.
         """
         from ethbrake_marl.training.session import resume, train  # torch takes seconds to load
 
@@ -96,13 +92,38 @@ class TrainingJob:
         if run.is_finished:
             return True
         if run.status.is_file():
-            ended = resume(self.folder, stop_at=stop_at, on_progress=say)
+            ended = resume(self.folder, on_progress=say)
         else:
             self.folder.parent.mkdir(parents=True, exist_ok=True)
-            ended = train(
-                asked.recipe, asked.scenario, self.folder, settings=self.noted, stop_at=stop_at, on_progress=say
-            )
+            ended = train(asked.recipe, asked.scenario, self.folder, settings=self.noted, on_progress=say)
         return True if ended.status == "finished" else None
+
+    def attempt(self) -> str:
+        """Start or continue the training run until it ends. Return "", or the reason if the training run fails.
+
+        Raises ``KeyboardInterrupt`` if Ctrl-C stopped the training run.
+        """
+        try:
+            if self.steps_left() and not self.finish():
+                raise KeyboardInterrupt
+        except EthBrakeError as error:
+            return str(error)
+        return ""
+
+    def result(self) -> dict[str, float]:
+        """Return the evaluation of the saved policy, the best one in the finished training run.
+
+        The entries are ``steps``, ``harm`` (the quantity that the saved policy has least) and the measures.
+        """
+        measured = [row for row in RunDirectory(self.folder).rows() if row.get("eval/total_harm")]
+        harm = RunDirectory.chosen_by(measured, self.training.recipe.reward.harm_count, "eval/")
+        best = min(measured, key=lambda row: float(row[harm]))
+        measures = ("first_impact_harm", "total_harm", "collision_rate")
+        return {
+            "steps": int(best["steps"]),
+            "harm": float(best[harm]),
+            **{name: float(best[f"eval/{name}"]) for name in measures},
+        }
 
     def time(self, sample: Sample | None = None) -> Timed:
         """Measure the time of a few updates of this training run, and the time in which its policies drive some worlds.

@@ -26,24 +26,12 @@ HEARD_LATE = NEVER_HEARD.replace(  # a while after the first decision, by messag
     latency_s=[0.0, 0.2, 0.6],
 )
 LISTS = {"never heard": NEVER_HEARD, "heard late": HEARD_LATE}
-_INSIDE = {
-    "gaps_m": [{"uniform": [5.13, 9.71]}, {"uniform": [5.37, 9.58]}],
-    "speeds_mps": [{"uniform": [18.23, 21.87]}, {"uniform": [18.11, 21.93]}, {"uniform": [18.41, 22.19]}],
-    "mass_t": [4.5, 5.5, {"uniform": [3.0, 9.0]}],
-}
-INSIDE = {  # the same ranges, and worlds from between the corners
-    **{name: scenario.replace(**_INSIDE) for name, scenario in LISTS.items()},
-    "blocked": NEVER_HEARD.replace(**_INSIDE, v2x={"preset": "blocked", "persistence": "periodic"}),
-    "sensors-only": NEVER_HEARD.replace(**_INSIDE, v2x="sensors-only"),
-}
 
 
-def shielded(
-    way: str, scenario: eb.Scenario, n: int, seed: int, *, robust: str | None = "corners"
-) -> tuple[Floats, Floats, int]:
+def shielded(way: str, scenario: eb.Scenario, n: int, seed: int, *, robust: bool = True) -> tuple[Floats, Floats, int]:
     """Harm realised and first bound of ``n`` worlds [n] m2/s2, and how many proposals were replaced."""
-    mode = {"mode": "step"} if robust is None else {"mode": "robust", "robust": robust}
-    driver = ShieldedDriver(Hostile(way, seed), scenario, estimated=True, **mode)
+    mode = "robust" if robust else "step"
+    driver = ShieldedDriver(Hostile(way, seed), scenario, estimated=True, mode=mode)
     episodes = drive(scenario.sample(n, seed).worlds, driver, scenario, 1)
     shield = episodes.guarded.shield
     return episodes.ledger.world_harm("first"), shield.predicted_harm, int(shield.interventions.sum())

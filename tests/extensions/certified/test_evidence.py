@@ -7,16 +7,12 @@ from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.shields.drivers import ShieldedDriver
 from ethbrake_marl.shields.evidence import review
 from tests.shield.test_step_shield import wavering
 
 SCENARIO = load_scenario("paper-random")
-TASK = Task(SCENARIO, (1,))
 WORLDS = SCENARIO.sample(60, 3).worlds
-FEW = WORLDS.take(np.arange(25))
-INTERVALS = parse_uncertainty("gaps_m=1,mass_t.vehicle_3=20%")
 
 
 def logged(policy, worlds=WORLDS, driver=None, **settings):

@@ -7,9 +7,10 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive, script_agents
 from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.protocol import Source
+from ethbrake_marl.agents.received import Received
 from ethbrake_marl.agents.spec import parse_spec
 from ethbrake_marl.evaluation.lineup import make_lineup
-from ethbrake_marl.extensions.certified.estimated import Ranges, Told
+from ethbrake_marl.extensions.certified.estimated import Ranges
 from ethbrake_marl.extensions.certified.estimating_agents import Odometer
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from tests.agents.test_knowledge import PAPER, agent_of, changed_decisions, check_stated, in_two, with_channels
@@ -20,7 +21,7 @@ BLOCKED = eb.load_scenario("cooperation-2-blocked")
 @pytest.mark.parametrize("spec", ["e_v2x_bm:estimated", "coast+step:estimated", "ppo+episode:estimated"])
 @pytest.mark.parametrize("leak", ["known", "speed_mps"])
 def test_estimated_model__a_planted_leak_is_found(spec, leak, monkeypatch):
-    honest = Told.to
+    honest = Received.by
 
     def leaking(worlds, vehicle):
         told = honest(worlds, vehicle)
@@ -28,7 +29,7 @@ def test_estimated_model__a_planted_leak_is_found(spec, leak, monkeypatch):
         return told._replace(**{leak: all_of_it[leak]})
 
     scenario = BLOCKED.replace(v2x={"preset": "blocked", "persistence": "periodic"})
-    monkeypatch.setattr(Told, "to", leaking)
+    monkeypatch.setattr(Received, "by", leaking)
     assert changed_decisions(agent_of(spec, scenario), scenario, n=100) > 0
 
 
@@ -100,7 +101,7 @@ def test_estimated__an_old_message_is_moved_on_by_the_script_to_the_truth() -> N
     engine = engine_of(BASE.replace(v2x=channel))
     odometer = Odometer.begun(engine.scenario.sample(40, 7).worlds, 1)
     for _ in range(12):
-        now, told = engine.worlds, Told.to(engine.worlds, 1)
+        now, told = engine.worlds, Received.by(engine.worlds, 1)
         assert told.known.all() and (told.at_s[:, [0, 2]] < now.time_s[:, np.newaxis] - 0.19).all()
         odometer = odometer.look(now, 1)
         taken = estimated(engine, odometer=odometer)
@@ -142,7 +143,7 @@ def test_estimating__knows_of_the_obstacle_what_it_was_told(v2x: object) -> None
     engine = engine_of(scenario)
     for _ in range(15):
         engine.step(np.full((40, 1), -0.9))
-    told, now = Told.to(engine.worlds, 1), engine.worlds
+    told, now = Received.by(engine.worlds, 1), engine.worlds
     heard = told.known[:, 0]
     assert heard.sum() > 20
     np.testing.assert_allclose(told.obstacle_m[heard], (now.obstacle_gap_m + now.gaps_m[:, 0])[heard], atol=1e-9)
@@ -158,12 +159,10 @@ STATED = {
     "e_v2x_bm:pairwise:estimated": (ESTIMATES,),
     "coast+step:estimated": (SENSORS, ESTIMATES),
     "coast+robust:estimated": (SENSORS, ESTIMATES),
-    "coast+robust:interior:estimated": (SENSORS, ESTIMATES),
     "ppo+step:estimated": (MESSAGES, ESTIMATES),
     "ppo+episode:estimated": (MESSAGES, ESTIMATES),
     "ppo+episode:pairwise:estimated": (MESSAGES, ESTIMATES),
     "ppo+robust": (MESSAGES, MODEL),
-    "ppo+robust:interior": (MESSAGES, MODEL),
 }
 HONEST, SEEING = in_two(STATED)
 
@@ -174,13 +173,13 @@ def test_knowledge__every_agent_states_it(spec, knows):
 
 
 def certified(spec: str, scenario: eb.Scenario = PAPER) -> eb.Agent:
-    uncertainty = parse_uncertainty("gaps_m=0.5") if parse_spec(spec).shield in ("robust", "robust:interior") else None
+    uncertainty = parse_uncertainty("gaps_m=0.5") if parse_spec(spec).shield == "robust" else None
     return make_lineup([spec], scenario, uncertainty=uncertainty)[spec]
 
 
 @pytest.mark.parametrize(("spec", "channel"), with_channels(HONEST), ids=str)
 def test_own_sensors_and_messages__what_was_not_received_changes_no_action(spec, channel):
-    n = 2 if "interior" in spec else 4 if "robust" in spec else 10
+    n = 4 if "robust" in spec else 10
     scenario = BLOCKED.replace(v2x=channel)
     assert changed_decisions(certified(spec, scenario), scenario, n=n) == 0
 

@@ -6,8 +6,8 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.making import make_agent
+from ethbrake_marl.agents.received import Received
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.certified.estimated import Told
 from ethbrake_marl.physics.messages import PIECES, USUAL_PIECES
 from tests.agents.test_knowledge import agent_of, changed_decisions
 from tests.extensions.certified.estimates import ABOVE, WAYS, shielded
@@ -43,7 +43,7 @@ def test_estimated__of_a_missing_piece_is_the_middle_of_its_range() -> None:
     assert (v.braking_capacity_mps2[:, 0] == 7.0).all()
     assert v.braking_capacity_mps2[:, 1:].tolist() == own.braking_capacity_mps2[:, 1:].tolist()
     engine = engine_of(telling({"vehicle_3": ["place", "mass"]}, base))  # without its speed its place is of no use
-    now, taken, told = engine.worlds, estimated(engine), Told.to(engine.worlds, 1)
+    now, taken, told = engine.worlds, estimated(engine), Received.by(engine.worlds, 1)
     assert not told.known[:, 2].any() and told.known[:, :2].all() and told.pieces[:, 2].sum(axis=1).max() == 2
     assert (taken.gaps_m[:, 1] != now.gaps_m[:, 1]).all() and taken.vehicles.mass_t[:, 2].tolist() == (
         own.mass_t[:, 2].tolist()
@@ -75,7 +75,7 @@ def test_robust__at_the_corners_no_world_is_above_the_first_bound(lacking: str, 
 
 
 def test_step__in_the_middle_promises_nothing_where_a_piece_is_missing() -> None:
-    harm, bound, _ = shielded("coast", telling(LACKING["everything"], CORNERS), 30, 7, robust=None)
+    harm, bound, _ = shielded("coast", telling(LACKING["everything"], CORNERS), 30, 7, robust=False)
     assert (harm > bound + 1.0).any()
 
 

@@ -10,10 +10,10 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.cooperation.comparison import compare
-from ethbrake_marl.extensions.cooperation.figures import ablation_figures
+from ethbrake_marl.extensions.cooperation.figures import ablation_figure
 from ethbrake_marl.extensions.cooperation.joint_optimum import Harms, LevelOptimum, Measured, best_known
 from ethbrake_marl.extensions.cooperation.levels import Level, Plan, common_worlds, plan_ablation
-from ethbrake_marl.extensions.cooperation.page import levels_csv, markdown
+from ethbrake_marl.extensions.cooperation.results import levels_csv
 from ethbrake_marl.extensions.cooperation.sweep import Swept
 from ethbrake_marl.extensions.search.best_harm import best_harm
 from tests.fixtures.commands import Command, Refuse
@@ -38,34 +38,22 @@ def test_parse__ranges_and_lists_in_ascending_order(text: str, settings: list[st
     assert [each.number for each in values] == [float(each.replace(":", "=").split("=")[-1]) for each in settings]
 
 
-MUST = "must be KEY=LOW..HIGH:STEP or KEY=A,B,... with numbers, for instance objective=social:0..90:15"
-RANGE = "must go up from LOW to HIGH in 1 to 99 equal steps, for instance 0..90:15"
 REFUSED = {
-    "friction": MUST,
-    "=1,2": MUST,
-    "objective=own,total": f"{MUST} or v2x.lost=0,0.1,0.3; for other values, give scenarios with --levels",
-    "gaps_m='{uniform: [5, 10]}'": MUST,
-    "friction=0.5,nan": MUST,
-    "friction=0.5,,0.6": MUST,
-    "objective=social:0..100:15": f"--sweep objective: range social:0..100:15: a range LOW..HIGH:STEP {RANGE}",
-    "friction=1..0.5:0.1": RANGE,
-    "friction=0.5..1:0": RANGE,
-    "friction=0.5..1:-0.1": RANGE,
-    "friction=0..100:1": RANGE,
-    "friction=0.5": "--sweep friction: has 1 number; give 2 to 100 numbers",
-    "friction=0..60:1,100..160:1": "has 122 numbers; give 2 to 100 numbers",
-    "friction=0.5,0.50": "--sweep friction: 0.5 is given twice",
-    "objective=social:0..120:30": "objective 'social:120': social needs an angle from 0 to 90 degrees",
-    "mass_t.2=-1,2": "mass_t[2] (vehicle_3) = -1: must be finite and in (0, 1000] t",
-    "frictoin=0.5,0.6": "unknown setting 'frictoin'; did you mean 'friction'?",
-    "averaging=0.9,0.99": "--sweep averaging: this is a key of a recipe, but only a key of a scenario can be swept",
-    "vehicles=2,3": "--sweep vehicles: levels with different values of vehicles cannot be compared; for each value",
-    "horizon_s=4,8": "for each value of horizon_s, run the command once, with --set horizon_s=... and an --output",
-    "friction=0.5,0.6 --sweep v2x.lost=0,0.1": "--sweep is given twice; give it once, because",
-    "friction=0.5,0.6 --set friction=1": "--sweep friction: --set changes the same key",
-    "friction=0.5,0.6 --levels cooperation-3-pair,cooperation-4-all": "levels: 2 levels given; a sweep needs",
-    "friction=0.5,0.6 --levels cooperation-0-sensors": "levels: no level has a learner",
-    "objective=social:0,90 --set reward.objective=own": "recipe 'cooperation' has its own objective",
+    "objective=own,total": "must be KEY=LOW..HIGH:STEP",
+    "friction=0.5,nan": "must be KEY=LOW..HIGH:STEP",
+    "objective=social:0..100:15": "equal steps",
+    "friction=1..0.5:0.1": "equal steps",
+    "friction=0.5..1:-0.1": "equal steps",
+    "friction=0.5": "give 2 to 100 numbers",
+    "friction=0..60:1,100..160:1": "give 2 to 100 numbers",
+    "friction=0.5,0.50": "given twice",
+    "averaging=0.9,0.99": "only a key of a scenario can be swept",
+    "vehicles=2,3": "cannot be compared",
+    "friction=0.5,0.6 --sweep v2x.lost=0,0.1": "--sweep is given twice",
+    "friction=0.5,0.6 --set friction=1": "--set changes the same key",
+    "friction=0.5,0.6 --levels cooperation-3-pair,cooperation-4-all": "a sweep needs",
+    "friction=0.5,0.6 --levels cooperation-0-sensors": "no level has a learner",
+    "objective=social:0,90 --set reward.objective=own": "has its own objective",
 }
 
 
@@ -149,38 +137,20 @@ def test_tables__have_the_key_and_the_number_as_columns(measured: list[Measured]
     told = [(row["swept_key"], row["swept_number"], row["seed"], row["first_impact_harm"]) for row in table]
     shown = [("objective", "0.0", "0", "12.0"), ("objective", "0.0", "1", "10.0"), ("objective", "30.0", "0", "9.0")]
     assert told[:3] == shown
-    text = markdown(found, "Conditions.")
-    assert "| Level | objective = social:… | Collisions |" in text
-    assert "| `cooperation-3-pair-social-90` | 90 | 100.0 % [" in text
-    assert "| objective = social:…, from | To |" in text and "\n| 30 | 90 | -2.00 [" in text
 
 
-def test_figures__their_axis_is_the_number_linear_from_zero(measured: list[Measured]) -> None:
+def test_figure__has_the_numbers_on_its_axis(measured: list[Measured]) -> None:
     found = compare([*measured, *(replace(each, algorithm="sac") for each in measured)], SEARCHED)
-    harm, bears = ablation_figures(found, "Conditions.")
-    for axes in (*harm.axes, *bears.axes):
-        assert (axes.get_xscale(), axes.get_yscale(), axes.get_ylim()[0]) == ("linear", "linear", 0.0)
-        assert axes.get_xlabel() == "objective = social:…" and list(axes.get_xticks()) == [0.0, 30.0, 90.0]
-        assert axes.get_xlim() == pytest.approx((-5.4, 95.4))
-    first = harm.axes[0]
-    lines = {each.get_label(): each for each in first.lines}
-    assert list(lines["all brake fully"].get_ydata()) == [20.0] * 3
-    assert list(lines["joint optimum"].get_ydata()) == [5.0] * 3
+    first = ablation_figure(found, "Conditions.").axes[0]
+    assert first.get_xlabel() == "objective = social:…"
     curve = next(each for each in first.containers if each.get_label() == "ppo")
     assert [list(part) for part in curve.lines[0].get_data()] == [[0.0, 30.0, 90.0], [11.0, 9.0, 7.0]]
     low, high = np.array([path.vertices[:, 1] for path in curve.lines[2][0].get_paths()]).T
     assert [*low, *high] == pytest.approx([10.0, 9.0, 6.0, 12.0, 9.0, 8.0])  # over seeds: worlds are alike
-    names = [each.get_label() for each in bears.axes[0].containers]
-    assert names == [f"Vehicle {i}, {algorithm}" for algorithm in ("ppo", "sac") for i in (1, 2, 3)]
-    assert list(bears.axes[0].containers[0].lines[0].get_ydata()) == [5.0, 4.0, 2.0]
-
-
-def test_figures__far_from_zero_the_axis_still_begins_there(measured: list[Measured]) -> None:
-    values = Swept.parse("obstacle_gap_m=40,41,60")
-    far = [replace(each, level=replace(each.level, swept=value)) for each, value in zip(measured, values, strict=True)]
-    axes = ablation_figures(compare(far, SEARCHED), "Conditions.")[0].axes[0]
-    assert axes.get_xlim() == pytest.approx((-3.6, 63.6)) and axes.get_xlabel() == "obstacle_gap_m"
-    assert 0.0 in axes.get_xticks() and 41.0 not in axes.get_xticks()  # 40 and 41 have no room beside each other
+    lines = [
+        path.vertices for each in first.collections if each.get_label() == "joint optimum" for path in each.get_paths()
+    ]
+    assert [list(line[:, 1]) for line in lines] == [[5.0, 5.0]] and lines[0][:, 0].mean() == pytest.approx(0.0)
 
 
 SMALL = "--seeds 1 --steps 128 --episodes 20 --search-episodes 4"
@@ -204,11 +174,11 @@ def test_sweep__costs_runs_and_goes_on(
     folders = sorted(each.name for each in out.glob("trainings/*"))
     assert folders == [f"{name}-tiny-shared-seed0" for name in names]
     assert [each.name for each in out.glob("optimum/*")] == names[:1]  # one search: the objective changes no worlds
-    assert {"ablation.png", "ablation-who-bears.png"} == {each.name for each in out.glob("*.png")}
+    files = {"ablation.png", "ablation.csv", "ablation.json", "settings.json"}
+    assert files == {each.name for each in out.iterdir() if each.is_file() and each.suffix}
     found = json.loads((out / "ablation.json").read_text())
     assert found["settings"]["sweep"] == "objective=social:0,90" and found["channels"] == []
-    assert "cooperation-3-pair with objective=social:0,90; tiny-shared" in (out / "ablation.md").read_text()
-    assert "with several numbers of objective = social:…" in (out / "ablation.html").read_text()
+    assert "cooperation-3-pair with objective=social:0,90; tiny-shared" in found["conditions"]
 
     again = ethbrake(*line.split())
     assert again.status == 0 and "to do: 0 trainings, 0 decisions" in again.err
@@ -229,6 +199,5 @@ def test_sweep__of_the_lines_is_said(
     assert ethbrake(*line.split()).status == 0
     out = Path("out")
     assert len([*out.glob("optimum/*")]) == 2  # other masses, other searches
-    text = (out / "ablation.md").read_text()
-    assert "20 worlds of seed 7, drawn with the same random numbers at every level" in text
-    assert "are those of cooperation-3-pair-mass_t.2-5: mass_t.2, delays of" in (out / "ablation.html").read_text()
+    told = json.loads((out / "ablation.json").read_text())["conditions"]
+    assert "20 worlds of seed 7, drawn with the same random numbers at every level" in told

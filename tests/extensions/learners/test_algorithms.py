@@ -109,7 +109,7 @@ OWN = {"reward": {"harm": 1.0, "harm_count": "total", "objective": "own", "termi
 CONTACT = OWN | {"observation": ["own", "front_1", "rear_1", "contact"]}
 
 
-SCRIPTED = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "planner:8"}
+SCRIPTED = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "best_harm:8"}
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.extensions.proofs import lower_bound, ramped_meetings
+from ethbrake_marl.extensions.proofs import lower_bound, onset
 from ethbrake_marl.physics.state import Bools, Floats
 
 # Evaluations prove their limits, a millisecond for each world, and many tests evaluate on the same worlds. Who asks
@@ -26,7 +26,7 @@ def _known_bounds(
     out[:] = np.reshape([_bounds[key] for key in keys], out.shape)
 
 
-def _remembered_lower_bound(*given: Any, **settings: Any) -> ramped_meetings.LowerBound:
+def _remembered_lower_bound(*given: Any, **settings: Any) -> onset.LowerBound:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lower_bound, "bound_worlds", _known_bounds)
         return _lower_bound(*given, **settings)

@@ -1,5 +1,6 @@
 """What proofs and searches of the least harm refuse."""
 
+import io
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -12,18 +13,17 @@ from ethbrake_marl.engine.profiles import ProfileProblem, Profiles, profile_prob
 from ethbrake_marl.errors import CorruptBundle
 from ethbrake_marl.extensions.proofs.avoidability import avoidability
 from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
-from ethbrake_marl.extensions.proofs.team_bound import team_bound
 from ethbrake_marl.extensions.search.best_harm import best_harm
 from ethbrake_marl.extensions.search.shipped import TABLES
 from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.task import Task
 from tests.fixtures.lines import line, wide_worlds
-from tests.programmes.archives import good, packed
+from tests.programmes.hostile import good_table
 from tests.refused import refused
 
-PAPER, PAIR = load_scenario("paper-random"), load_scenario("cooperation-3-pair")
-WORLDS, TEAM = PAPER.sample(1, 11).worlds, PAIR.sample(2, 7).worlds
+PAPER = load_scenario("paper-random")
+WORLDS = PAPER.sample(1, 11).worlds
 THREE = line([7, 7], [20, 18, 20], [6, 7, 6], [0, 0.5, 0.8])
 
 
@@ -63,14 +63,8 @@ PROOFS: dict[str, Callable[[], object]] = {
     "lower_bound: time_step_s = nan: must be a finite number of at least 0.001": lambda: lower_bound(
         THREE, time_step_s=float("nan")
     ),
-    "team_bound: vehicles = (): must have at least one vehicle and no vehicle twice": lambda: team_bound(TEAM, ()),
-    "team_bound: an entry of vehicles = 3: must be a whole number in 0..2": lambda: team_bound(TEAM, (1, 3)),
-    "team_bound: vehicles = 1: must be a list of indices": lambda: team_bound(TEAM, 1),
-    "team_bound: a key of scripts = 'vehicle_1': must be a whole number in 0..2": lambda: team_bound(
-        TEAM, (1, 2), scripts={"vehicle_1": "coast"}
-    ),
-    "team_bound: vehicle_1 follows the script 'coast'; must be 'full_brake'": lambda: team_bound(
-        TEAM, (1, 2), scripts={0: "coast"}
+    "lower_bound: world 0 has an obstacle ahead; the bound is proven without an obstacle": lambda: lower_bound(
+        load_scenario("paper-random-obstacle").sample(1, 7).worlds
     ),
     "avoidability: the result would not be exact, because brakes in world 0 build up at a finite rate;": lambda: (
         avoidability(PAPER.replace(brake_rate_mps3=9).sample(2, 7).worlds)
@@ -122,15 +116,10 @@ def test_file__is_no_table(empty_folder: Path) -> None:
     Path("t.npz").write_bytes(b"no table")
     with refused("t.npz: is not a table of best known harm: not a plain .npz archive", CorruptBundle):
         BestHarmTable.load(Path("t.npz"))
-    Path("t.npz").write_bytes(packed({**good(), "first_harm": np.zeros(4)}))
+    with np.load(io.BytesIO(good_table())) as arrays:
+        np.savez_compressed("t.npz", **{**arrays, "first_harm": np.zeros(4)})
     with refused("array 'first_harm' has type <f8 and shape [4]; must have type <f8 and shape [3]", CorruptBundle):
         BestHarmTable.load(Path("t.npz"))
-
-
-def test_table__is_improved_by_a_harm_of_each_world() -> None:
-    table = BestHarmTable.load(TABLES / "paper-random.npz")
-    with refused("harm has the shape (3,); give one number for each world, shape (2,)"):
-        table.improved(table.identity[:2], "first", np.zeros(3))
 
 
 def test_table__of_other_worlds_is_refused() -> None:

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -51,9 +52,10 @@ def test_page__its_code_runs_from_the_top_down(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(app, "registered_commands", [*app.registered_commands])
     code = "\n".join(re.findall("```python\n(.*?)```", PAGE, re.DOTALL))
-    names: dict[str, object] = {"__name__": "my_file"}
+    names: dict[str, Any] = {"__name__": "my_file"}
     exec(compile(code, "extend.md", "exec"), names)
-    assert names["status"] == 0
+    assert names["status"] == 0 and (names["harm"] <= names["bounded"].predicted_harm).all()
+    assert "6.08 7.43 0\n" in capsys.readouterr().out
     assert run_command(["scenario", "parts"]) == 0
     told = capsys.readouterr().out
     assert all(name in told for name in ("comfort", "time_gap", "rural", "front-first", "patient", "absorbed"))

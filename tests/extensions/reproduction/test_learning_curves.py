@@ -1,9 +1,7 @@
 """Learning curves of several trainings."""
 
 import re
-import shutil
 import signal
-from pathlib import Path
 
 import pytest
 import yaml
@@ -13,7 +11,6 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.identity import scenario_sha256, worlds_sha256
 from ethbrake_marl.extensions.reproduction.learning_curves import LearningCurves
 from ethbrake_marl.progress import Progress
-from ethbrake_marl.training.recipe import TrainingRecipe
 from tests.fixtures.commands import TINY_RECIPE, rows_of
 
 SCENARIO = eb.load_scenario("paper-random")
@@ -21,7 +18,7 @@ SCENARIO = eb.load_scenario("paper-random")
 
 def test_curves__are_trained_drawn_and_gone_on_with(tiny_recipe, tiny_sac, tmp_path) -> None:
     folder = tmp_path / "curves"
-    curves = LearningCurves(SCENARIO, LearningCurves.parse(f"{tiny_recipe}:2,{tiny_sac}:2"), folder)
+    curves = LearningCurves(SCENARIO, [(eb.load_recipe(each), 2) for each in (tiny_recipe, tiny_sac)], folder)
 
     def press(progress: Progress) -> None:
         if (progress.name, progress.done) == ("tiny-seed1", 128):
@@ -58,28 +55,21 @@ def test_curves__another_training_or_an_edited_scenario_is_told_before_any_is_be
     folder, other = tmp_path / "curves", tmp_path / "other.yaml"
     other.write_text(yaml.safe_dump({**TINY_RECIPE, "gamma": 0.9}))
 
-    def curves(recipes: str, old: str, new: str) -> None:
-        asked = LearningCurves(eb.load_scenario(scenario_file(old, new)), LearningCurves.parse(recipes), folder)
+    def curves(recipes: list[object], old: str, new: str) -> None:
+        plan = [(eb.load_recipe(recipe), 1) for recipe in recipes]
+        asked = LearningCurves(eb.load_scenario(scenario_file(old, new)), plan, folder)
         assert asked.train()
         asked.write()
 
-    curves(f"{tiny_recipe}:1", "horizon_s: 8", "horizon_s: 8")
+    curves([tiny_recipe], "horizon_s: 8", "horizon_s: 8")
     drawn = (folder / "learning_curves.json").stat().st_mtime_ns
     for recipes, horizon, what in (
-        (f"{tiny_recipe}:1", "horizon_s: 9", "scenario horizon_s"),
-        (f"ppo:1,{other}:1", "horizon_s: 8", "recipe gamma"),
+        ([tiny_recipe], "horizon_s: 9", "scenario horizon_s"),
+        (["ppo", other], "horizon_s: 8", "recipe gamma"),
     ):
         told = f"tiny-seed0: this folder contains another training run, which differs in {what}; choose another folder"
         with pytest.raises(InvalidInput, match=re.escape(told)):
             curves(recipes, "horizon_s: 8", horizon)
     assert (folder / "learning_curves.json").stat().st_mtime_ns == drawn and not (folder / "ppo-seed0").exists()
     # Words change no training: its result is kept.
-    curves(f"{tiny_recipe}:1", 'title: "One-line title for lists and figures"', 'title: "Another line"')
-
-
-def test_recipes__may_lie_in_folders_of_any_name(empty_folder: Path) -> None:
-    folder = Path("lr=1,b:2")
-    folder.mkdir()
-    shutil.copy(TrainingRecipe.shipped()["quick"], folder)
-    curves = LearningCurves.parse("lr=1,b:2/quick.yaml:3,ppo:2")
-    assert [(recipe.name, seeds) for recipe, seeds in curves] == [("quick", 3), ("ppo", 2)]
+    curves([tiny_recipe], 'title: "One-line title for lists and figures"', 'title: "Another line"')

@@ -6,7 +6,7 @@ from unittest.mock import Mock
 import pytest
 
 from ethbrake_marl.cli import scenario as module
-from ethbrake_marl.extensions.search import best_harm, planner
+from ethbrake_marl.extensions.search import recall
 from ethbrake_marl.extensions.search.problem import search_profiles
 from ethbrake_marl.kernel_store import cache_folder
 from ethbrake_marl.policies.shipped import shipped_policies
@@ -16,11 +16,10 @@ from tests.fixtures.commands import Command, Refuse, check_refused, told_json
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
-@pytest.mark.parametrize("script", ["planner", "planner:1000000", "best_harm", "best_harm:1000000"])
+@pytest.mark.parametrize("script", ["best_harm", "best_harm:1000000"])
 def test_validate__trying_a_search_has_a_budget(ethbrake: Command, scenario_file, monkeypatch, script: str) -> None:
     searched = Mock(side_effect=search_profiles)
-    for searching in (planner, best_harm):
-        monkeypatch.setattr(searching, "search_profiles", searched)
+    monkeypatch.setattr(recall, "search_profiles", searched)
     monkeypatch.setattr(module, "TRIED_WORLDS", 5)
     path = scenario_file("\n  vehicle_3: full_brake\n", f"\n  vehicle_3: {script}\n")
     path.write_text(path.read_text().replace("early_impacts: reject", "early_impacts: keep"))
@@ -64,7 +63,7 @@ def test_evaluate__a_damaged_bundle_is_refused_by_file_with_a_search_around_it(e
 def test_compile__leaves_nothing_of_a_search_to_compile(ethbrake: Command) -> None:
     assert ethbrake("doctor", "--compile").status == 0
     kernels = set(cache_folder().iterdir())
-    assert ethbrake("evaluate", "--agents", "planner", "--episodes", "3").status == 0
+    assert ethbrake("evaluate", "--agents", "best_harm", "--episodes", "3").status == 0
     assert set(cache_folder().iterdir()) == kernels
 
 
@@ -72,15 +71,10 @@ def test_compile__leaves_nothing_of_a_search_to_compile(ethbrake: Command) -> No
     ("old", "new", "message"),
     [
         (
-            "vehicle_1: full_brake\n",
-            "vehicle_1: planner:0\n",
-            "after the colon, give the number of profiles to try at each decision",
-        ),
-        (
             "vehicle_3: full_brake\n",
             "vehicle_3: best_harm:1000001\n",
             "the number of profiles to try in each world, from 1 to 1,000,000, for instance best_harm:20000",
-        ),
+        )
     ],
 )
 def test_validate__names_the_line_of_the_mistake(old: str, new: str, message: str, refuse: Refuse) -> None:
@@ -90,5 +84,5 @@ def test_validate__names_the_line_of_the_mistake(old: str, new: str, message: st
 
 @pytest.mark.parametrize("command", ["run --output new", "train --output new", "evaluate"])
 def test_role_that_cannot_drive__is_refused_before_anything_is_written(command: str, refuse: Refuse) -> None:
-    write_scenario("vehicle_1: full_brake\n", "vehicle_1: planner:0\n")
-    refuse(f"{command} --scenario mine.yaml", "mine.yaml, line 80: roles.vehicle_1 = planner:0: agent 'planner:0'")
+    write_scenario("vehicle_1: full_brake\n", "vehicle_1: best_harm:0\n")
+    refuse(f"{command} --scenario mine.yaml", "mine.yaml, line 80: roles.vehicle_1 = best_harm:0: agent 'best_harm:0'")

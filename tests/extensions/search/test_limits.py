@@ -209,8 +209,8 @@ def test_best_known__is_the_witness_the_table_or_an_agent(four: Evaluation, tmp_
 
 
 @SILENT
-def test_best_known__rounding_below_the_table_is_not_below_it(four: Evaluation) -> None:
-    close = first_worlds(four, 4, a=([1.0, 2.0 - 9e-7, 4.0 - 2e-6, 6.0], [1.0, 4.0, 6.0, 7.0]))
+def test_best_known__equal_to_the_table_and_rounding_below_it_are_not_below_it(four: Evaluation) -> None:
+    close = first_worlds(four, 4, a=([1.0, 2.0 - 9e-7, 4.0 - 2e-6, 6.0], [1.0, 3.0, 6.0, 7.0]))
     found = regrets_of(close)
     assert found.below(close.outcome("a")).tolist() == [False, False, True, False]
     assert found.source.tolist() == ["witness", "table", "below_table", "agents"]
@@ -293,18 +293,17 @@ def test_limits__do_not_apply_to_other_scripts_vehicles_and_latencies(
     assert isinstance(known_limits(worlds, task), Unproven) == (reason is not None)
 
 
-def test_limits__an_obstacle_out_of_vehicle_1_s_own_reach_leaves_avoidability_and_a_least_harm(tmp_path: Path) -> None:
+def test_limits__an_obstacle_out_of_vehicle_1_s_own_reach_leaves_avoidability(tmp_path: Path) -> None:
     scenarios = [load_scenario(name) for name in ("paper-random-obstacle", "paper-random")]
     results = [evaluate(each.sample(50, 7), BRAKE, scenario=each, seed=7) for each in scenarios]
     row, other = (summarise(each)[0].to_json() for each in results)
-    assert all(row[name] == other[name] > 0.0 for name in ("unavoidable_rate", "impact_proven_rate"))
-    assert 0.0 < row["proven_harm"] <= row["best_known_first_impact_harm"] <= row["best_known_total_harm"]
+    assert row["unavoidable_rate"] == other["unavoidable_rate"] > 0.0
+    assert row["impact_proven_rate"] is None and row["proven_harm"] is None
+    assert 0.0 < row["best_known_first_impact_harm"] <= row["best_known_total_harm"]
     assert row["mean_regret"] is not None and row["parameters"]["no_limits_because"] is None
-    assert f"Proven lower bound: {row['proven_harm']:.2f}" in summarise(results[0]).markdown()
+    assert "no command of Vehicle 2 avoids contact (proven)" in summarise(results[0]).markdown()
     columns = columns_of(results[0], tmp_path)
-    proven, best = (np.array(columns[name], float) for name in ("proven_harm", "best_known_first_impact_harm"))
-    assert proven.mean() == pytest.approx(row["proven_harm"]) and (proven <= best + 1e-9).all()
-    assert set(columns["avoidable"]) == {"0", "1"}
+    assert set(columns["avoidable"]) == {"0", "1"} and set(columns["proven_harm"]) == {""}
 
 
 def test_limits__of_another_line_up_are_null_with_the_reason(pair: Scenario, tmp_path: Path) -> None:
@@ -423,8 +422,6 @@ def test_search_and_shield__execute_what_they_foresee(slow: Scenario) -> None:
     assert harm["best_harm"].mean() < harm["e_v2x_bm"].mean() < harm["full_brake"].mean()
     assert (harm["constant:2+step"] <= harm["e_v2x_bm"] + 1e-9).all()  # its bound
     assert (harm["constant:2+step"] != harm["e_v2x_bm"]).any()
-    proof = limits_of(result).proof  # of harm, not of contact
-    assert proof.avoidable is None and (proof.harm <= harm["best_harm"] + 1e-9).all() and proof.harm.mean() > 5.0
 
 
 def test_train__proves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -473,3 +470,10 @@ def test_summarise__has_the_keys_of_the_limits_beside_its_own(evaluation: Evalua
 
 def test_per_world__has_the_columns_of_the_limits(evaluation: Evaluation, tmp_path: Path) -> None:
     assert set(KNOWN_OF_WORLDS) < set(per_world(evaluation, tmp_path)[0])
+
+
+def test_below__is_less_than_the_best_known_harm_and_not_equal_to_it() -> None:
+    known = SimpleNamespace(first_impact_harm=np.array([3.0, 3.0, 3.0]), total_harm=np.array([5.0, 5.0, 5.0]))
+    found = SimpleNamespace(first_impact_harm=np.array([3.0, 3.0, 2.9]), total_harm=np.array([5.0, 4.9, 6.0]))
+    regrets = regret.Regrets(known, known.first_impact_harm, known.total_harm, np.array(["table"] * 3))
+    assert regrets.below(found).tolist() == [False, True, True]

@@ -1,9 +1,6 @@
 """Search and proofs where an obstacle stands ahead of Vehicle 1."""
 
-import numpy as np
-
 from ethbrake_marl.extensions.proofs.avoidability import avoidability
-from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
 from ethbrake_marl.extensions.search.best_harm import best_harm, task_problem
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.task import Task
@@ -12,25 +9,19 @@ from tests.refused import refused
 ALL = load_scenario("cooperation-4-all")
 
 
-def test_best_harm__of_the_whole_line_is_no_worse_than_of_its_followers_and_above_the_bound() -> None:
-    worlds, level_3, level_2 = ALL.sample(40, 7).worlds, ALL.with_learners([1, 2]), ALL.with_learners([1])
+def test_best_harm__of_the_whole_line_is_no_worse_than_of_its_followers() -> None:
+    worlds, level_3 = ALL.sample(3, 7).worlds, ALL.with_learners([1, 2])
     settings = {"counts": ("total",), "budget": 3_000, "threads": 1}
-    together, followers = (best_harm(each, worlds.take([0, 1, 2]), **settings).best["total"] for each in (ALL, level_3))
+    together, followers = (best_harm(each, worlds, **settings).best["total"] for each in (ALL, level_3))
     assert together.harm.mean() < followers.harm.mean()
-    _, again = task_problem(worlds.take([0, 1, 2]), Task(ALL, (0, 1, 2))).follow(together.profiles)
+    _, again = task_problem(worlds, Task(ALL, (0, 1, 2))).follow(together.profiles)
     assert again.tobytes() == together.harm.tobytes()
-    bound = lower_bound(worlds, horizon_s=ALL.horizon_s, time_step_s=ALL.time_step_s).harm
-    for harm_count in ("first", "total"):
-        found = best_harm(level_2, worlds, counts=(harm_count,), budget=500, threads=1).best[harm_count].harm
-        assert np.all(bound <= found)
-    assert bound.mean() > 1.0
 
 
 def test_proofs__cover_an_obstacle_that_full_braking_never_meets() -> None:
     worlds, plain = (load_scenario(name).with_learners([1]).sample(200, 7).worlds for name in
                      ("cooperation-4-all", "cooperation-2-paper"))  # fmt: skip
     assert avoidability(worlds).reason.tolist() == avoidability(plain).reason.tolist()
-    assert np.all(lower_bound(worlds).front_pair == lower_bound(plain).front_pair)
 
 
 def test_proof__of_an_obstacle_that_full_braking_meets_is_refused() -> None:

@@ -27,15 +27,10 @@ def problem(*vehicles: int) -> ProfileProblem:
 
 
 REFUSED: dict[str, Callable[[], object]] = {
-    "agent 'planner+step+episode': may have at most one search (+search), then at most one shield (+episode,": lambda: (
-        make_agent("planner+step+episode", scenario=PAPER)
+    "agent 'best_harm+step+episode': may have at most one search": lambda: make_agent(
+        "best_harm+step+episode", scenario=PAPER
     ),
-    "agent 'planner:0': after the colon, give the number of profiles to try at each decision": lambda: make_agent(
-        "planner:0"
-    ),
-    "agent 'planner:1.5': after the colon, give the number of profiles to try at each decision": lambda: make_agent(
-        "planner:1.5"
-    ),
+    "agent 'best_harm:1.5': after the colon, give the number of profiles": lambda: make_agent("best_harm:1.5"),
     "best_harm: budget = 0: the number of profiles to try must be at least 1": lambda: make_agent(
         "best_harm", most_candidates=0
     ),
@@ -70,10 +65,10 @@ def test_failure__is_told_with_its_world_where_a_search_stands_around_the_agent(
 
 
 PLANS = PAPER.replace(
-    early_impacts="keep", roles={"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "planner:8"}
+    early_impacts="keep", roles={"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "ppo"}
 )
 
 
 def test_looking_ahead__needs_commands_that_are_fixed_at_the_alert() -> None:
-    with refused("vehicle_3 is driven by 'planner:8', whose command is not fixed at the alert; to look ahead,"):
+    with refused("vehicle_3 is driven by 'ppo', whose command is not fixed at the alert; to look ahead,"):
         drive(WORLDS, Searched(BRAKE, PLANS), PLANS, 1)

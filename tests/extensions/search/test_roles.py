@@ -4,7 +4,7 @@ import pytest
 
 from tests.agents.test_roles import SCENARIOS, check_nothing_around, check_role
 
-SPECS = {"best_harm": ["best_harm:50", "best_harm"], "planner": ["planner:8", "planner:8:estimated"]}
+SPECS = {"best_harm": ["best_harm:50", "best_harm"]}
 
 
 @pytest.mark.parametrize("kind", SPECS)
@@ -13,6 +13,6 @@ def test_role__is_the_same_agent_as_a_driver(name, kind):
     check_role(name, SPECS[kind])
 
 
-@pytest.mark.parametrize("around", ["+search", "+episode", "+step", "+step:estimated"])
+@pytest.mark.parametrize("around", ["+search", "+episode", "+step"])
 def test_role__has_nothing_around_it(around):
-    check_nothing_around("planner:8", around)
+    check_nothing_around("best_harm:8", around)

@@ -9,13 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.evaluation.seeds import mean_over_seeds
 from ethbrake_marl.extensions.cooperation.comparison import compare
-from ethbrake_marl.extensions.cooperation.figures import ablation_figures
+from ethbrake_marl.extensions.cooperation.figures import ablation_figure
 from ethbrake_marl.extensions.cooperation.joint_optimum import (
     Goal,
     Harms,
@@ -26,17 +25,8 @@ from ethbrake_marl.extensions.cooperation.joint_optimum import (
     questions,
     search_all,
 )
-from ethbrake_marl.extensions.cooperation.levels import (
-    FIGURES,
-    STANDARD,
-    Level,
-    Plan,
-    common_worlds,
-    read_levels,
-    with_scheme,
-)
-from ethbrake_marl.extensions.cooperation.page import ablation_page, interval_words, levels_csv, markdown
-from ethbrake_marl.extensions.report.style import ALARM
+from ethbrake_marl.extensions.cooperation.levels import STANDARD, Level, Plan, common_worlds, read_levels, with_scheme
+from ethbrake_marl.extensions.cooperation.results import levels_csv, tables
 from ethbrake_marl.extensions.search.best_harm import best_harm, chunks_left
 from ethbrake_marl.extensions.studies.trainings import TrainingJob
 from ethbrake_marl.game.harm import HarmCount
@@ -47,8 +37,7 @@ from ethbrake_marl.training.callback import RunCallback
 from ethbrake_marl.training.recipe import Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.training.training import Training
 from tests.extensions.studies.conftest import ABLATE, LEVELS, study
-from tests.extensions.studies.counting import PROGRAM, end_when
-from tests.fixtures.page import Page
+from tests.extensions.studies.killing import PROGRAM, end_when
 from tests.fixtures.snapshots import check_snapshot
 from tests.learning.tiny import TINY_PPO
 
@@ -57,17 +46,17 @@ SNAPSHOTS = Path(__file__).parent / "snapshots"
 
 def content(folder: Path) -> dict:
     found = json.loads((folder / "ablation.json").read_text())
-    return found | {"settings": {k: v for k, v in found["settings"].items() if k not in ("machine", "date")}}
+    found["settings"] = {k: v for k, v in found["settings"].items() if k not in ("machine", "date")}
+    return {k: v for k, v in found.items() if k != "conditions"}
 
 
 def ablate(folder: Path, recipe: Path, *options: object) -> int:
     return study("ablate", "--output", folder, "--recipes", recipe, *ABLATE, *options)
 
 
-def test_ablate__writes_tables_and_figures(finished_ablation: Path) -> None:
-    names = {"ablation.json", "ablation.csv", "ablation.md", "ablation.png", "ablation-changes.png",
-             "ablation-who-pays.png", "ablation.html"}  # fmt: skip
-    assert names <= {path.name for path in finished_ablation.iterdir()}
+def test_ablate__writes_three_files(finished_ablation: Path) -> None:
+    names = {path.name for path in finished_ablation.glob("ablation*")}
+    assert names == {"ablation.json", "ablation.csv", "ablation.png"}
     found = content(finished_ablation)
     levels = found["levels"]
     assert [(each["level"], each["seeds"]) for each in levels] == list(zip(LEVELS.split(","), (1, 2, 2), strict=True))
@@ -100,15 +89,6 @@ def test_ablate__the_shield_goes_around_what_was_trained(finished_ablation, tmp_
             assert 0.1 < told["replaced"] == pytest.approx(sum(told["replaced_vehicles"]) / 2)
             assert before[count].pop("shielded") is None
     assert found["levels"][1:] == alone["levels"][1:]  # without the shield as before
-    assert "Behind the step shield" in (copied / "ablation.html").read_text("utf-8")
-
-
-def test_page__plays_the_same_worlds_at_every_level(finished_ablation: Path) -> None:
-    html = (finished_ablation / "ablation.html").read_text("utf-8")
-    told = html.split('<script type="application/json" id="episode_data">')[1].partition("</script>")[0]
-    content = json.loads(told)
-    assert content["agents"] == LEVELS.split(",") and len(html) <= 5 << 20 and 3 <= len(content["worlds"]) <= 7
-    assert [episode["driven"] for episode in content["worlds"][0]["episodes"]] == [[], [1, 2], [1, 2]]
 
 
 @pytest.mark.slow
@@ -170,33 +150,23 @@ def test_ablate__an_interruption_ends_the_trainings_of_other_processes(tmp_path:
     assert len(runs) == 2 and [(run / "progress.csv").read_bytes() for run in runs] == before
 
 
-def test_tables_figures_and_page__show_what_was_found(levels, behind, found) -> None:
-    """What stands there follows from the harms above by hand; a change shows in the snapshot."""
-    other = measured("cooperation-2-paper", "sac", harms((5.0, 3.0, 2.0)), 6.0)
+def test_results__show_what_was_found(levels, behind, found) -> None:
+    """What stands there follows from the harms below by hand; a change shows in the snapshot."""
     shielded = compare(behind, SEARCHED)
-    shown = [
-        markdown(found, "40 worlds."),
-        markdown(shielded, "40 worlds."),
-        markdown(compare([*levels[:2], other], SEARCHED), ""),
-        levels_csv(behind, SEARCHED),
-        *(interval_words(seeds) for seeds in (1, 2, 3)),
-    ]
-    for told in (found, shielded):
-        for figure in ablation_figures(told, "40 worlds"):
-            texts = [text.get_text() for axes in figure.axes for text in axes.texts]
-            labels = [
-                label.get_text() for axes in figure.axes for label in axes.get_xticklabels() + axes.get_yticklabels()
-            ]
-            legends = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
-            shown.append(repr([texts, labels, legends, figure.get_supxlabel()]))
-    check_snapshot(SNAPSHOTS / "ablation.txt", "\n\n".join(shown) + "\n")
+    shown = [sheet.markdown() for told in (found, shielded) for sheet in tables(told)]
+    check_snapshot(SNAPSHOTS / "ablation.txt", "\n\n".join([*shown, levels_csv(behind, SEARCHED)]) + "\n")
     check_snapshot(SNAPSHOTS / "ablation.json", json.dumps(shielded, indent=1) + "\n")
-    figures = dict(zip(FIGURES, ablation_figures(found, "40 worlds"), strict=True))
-    html = ablation_page({**found, "settings": {"seeds": 2, "machine": "</script><b>"}}, "40 worlds.", figures)
-    page = Page(html)
-    assert page.open == [] and not {"script", "b", "img"} & {tag for tag, _ in page.tags}
-    assert "cooperation-2-paper 100.0 % [91.2, 100.0] 20.00 11.00 [10.00, 12.00]" in page.text
-    assert "`" not in page.text and html.count("<figure>") == 3 and "</script><b>" in page.text
+
+
+@pytest.mark.filterwarnings("error::UserWarning")
+def test_figure__has_every_level_both_counts_and_the_shield(behind) -> None:
+    axes = ablation_figure(compare(behind, SEARCHED), "40 worlds").axes
+    assert [label.get_text() for label in axes[0].get_xticklabels()] == ["0\nsensors", "2\npaper", "3\npair"]
+    for factor, each in zip((1.0, 2.0), axes, strict=True):
+        drawn = {bars.get_label(): bars.lines[0].get_xydata() for bars in each.containers}
+        assert drawn["ppo"] == pytest.approx(np.array([[0.0, 20.0], [1.0, 11.0], [2.0, 5.0]]) * [1.0, factor])
+        assert drawn["ppo, worse messages"] == pytest.approx(np.array([[1.42, 11.0 * factor]]))
+        assert drawn["ppo, shielded"][:, 0] == pytest.approx([1.88])
 
 
 WORLDS, SEARCHED = 40, 10
@@ -262,7 +232,7 @@ def test_compare__worlds_of_one_recording_are_one_cluster(levels) -> None:
     assert np.ptp(harms[1]["interval"]) > 2.0 * np.ptp(harms[0]["interval"])
 
 
-def test_undertrained__full_braking_does_better_is_said_in_table_page_and_figures(levels) -> None:
+def test_undertrained__full_braking_does_better_is_said_in_results_and_figure(levels) -> None:
     told = "Not trained enough to say anything: cooperation-3-pair (ppo), total harm 38.20 (24.20 if everybody brakes"
     told += " fully)."
     worse, better = Goal("total harm", 38.2, 24.2), Goal("total harm", 24.2, 24.2)
@@ -271,16 +241,8 @@ def test_undertrained__full_braking_does_better_is_said_in_table_page_and_figure
     (both,) = compare([replace(level, goal=worse) for level in levels[1:3]], SEARCHED)["undertrained"]
     assert both.count("Not trained enough") == 1 and both.count("total harm 38.20 (24.20") == 2
     assert [level["goal"] and level["goal"]["missed"] for level in found["levels"]] == [None, False, True]
-    assert markdown(found, "Conditions.").startswith(f"**{told}**\n\n## Levels")
-    page = ablation_page({**found, "settings": {}}, "Conditions.", {})
-    assert page.index(f'<p class="alarm">{told}</p>') < page.index("<nav")
-    for figure in ablation_figures(found, "Conditions."):
-        FigureCanvasAgg(figure).draw()
-        texts = [legend.get_title() for legend in figure.legends] or [figure._suptitle]
-        assert [" ".join(text.get_text().split()) for text in texts] == [told] and texts[0].get_color() == ALARM
-        assert texts[0].get_window_extent().y0 >= max(axes.get_tightbbox().y1 for axes in figure.axes) - 1.0
-    silent = compare(levels, SEARCHED)
-    assert silent["undertrained"] == [] and "not trained enough" not in markdown(silent, "Conditions.")
+    assert " ".join(ablation_figure(found, "Conditions.").get_supxlabel().split()).startswith(told)
+    assert compare(levels, SEARCHED)["undertrained"] == []
 
 
 @pytest.mark.parametrize(
@@ -335,23 +297,6 @@ def behind(levels) -> list[Measured]:
         )  # fmt: skip
     shielded["total"].bound[1, 3] = 0.0
     return [*levels[:2], replace(levels[2], shielded=shielded), levels[3]]
-
-
-@pytest.mark.filterwarnings("error::UserWarning")
-def test_figures__texts_and_captions_have_room_and_the_colour_bar_reaches_its_end(levels, found):
-    _, figure, pays = ablation_figures(found, "40 worlds")
-    FigureCanvasAgg(figure).draw()
-    for axes in figure.axes:
-        inside = axes.get_window_extent()
-        boxes = [text.get_window_extent() for text in axes.texts]
-        assert all(inside.x0 <= box.x0 and box.x1 <= inside.x1 and box.y1 <= inside.y1 for box in boxes)
-    bar = pays.axes[-1]
-    assert max(bar.get_yticks()) >= 0.3 * bar.get_ylim()[1]
-    found = compare(levels[:2], SEARCHED)  # a single change
-    for figure in ablation_figures(found, "Conditions of this figure, in many words. " * 14):
-        FigureCanvasAgg(figure).draw()
-        bottom = min(axes.get_tightbbox().y0 for axes in figure.axes)
-        assert figure._supxlabel.get_window_extent().y1 <= bottom + 1.0
 
 
 LINES = 30

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.studies.falsification import APART, Scored, far_apart, search
 from ethbrake_marl.extensions.studies.weakness import Measure, MeasureName
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
@@ -132,3 +133,9 @@ def test_search__spreads_evenly_while_all_points_are_alike() -> None:
     found = search(lambda points: np.zeros(len(points)), 3, 1_024, 0)
     cells = np.unique((found.points * 8).astype(int), axis=0)
     assert len(cells) == 512
+
+
+@pytest.mark.parametrize(("budget", "seed", "key"), [(0, 0, "budget"), (10, -1, "seed")])
+def test_search__numbers_that_are_too_small_are_refused(budget: int, seed: int, key: str) -> None:
+    with pytest.raises(InvalidInput, match=key):
+        search(_peak, 2, budget, seed)

@@ -67,7 +67,7 @@ def test_page__never_scrolls_sideways_and_is_no_giant(open_page: Open, name: str
             " !e.closest('.wide, .drawing, svg, .skip')).map((e) => e.outerHTML.slice(0, 80))"
         )
         assert outside == [], width
-    assert name != "reproduction_file" or page.evaluate("document.querySelectorAll('svg').length") == 3
+    assert name != "reproduction_file" or page.evaluate("document.querySelectorAll('figure img').length") == 3
     assert path.stat().st_size <= MOST_BYTES
 
 
@@ -100,26 +100,26 @@ def test_report__sentence_figure_and_table_of_four_columns_stand_above_the_fold(
     page.set_viewport_size({"width": width, "height": height})
     bottoms = {
         name: page.evaluate(f"document.querySelector('{name}').getBoundingClientRect().bottom")
-        for name in (".lead", ".beside svg", ".beside table")
+        for name in (".lead", ".beside img", ".beside table")
     }
     assert all(0 < bottom <= height for bottom in bottoms.values()), bottoms
     assert page.locator(".beside thead th").count() == 4 and page.locator(".beside tbody tr").count() == 5
     for name in (".beside .wide", ".beside .drawing"):  # nothing is hidden at the side
         assert page.evaluate(f"(e => e.scrollWidth <= e.clientWidth)(document.querySelector('{name}'))")
     assert page.locator(".remarks li").count() == 3
-    least_px = page.evaluate("(e => e.clientWidth / e.viewBox.baseVal.width)(document.querySelector('.beside svg'))")
+    least_px = page.evaluate("(e => e.clientWidth / e.naturalWidth * 96 / 72)(document.querySelector('.beside img'))")
     assert least_px * 8.0 >= 9.0  # labels are of 8 pt or more
 
 
 def test_figures__say_that_they_scroll_and_can_be_read(report_page: Any) -> None:
-    broad = "document.querySelector('.drawing:has(svg.broad)')"
+    broad = "document.querySelector('.drawing:has(img.broad)')"
     for width, hint in ((360, "block"), (768, "block"), (1440, "none")):
         report_page.set_viewport_size({"width": width, "height": 900})
         assert report_page.evaluate(f"getComputedStyle({broad}, '::before').display") == hint
         assert report_page.evaluate(f"{broad}.scrollWidth > {broad}.clientWidth") == (hint == "block")
         least_px = report_page.evaluate(
-            "Math.min(...[...document.querySelectorAll('.drawing svg')]"
-            ".map((e) => e.clientWidth / e.viewBox.baseVal.width))"
+            "Math.min(...[...document.querySelectorAll('.drawing img')]"
+            ".map((e) => e.clientWidth / e.naturalWidth * 96 / 72))"
         )
         assert least_px * 8.0 >= 9.0  # labels are of 8 pt or more
 

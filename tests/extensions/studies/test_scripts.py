@@ -1,0 +1,109 @@
+"""``train/sweep.py`` and ``train/tune.py``: a killed run goes on to the result of an undisturbed one."""
+
+import runpy
+import signal
+import sys
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from tests.extensions.studies.conftest import RECIPE, write_yaml
+from tests.extensions.studies.killing import ROOT, end_when
+
+Run = Callable[..., int]
+
+SWEEP = ("sweep", "--scenarios", "paper-random", "--seeds", "2", "--recipes")
+TUNE = ("tune", "--scenario", "paper-random", "--trials", "3", "--search", "gamma=0.9..1.0:log")
+TUNE += ("n_epochs=1..3", "network.policy=[8]/[16, 8]", "--recipe")
+
+
+@pytest.fixture(scope="module")
+def recipe(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A recipe of eight updates, with a checkpoint after each."""
+    return str(write_yaml(tmp_path_factory.mktemp("recipe") / "tiny.yaml", {**RECIPE, "total_steps": 1024}))
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Run a script in this process; its exit status."""
+
+    def call(script: str, *words: object) -> int:
+        monkeypatch.setattr(sys, "argv", [f"{script}.py", *map(str, words)])
+        try:
+            runpy.run_path(str(ROOT / "train" / f"{script}.py"), run_name="__main__")
+        except SystemExit as ended:
+            return int(ended.code or 0)
+        return 0
+
+    return call
+
+
+def results(folder: Path) -> dict[str, bytes]:
+    """The table and all weights: name -> content."""
+    files = [*folder.glob("*.csv"), *folder.rglob("weights.safetensors")]
+    return {str(file.relative_to(folder)): file.read_bytes() for file in files}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("words", "second"), [(SWEEP, "*-seed1-*"), (TUNE, "trial-2")], ids=["sweep", "tune"])
+def test_killed_run__goes_on_to_the_same_result(
+    words: tuple[str, ...], second: str, recipe: str, run: Run, tmp_path: Path
+) -> None:
+    script, *options = words
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    assert run(script, *options, recipe, "--output", whole) == 0
+    line = [sys.executable, f"train/{script}.py", *options, recipe, "--output", killed]
+    end_when(line, lambda process: any(killed.glob(f"{second}/checkpoints/*")), signal.SIGKILL)
+    assert not [*killed.glob("*.csv")] and any(killed.glob("*/checkpoints/*"))
+    assert run(script, *options, recipe, "--output", killed) == 0
+    assert results(killed) == results(whole) and len(results(whole)) >= 3
+    before = {file: file.stat().st_mtime_ns for file in whole.rglob("weights.safetensors")}
+    assert run(script, *options, recipe, "--output", whole) == 0  # finished training runs are skipped
+    assert before == {file: file.stat().st_mtime_ns for file in whole.rglob("weights.safetensors")}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("ray") is None, reason="needs ray")
+def test_sweep__on_ray_has_the_same_table(recipe: str, run: Run, tmp_path: Path) -> None:
+    script, *options = SWEEP
+    for folder, more in (("here", []), ("ray", ["--ray", "local", "--jobs", "2"])):
+        assert run(script, *options, recipe, *more, "--output", tmp_path / folder) == 0
+    assert results(tmp_path / "ray") == results(tmp_path / "here")
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_run__that_fails_is_a_row_with_its_reason(recipe: str, run: Run, tmp_path: Path) -> None:
+    (script, *options), diverging = SWEEP, "reward.harm=1.0e+300"
+    assert run(script, *options, recipe, "--set", diverging, "--output", tmp_path / "sweep") == 1
+    assert (tmp_path / "sweep" / "results.csv").read_text().count(",training: ") == 2
+    assert run(TUNE[0], *TUNE[1:], recipe, "--trials", "1", "--set", diverging, "--output", tmp_path / "tune") == 0
+    assert "\n0,,0.9" in (tmp_path / "tune" / "trials.csv").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "key"),
+    [
+        ((*SWEEP, "ppp"), "'ppo'"),
+        ((*SWEEP, "ppo", "ppo"), "only once"),
+        ((*SWEEP, "ppo", "--set", "gama=1"), "gamma"),
+        ((*TUNE, "ppo", "--search", "gamma=0.9"), "KEY=LOW..HIGH"),
+        ((*TUNE, "ppo", "--search", "gamma=3..1"), "low <= high"),
+        ((*TUNE, "ppo", "--search", "n_epochs=0..4"), "n_epochs"),
+        ((*TUNE, "ppo", "--search", "mass_t=1..4"), "mass_t"),
+    ],
+)
+def test_bad_input__is_refused_in_one_line_and_nothing_is_made(
+    words: tuple[str, ...], key: str, run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    script, *options = words
+    assert run(script, *options, "--output", tmp_path / "new") == 2 and not (tmp_path / "new").exists()
+    told = capsys.readouterr().err
+    assert key in told and told.startswith(f"{script}.py: error: ") and told.count("\n") == 1
+
+
+def test_tune__other_settings_in_its_folder_are_refused(recipe: str, run: Run, tmp_path: Path) -> None:
+    script, *options = TUNE
+    assert run(script, *options, recipe, "--trials", "1", "--output", tmp_path) == 0
+    assert run(script, *options, recipe, "--set", "gae_lambda=0.5", "--output", tmp_path) == 2

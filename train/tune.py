@@ -1,0 +1,90 @@
+"""Search for settings of a recipe that lead to little harm, with Optuna. Read it from top to bottom.
+
+    python train/tune.py --scenario paper-random --recipe ppo --search n_epochs=1..4 gamma=0.99/1.0 --output runs/tuning
+
+A trial is one training run, and its harm is the harm of its saved policy in the worlds of the recipe's evaluation.
+``--jobs`` trials are proposed together, then trained at the same time. After an interruption, start the same command
+again: it keeps the trials in ``optuna.log``, and has the same result. A larger number of ``--trials`` adds trials.
+"""
+
+import argparse
+from pathlib import Path
+
+import optuna
+from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
+
+from ethbrake_marl.errors import EthBrakeError, InvalidInput
+from ethbrake_marl.evaluation import load_runnable
+from ethbrake_marl.extensions.studies.folder import StudyFolder
+from ethbrake_marl.extensions.studies.trainings import TrainingJob
+from ethbrake_marl.files.sheet import csv_text
+from ethbrake_marl.files.store import write_file
+from ethbrake_marl.parallel import run_each
+from ethbrake_marl.training import Training, load_recipe, read_settings
+
+
+def read_search(text: str) -> tuple[str, BaseDistribution]:
+    """Read choices ``KEY=A/B/C`` or a range ``KEY=LOW..HIGH``, which is logarithmic with ``:log`` at its end."""
+    key, _, values = text.partition("=")
+    if "/" in values:
+        return key, CategoricalDistribution(values.split("/"))
+    try:
+        low, high = values.removesuffix(":log").split("..")
+        if low.isdigit() and high.isdigit():
+            return key, IntDistribution(int(low), int(high), log=values.endswith(":log"))
+        return key, FloatDistribution(float(low), float(high), log=values.endswith(":log"))
+    except ValueError as error:
+        raise InvalidInput(f"--search {text}: must be KEY=A/B, KEY=LOW..HIGH or KEY=LOW..HIGH:log ({error})") from None
+
+
+def tune(args: argparse.Namespace) -> None:
+    """Train until ``--trials`` trials have ended, and write ``trials.csv``."""
+    space, loaded = dict(map(read_search, args.search)), load_recipe(args.recipe)
+    settings = read_settings(args.set, [loaded])
+    scenario, recipe = load_runnable(args.scenario, settings.scenario), settings.change(loaded)
+
+    def job(values: dict[str, object], folder: str = "") -> TrainingJob:
+        own = read_settings([f"recipe.{key}={value}" for key, value in values.items()], [recipe])
+        training, path = Training.of(own.change(recipe), scenario), args.output.absolute() / folder
+        return TrainingJob(training, path, (*args.set, *own.texts))
+
+    for key, each in space.items():  # raises now what a trial would raise
+        for value in each.choices if isinstance(each, CategoricalDistribution) else (each.low, each.high):
+            job({key: value})
+    question = {"training": job({}).training.content(), "search": args.search, "jobs": args.jobs}
+    with StudyFolder(args.output, "a tuning", question, writes=("trials.csv",)).work():
+        storage = JournalStorage(JournalFileBackend(str(args.output / "optuna.log")))
+        study = optuna.create_study(storage=storage, study_name="tuning", load_if_exists=True)
+        while (ended := sum(each.state.is_finished() for each in study.trials)) < args.trials:
+            while (number := len(study.trials)) < min(args.trials, (ended // args.jobs + 1) * args.jobs):
+                study.sampler = optuna.samplers.TPESampler(seed=number, constant_liar=True)
+                study.ask(space)
+            asked = [each for each in study.trials if not each.state.is_finished()]
+            jobs = [job(each.params, f"trial-{each.number}") for each in asked]
+            reasons = run_each(((each.attempt,) for each in jobs), args.jobs)
+            for trial, each, reason in zip(asked, jobs, reasons, strict=True):
+                harm = None if reason else each.result()["harm"]
+                study.tell(trial.number, harm, optuna.trial.TrialState.FAIL if reason else None)
+                print(f"trial {trial.number}: {reason or harm}: {trial.params}", flush=True)
+        rows = [{"trial": each.number, "harm": each.value, **each.params} for each in study.trials]
+        write_file(args.output / "trials.csv", csv_text(rows).encode())
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenario", required=True, help="name or path of a scenario")
+    parser.add_argument("--recipe", required=True, help="name or path of a recipe")
+    parser.add_argument("--search", nargs="+", required=True, metavar="KEY=VALUES", help="choices and ranges to search")
+    parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings of every trial")
+    parser.add_argument("--trials", type=int, default=30, help="number of trials in all (default: 30)")
+    parser.add_argument("--jobs", type=int, default=1, help="number of trials at the same time (default: 1)")
+    parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="folder of all results")
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    try:
+        tune(parser.parse_args())
+    except KeyboardInterrupt:
+        parser.exit(130, "interrupted; the same command goes on\n")
+    except (EthBrakeError, OSError) as error:
+        parser.exit(2, f"{parser.prog}: error: {error}\n")
