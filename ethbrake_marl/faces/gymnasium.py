@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
+from numpy.typing import NDArray
 
 from ethbrake_marl.episode.infos import dictionaries
 from ethbrake_marl.episode.observe import Observations, View
@@ -85,7 +86,7 @@ def plain(setting: Any) -> Any:
     return [plain(value) for value in setting] if isinstance(setting, list | tuple) else setting
 
 
-class EthBrakeEnv(OneLearner, gymnasium.Env[Observations, Any]):
+class EthBrakeEnv(OneLearner, gymnasium.Env[NDArray[Any], NDArray[Any]]):
     """One learner in a line whose other vehicles follow scripts (``gymnasium.make("EthBrake-v1")``).
 
     Action, end, infos and options of ``reset`` are those of ``EthBrakeParallelEnv``, as are the arguments; there must

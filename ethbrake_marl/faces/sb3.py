@@ -113,7 +113,8 @@ class EthBrakeVecEnv(VecEnv):
                 f"observation: the learners of {self.scenario.name!r} observe different features, but must observe the"
                 " same here; give one list of features for all vehicles, use a single learner, or use parallel_env"
             )
-        own, last = views.pop().features, len(self.learners) - 1
+        own: tuple[Feature, ...] = views.pop().features
+        last = len(self.learners) - 1
         if self.appended is None:
             return own
         if self.appended == "state":
@@ -248,7 +249,8 @@ class EthBrakeVecEnv(VecEnv):
     def restore(self, saved: dict[str, Any]) -> None:
         """Go on from a ``snapshot``."""
         memories = {int(name) if name.isdigit() else name: memory for name, memory in saved["memories"].items()}
-        self.episode = State(*saved["state"], memories)
+        line, car, clock, know, wanted = saved["state"]
+        self.episode = State(line, car, clock, know, wanted, memories)
         self._return, self._steps, self._begun = saved["rows"]
         self.stream.seed, self.stream.next = saved["stream"]
 

@@ -11,7 +11,7 @@ import numpy as np
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import NUMBER, State
 from ethbrake_marl.errors import InvalidInput, check_whole_number
-from ethbrake_marl.worlds.describe import describe_worlds
+from ethbrake_marl.worlds.describe import columns_of, quantities_of
 from ethbrake_marl.worlds.given import worlds_from_state
 from ethbrake_marl.worlds.scenario import Scenario
 
@@ -29,6 +29,7 @@ class Stream:
         self.scenario, self.game = scenario, game
         self.seed: int | None = None
         self.next = 0  # number of the next world
+        self.given: State | None = None  # the worlds at the alert that the last reset asked for
 
     def restart(self, n: int, seed: int | None, options: Any = None, known: tuple[str, ...] = OPTIONS) -> State:
         """Return new episodes in n worlds. ``seed`` None: go on with the stream, or begin one with a random seed.
@@ -40,10 +41,12 @@ class Stream:
             self.seed, self.next = chosen_seed(seed), 0
         try:
             worlds = self._asked_for(n, checked_options(options, known))
-            return self.draw(n) if worlds is None else self.game.begin(worlds)
+            begun = self.draw(n) if worlds is None else self.game.begin(worlds)
         except Exception:
             self.seed, self.next = before
             raise
+        self.given = worlds
+        return begun
 
     def draw(self, n: int) -> State:
         """Return the next n worlds at their first decision, in memory of their own."""
@@ -54,7 +57,16 @@ class Stream:
 
     def describe(self, state: State) -> dict[str, Any]:
         """Return what was drawn for each running world: a name such as ``gap_1_m`` or ``scenario`` -> [n]."""
-        return describe_worlds(self.scenario, state, self.seed or 0)
+        parts: list[dict[str, Any]] = []
+        for row, number in enumerate(state.clock[:, NUMBER].astype(np.int64)):
+            if number >= 0:
+                drawn = self.scenario.draw(1, self.seed or 0, first=int(number), channel="training")
+                parts.append(columns_of(drawn))
+            else:
+                assert self.given is not None
+                parts.append({**quantities_of(self.given.take(slice(row, row + 1)))})
+        shared = [name for name in parts[0] if all(name in part for part in parts)]
+        return {name: np.concatenate([part[name] for part in parts]) for name in shared}
 
     def _asked_for(self, n: int, options: Mapping[str, Any]) -> State | None:
         if len(options.keys() & set(OPTIONS)) == 2:

@@ -163,7 +163,8 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
             raise InvalidInput(
                 f"reset: reset_mask = {mask!r}: must be a bool array of shape ({self.num_envs},) with at least one True"
             )
-        return mask.copy()
+        chosen: Bools = mask.copy()
+        return chosen
 
     def _observe(self) -> Observations:
         seen: Observations = self.game.observe_alike(self.episode, [self.body])[:, 0]

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.scenario import Scenario
 
 from ethbrake_marl.episode.game import Game, Script
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.reward import Reward, Rewarding
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.worlds.catalogue import load_scenario
+from ethbrake_marl.worlds.scenario import Scenario
 
 AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping is the content of a scenario file
 

@@ -192,7 +192,8 @@ def _accepted(scenario: Scenario, seed: int, channel: str, index: Ints) -> Drawn
     gaps = "time_gaps_s" if scenario.gaps_m is None else "gaps_m"
     raise InvalidInput(
         f"scenario {scenario.name!r}: early_impacts: reject, but in all {MOST_ATTEMPTS} draws of world"
-        f" {index[pending[0]]} an impact happens before {learners} can act; use larger {gaps}, a smaller latency_s, or early_impacts: keep"
+        f" {index[pending[0]]} an impact happens before {learners} can act; use larger"
+        f" {gaps}, a smaller latency_s, or early_impacts: keep"
     )
 
 

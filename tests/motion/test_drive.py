@@ -148,7 +148,8 @@ CASES: dict[str, tuple[Any, Any, float, Events, dict[str, Any]]] = {
         [(0.0, 0, 8.0), (4.0, 0, 8.0), (8.0, 0, 8.0), (12.0, 0, 8.0)], {"speeds_mps": [0.0, 4.0]},
     ),
     "an obstacle throws back": (  # 10 m at 20 m/s; v+ = -0.5 * 20; 5 m away again
-        lines([50.0], [20.0, 0.0], mass_t=[3.0, 1.0], restitution=0.5, obstacle_gap_m=10.0), 0.0, 1.0, [(0.5, -1, 20.0)],
+        lines([50.0], [20.0, 0.0], mass_t=[3.0, 1.0], restitution=0.5, obstacle_gap_m=10.0),
+        0.0, 1.0, [(0.5, -1, 20.0)],
         {"speeds_mps": [-10.0, 0.0], "gaps_m": [55.0], "obstacle_gap_m": 5.0, "obstacle_hit": True},
     ),
     "an obstacle is struck again": (  # thrown back at 5, its motor turns it round
