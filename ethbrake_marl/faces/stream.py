@@ -61,7 +61,7 @@ class Stream:
         for row, number in enumerate(state.clock[:, NUMBER].astype(np.int64)):
             if number >= 0:
                 drawn = self.scenario.draw(1, self.seed or 0, first=int(number), channel="training")
-                parts.append(columns_of(drawn))
+                parts.append({"world_seed": np.array([self.seed]), **columns_of(drawn)})
             else:
                 assert self.given is not None
                 parts.append({**quantities_of(self.given.take(slice(row, row + 1)))})
