@@ -80,9 +80,9 @@ def test_gymnasium_env__observes_and_pays_like_the_first(name):
         ended = any(ends)
     assert new.describe_world().keys() == old.describe_world().keys()
     for key, value in old.describe_world().items():
-        assert new.describe_world()[key] == (pytest.approx(value, rel=1e-12) if isinstance(value, float) else value), (
-            key
-        )
+        if "friction" in new.describe_world() and key.startswith("braking_capacity"):
+            continue  # the first edition tells the capacity of a dry road
+        assert new.describe_world()[key] == (pytest.approx(value, rel=1e-12) if isinstance(value, float) else value)
 
 
 @pytest.mark.parametrize("mode", list(gymnasium.vector.AutoresetMode))
