@@ -48,7 +48,7 @@ TABLES: dict[str, tuple[str, ...]] = {
 }
 
 PICTURES: dict[str, tuple[str, ...]] = {
-    "emergency.svg": ("ethbrake watch --agents full_brake,universal --output emergency.svg",),
+    "emergency.png": ("ethbrake watch --agents full_brake,universal --output emergency.png",),
     "deceleration.png": (
         'python -c "import ethbrake_marl as eb; from ethbrake_marl.scenario import Task;'
         " from ethbrake_marl.extensions.report import deceleration_curve, deceleration_figure, write_picture;"

@@ -55,13 +55,12 @@ def front_command(
     For each choice of weights, a search looks in every world for the commands with the least weighted harm. The command
     compares the results with full braking, with maximin (commands that minimise the largest harm of a vehicle) and, if
     there is one learner, with agents. The default choices of weights are a grid, equal weights, and, for each vehicle,
-    weight 1 for this vehicle and a tiny weight for all others. The command writes front.json, front.png and, for three
-    vehicles, front-ternary.png.
+    weight 1 for this vehicle and a tiny weight for all others. The command writes front.json and front.png.
     """
     with Out(as_json=as_json, force=force) as out:
         import numpy as np
 
-        from ethbrake_marl.extensions.fronts.figures import front_figures
+        from ethbrake_marl.extensions.fronts.figures import front_figure
         from ethbrake_marl.extensions.fronts.front import least_largest, search_front
         from ethbrake_marl.extensions.fronts.results import front_results, front_sheet, full_braking, hypervolume_sheet
         from ethbrake_marl.extensions.fronts.weights import corners, parsed_weights, weight_grid
@@ -75,7 +74,7 @@ def front_command(
             rows = np.concatenate([weight_grid(N, steps), np.ones((1, N)), corners(N)])
         else:
             rows = parsed_weights(weights, chosen.vehicles)
-        check_folder(output, ("front.json", "front.png", "front-ternary.png"), force=force)
+        check_folder(output, ("front.json", "front.png"), force=force)
         sample = chosen.sample(episodes, seed)
         beside_it = DEFAULT_AGENTS if agents is None and len(chosen.learners) == 1 else agents or ""
         others = [spec for spec in split_specs(beside_it) if spec != "full_brake"] if beside_it else []
@@ -89,8 +88,7 @@ def front_command(
         results |= {"budget": budget, "settings": list(settings or ())}
         output.mkdir(parents=True, exist_ok=True)
         out.write(output / "front.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
-        for name, figure in front_figures(results).items():
-            out.write(output / name, picture_bytes(figure, name), "figure")
+        out.write(output / "front.png", picture_bytes(front_figure(results), "front.png"), "figure")
         out.result(results, front_sheet(results), hypervolume_sheet(results))
 
 

@@ -30,10 +30,7 @@ in_our_style = matplotlib.style.context("default")
 
 GREY = "#555555"
 
-ALARM = "#b00020"
-
 DPI = 150
-
 CAPTION_PT = 7.5
 
 _CHARACTERS_PER_INCH = 17.0  # characters per inch of a caption
