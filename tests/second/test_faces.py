@@ -11,9 +11,18 @@ from ethbrake_marl.faces.gymnasium import EthBrakeEnv
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
 from ethbrake_marl.faces.sb3 import make_sb3_vec_env
 from ethbrake_marl.faces.vector import EthBrakeVectorEnv
-from ethbrake_marl.worlds.catalogue import list_scenarios, load_scenario
+from ethbrake_marl.worlds.catalogue import load_scenario
 
-NAMES = [entry.name for entry in list_scenarios()]
+NAMES = (
+    "paper-random",
+    "paper-random-obstacle",
+    "paper-random-buildup",
+    "cooperation-0-sensors",
+    "cooperation-1-front",
+    "cooperation-4-all",
+    "engineering-wet-road",
+    "mixture-delays",
+)
 
 
 def commands(rng, shape):
