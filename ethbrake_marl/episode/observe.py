@@ -63,8 +63,8 @@ class Plan(NamedTuple):
 class View:
     """What a vehicle observes: a list of features, by name.
 
-    >>> import ethbrake_marl as eb
-    >>> eb.View(["own", "front_1.gap"]).features[-1].name
+    >>> from ethbrake_marl.episode.observe import View
+    >>> View(["own", "front_1.gap"]).features[-1].name
     'front_1.gap'
 
     """
