@@ -31,7 +31,6 @@ from ethbrake_marl.worlds.given import worlds_from_table
 from tests.fixtures.scenarios import SHIPPED
 
 
-
 def as_state(worlds):
     """Arrays line, car, know of the first edition's worlds."""
     n, N, v = worlds.n, worlds.N, worlds.vehicles
