@@ -90,7 +90,6 @@ def _search(folder: Path, entry: Format) -> tuple[dict[str, Path], list[str], li
     files, seen, refused, twice = dict[str, Path](), set[object](), list[str](), list[str]()
     walk = os.walk(folder, onerror=lambda error: refused.append(f"{error.filename}: cannot be read ({error.strerror})"))
     everything = {Path(top, name) for top, _, names in walk for name in names}
-    sizes = Counter(map(_size, everything))
     for file in sorted(everything):
         below = file.relative_to(folder)
         matches = any(fnmatch(file.name.lower(), pattern) for pattern in entry.files)
@@ -98,20 +97,13 @@ def _search(folder: Path, entry: Format) -> tuple[dict[str, Path], list[str], li
             continue
         shown = plain_text(below.as_posix())
         again = entry.headless and file.suffix == ".txt" and file.with_suffix(".csv") in everything
-        content = _content(file) if sizes[_size(file)] > 1 else file
+        content = _content(file)
         if again or shown in files or content in seen:
             twice.append(shown)
         else:
             seen.add(content)
             files[shown] = file
     return files, refused, twice
-
-
-def _size(file: Path) -> int:
-    try:
-        return file.stat().st_size
-    except OSError:
-        return -1
 
 
 def _content(file: Path) -> object:

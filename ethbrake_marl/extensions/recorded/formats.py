@@ -78,7 +78,7 @@ FORMATS: dict[DataFormat, Format] = {
         "NGSIM is of the US Department of Transportation, CC BY-SA: name the source, and share what you make of it"
         " under the same licence. Streets with crossings (lankershim, peachtree) are left out.",
         metres=FOOT_M, mps=FOOT_M, ticks=0.01, impossible=0.05, streets=("lankershim", "peachtree"),
-        headless=_NGSIM_TEXT,
+        headless=_NGSIM_TEXT, texts=("location",),
     ),
     "openacc": Format(
         "OpenACC", ("*.csv",), {"time": "Time", "speed": f"Speed{NUMBER}", "gap": f"IVS{NUMBER}"}, "m and m/s",

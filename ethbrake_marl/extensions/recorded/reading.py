@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from io import BufferedReader, BytesIO
 from itertools import islice
@@ -13,18 +13,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
+import pyarrow
+from pyarrow import compute, csv
+from pyarrow.parquet import ParquetFile
 
-from ethbrake_marl.errors import InvalidInput, naming_extras, plain_text
+from ethbrake_marl.errors import InvalidInput, plain_text
 from ethbrake_marl.extensions.recorded.formats import NUMBER, Format
 from ethbrake_marl.files.plain import open_plain
 from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.physics.state import Floats
-
-with naming_extras():
-    import pandas as pd
-    import pyarrow
-    from pyarrow import compute, csv
-    from pyarrow.parquet import ParquetFile
 
 HEAD = 11  # number of first lines that may be the header
 
@@ -67,7 +65,7 @@ class Source(NamedTuple):
         """
         if bad.any():
             row = bad.idxmax()
-            raise InvalidInput(f"{self.place(row, quantity)}: {values[row]:.12g} {right}")
+            raise InvalidInput(f"{self.place(row, quantity)}: {values[row]:.12} {right}")
 
 
 def open_source(file: Path, entry: Format) -> Source:
@@ -78,30 +76,17 @@ def open_source(file: Path, entry: Format) -> Source:
     """
     missing = list(entry.columns.values())
     with _reading(file) as stream:
-        if _is_parquet(file):
-            names = ParquetFile(stream).schema_arrow.names
-            at, missing = _match(file, entry, names)
-            if not missing:
-                return Source(file, names, at)
-        else:
-            for number in range(1, HEAD + 1):
-                line = stream.readline(LONGEST_HEAD).decode("utf-8-sig")
-                row = line.split()
-                numbers = sum(parse_numeral(cell) is not None for cell in row)
-                if entry.headless and number == 1 and 2 * numbers > len(row) > 1:
-                    return Source(file, entry.headless, _match(file, entry, entry.headless)[0], 0, " ")
-                for separator in ",;\t":
-                    names = [cell.strip().strip('"') for cell in line.split(separator)]
-                    at, lacking = _match(file, entry, names)
-                    if not lacking:
-                        return Source(file, names, at, number, separator)
-                    missing = min(missing, lacking, key=len)
+        for names, heading, separator in _headers(file, entry, stream):
+            at, lacking = _match(file, entry, names)
+            if not lacking:
+                return Source(file, names, at, heading, separator)
+            missing = min(missing, lacking, key=len)
     refusal = NotARecording if 2 * len(missing) > len(entry.columns) else InvalidInput
     raise refusal(f"{file}: lacks columns that files of {entry.title} have: {', '.join(missing)}")
 
 
 def read_columns(
-    source: Source, entry: Format, quantities: Iterable[str], progress: Callable[[int, int], None]
+    source: Source, entry: Format, quantities: Sequence[str], progress: Callable[[int, int], None]
 ) -> Iterator[Any]:
     """Yield the columns of these quantities as data frames, whose index is the number of the row in the file.
 
@@ -110,21 +95,20 @@ def read_columns(
 
     Raises ``InvalidInput``, which names file, line and column, for a cell that is empty or not a number.
     """
-    quantities, first = list(quantities), 0
+    first, names = 0, [str(source.at[quantity]) for quantity in quantities]
     with _reading(source.file) as stream:
-        for batch in (_parquet if _is_parquet(source.file) else _text)(source, stream, quantities):
+        for batch in _parquet(stream, names) if _is_parquet(source.file) else _text(source, stream, names):
             progress(stream.tell() >> 10, os.fstat(stream.fileno()).st_size >> 10)
-            rows = np.arange(first, first + batch.num_rows)
-            first += batch.num_rows
-            if entry.streets and "location" in source.at:
-                used = compute.invert(compute.is_in(batch.column(len(quantities)), pyarrow.array(entry.streets)))
-                batch, rows = batch.filter(used), rows[used.to_numpy(zero_copy_only=False)]
             columns = {}
-            for quantity, cells in zip(quantities, batch.columns, strict=False):
-                empty_cells = entry.gaps and quantity != "time"
-                read = _texts if quantity in entry.texts else _numbers
-                columns[quantity] = read(source, quantity, cells, rows, empty_cells)
-            yield pd.DataFrame(columns, index=rows)
+            for quantity, name in zip(quantities, names, strict=True):
+                cells = batch.column(name)
+                if quantity in entry.texts:
+                    cells = compute.fill_null(cells.cast(pyarrow.string()), "")
+                    columns[quantity] = compute.utf8_trim_whitespace(cells).to_pandas()
+                else:
+                    columns[quantity] = _numbers(source, quantity, cells, first, entry.gaps and quantity != "time")
+            yield pd.DataFrame(columns).set_axis(range(first, first + batch.num_rows))
+            first += batch.num_rows
 
 
 def _is_parquet(file: Path) -> bool:
@@ -137,7 +121,22 @@ def _reading(file: Path) -> Iterator[BufferedReader]:
         with open_plain(file, LARGEST_BYTES) as stream:
             yield stream
     except pyarrow.ArrowException as error:
-        raise InvalidInput(f"{file}: cannot be read ({plain_text(str(error))[:200]})") from None
+        right = "rows are counted from the header; is the file complete?"
+        raise InvalidInput(f"{file}: cannot be read ({plain_text(str(error))[:200]}); {right}") from None
+
+
+def _headers(file: Path, entry: Format, stream: BufferedReader) -> Iterator[tuple[Sequence[str], int, str]]:
+    """Yield what may be the names of the columns, the number of lines up to the header, and the separator."""
+    if _is_parquet(file):
+        yield ParquetFile(stream).schema_arrow.names, 0, ","
+        return
+    for number in range(1, HEAD + 1):
+        line = stream.readline(LONGEST_HEAD).decode("utf-8-sig")
+        row = line.split()
+        if number == 1 and 2 * sum(parse_numeral(cell) is not None for cell in row) > len(row) > 1:
+            yield entry.headless, 0, " "
+        for separator in ",;\t":
+            yield [cell.strip().strip('"') for cell in line.split(separator)], number, separator
 
 
 def _match(file: Path, entry: Format, names: Sequence[str]) -> tuple[dict[str, int], list[str]]:
@@ -161,54 +160,29 @@ def _match(file: Path, entry: Format, names: Sequence[str]) -> tuple[dict[str, i
     return at, missing
 
 
-def _parquet(source: Source, stream: BufferedReader, quantities: Sequence[str]) -> Iterator[Any]:
-    names = [source.names[source.at[quantity]] for quantity in quantities]
-    for batch in ParquetFile(stream).iter_batches(BATCH_ROWS, columns=names):
-        yield batch.select(names)
+def _parquet(stream: BufferedReader, used: Sequence[str]) -> Iterator[Any]:
+    table = ParquetFile(stream)
+    names = table.schema_arrow.names
+    for batch in table.iter_batches(BATCH_ROWS, columns=[names[int(k)] for k in used]):
+        yield batch.rename_columns([str(names.index(name)) for name in batch.schema.names])
 
 
-def _text(source: Source, stream: BufferedReader, quantities: Sequence[str]) -> Iterator[Any]:
-    blank = 0
-    short: list[Any] = []
-
-    def check(row: Any) -> str:
-        nonlocal blank
-        if not row.text.strip():
-            blank += 1
-            return "skip"
-        short.append(row)
-        return "error"
-
+def _text(source: Source, stream: BufferedReader, used: Sequence[str]) -> Iterator[Any]:
     for _ in range(source.heading):
         stream.readline()
-    names = [str(k) for k in range(len(source.names))]
-    used = [names[source.at[each]] for each in (*quantities, "location") if each in source.at]
     text: Any = stream
     if source.separator == " ":
         text = BytesIO(re.sub(rb"[ \t]+", b",", re.sub(rb"(?m)^[ \t]+|[ \t\r]+$", b"", stream.read())))
-    try:
-        yield from csv.open_csv(
-            text,
-            csv.ReadOptions(column_names=names, block_size=BATCH_BYTES, use_threads=False),
-            csv.ParseOptions(delimiter=source.separator.replace(" ", ","), invalid_row_handler=check),
-            csv.ConvertOptions(include_columns=used, column_types=dict.fromkeys(used, pyarrow.string())),
-        )
-    except pyarrow.ArrowInvalid:
-        for row in short:
-            right = f"{row.actual_columns} values, but must have {row.expected_columns}; is the file complete?"
-            raise InvalidInput(f"{source.place(row.number - 1 - blank)}: the line has {right}") from None
-        raise
+    names = [str(k) for k in range(len(source.names))]
+    yield from csv.open_csv(
+        text,
+        csv.ReadOptions(column_names=names, block_size=BATCH_BYTES, use_threads=False),
+        csv.ParseOptions(delimiter=source.separator.replace(" ", ",")),
+        csv.ConvertOptions(include_columns=used, column_types=dict.fromkeys(used, pyarrow.string())),
+    )
 
 
-def _texts(source: Source, quantity: str, cells: Any, rows: Any, empty_cells: bool) -> Any:
-    texts = compute.utf8_trim_whitespace(compute.fill_null(cells.cast(pyarrow.string()), ""))
-    empty = pd.Series(compute.equal(texts, "").to_numpy(zero_copy_only=False), index=rows)
-    if empty.any():
-        raise InvalidInput(f"{source.place(empty.idxmax(), quantity)}: must have a value, but is empty")
-    return texts.to_pandas().to_numpy()
-
-
-def _numbers(source: Source, quantity: str, cells: Any, rows: Any, empty_cells: bool) -> Floats:
+def _numbers(source: Source, quantity: str, cells: Any, first: int, empty_cells: bool) -> Floats:
     try:
         values: Floats = cells.cast(pyarrow.float64()).to_numpy(zero_copy_only=False)
     except pyarrow.ArrowException:
@@ -217,7 +191,7 @@ def _numbers(source: Source, quantity: str, cells: Any, rows: Any, empty_cells: 
     for k in np.flatnonzero(~np.isfinite(values)):
         cell = str(cells[k].as_py() or "").strip()
         if not empty_cells or cell.lower() not in ("", "nan"):
-            place = source.place(rows[k], quantity)
+            place = source.place(first + int(k), quantity)
             raise InvalidInput(f"{place}: must be a finite number, but is {repr(cell) if cell else 'empty'}"[:300])
     return values
 

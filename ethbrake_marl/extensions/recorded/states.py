@@ -75,9 +75,13 @@ def read_recording(file: Path, entry: Format, every_s: float, progress: Callable
     names file, line and column, for an impossible value, for instance a length of 0 m.
     """
     source = open_source(file, entry)
-    times = pd.concat([each["time"] for each in read_columns(source, entry, ["time"], progress)] or [pd.Series()])
+    first = [quantity for quantity in ("time", "location") if quantity in source.at]
+    moments = pd.concat(list(read_columns(source, entry, first, progress)))
+    if "location" in moments:
+        moments = moments[~moments["location"].isin(entry.streets)]
+    times = moments["time"]
     if times.empty:
-        right = f" (those from {' and '.join(entry.streets)}, which have crossings, are left out)" * bool(entry.streets)
+        right = f" except those from {' and '.join(entry.streets)}, which have crossings" * bool(entry.streets)
         raise InvalidInput(f"{file}: contains no rows of data{right}")
     if not entry.hertz:
         entry = _with_rate(entry, times.to_numpy(), every_s)
@@ -89,14 +93,14 @@ def read_recording(file: Path, entry: Format, every_s: float, progress: Callable
     )
     near = max(1, min(stride, int(CHECK_S * entry.hertz)))
     used = whole[np.isin(whole % stride, (0, near % stride))].astype("int64").rename("tick")
-    pieces = (each.join(used, how="inner") for each in read_columns(source, entry, _columns(source), progress))
+    pieces = (each.join(used, how="inner") for each in read_columns(source, entry, list(source.at), progress))
     raw = pd.concat(list(pieces))
     names = dict[float, str]()
     if entry.gaps:
         states = _openacc(raw, source, entry)
     else:
-        if entry.texts:
-            names = _number_names(raw)
+        if "lane" in entry.texts:
+            names = _number_names(raw, source)
         states = _along_road(raw, source, entry)
         if entry.title == "highD":
             _turn_highd(states, source)
@@ -105,10 +109,6 @@ def read_recording(file: Path, entry: Format, every_s: float, progress: Callable
         _check(states, source, entry)
     states["row"] = states.index
     return Recording(source, entry, stride, near, states.sort_values(list(states), ignore_index=True), names)
-
-
-def _columns(source: Source) -> list[str]:
-    return [quantity for quantity in source.at if quantity != "location"]
 
 
 def _with_rate(entry: Format, times: Any, every_s: float) -> Format:
@@ -127,8 +127,10 @@ def _with_rate(entry: Format, times: Any, every_s: float) -> Format:
     return entry._replace(hertz=hertz, ticks=entry.ticks * hertz)
 
 
-def _number_names(raw: Any) -> dict[float, str]:
+def _number_names(raw: Any, source: Source) -> dict[float, str]:
     """Replace the names of vehicles and lanes by numbers, in the order of the names; return the names by number."""
+    for column in ("vehicle", "lane"):
+        source.refuse(raw[column] == "", column, raw[column], "must be a name")
     text = pd.concat([raw["vehicle"], raw["lane"]]).drop_duplicates()
     names = pd.DataFrame({"number": pd.to_numeric(text, errors="coerce"), "text": text}).sort_values(["number", "text"])
     numbers = {name: float(k) for k, name in enumerate(names["text"])}
@@ -158,7 +160,7 @@ def _along_road(raw: Any, source: Source, entry: Format) -> Any:
 def _turn_highd(states: Any, source: Source) -> None:
     """Let positions increase in the direction of travel; x is the left edge of a vehicle and grows to the right."""
     meta = open_source(Path(f"{str(source.file)[:-4]}Meta.csv"), HIGHD_META)
-    rows = pd.concat(read_columns(meta, HIGHD_META, meta.at, lambda *_: None))
+    rows = pd.concat(read_columns(meta, HIGHD_META, list(meta.at), lambda *_: None))
     direction = states["vehicle"].map(rows.drop_duplicates("vehicle").set_index("vehicle")["direction"])
     right = "must have the drivingDirection 1 or 2 in its tracksMeta.csv"
     source.refuse(~direction.isin([1.0, 2.0]), "vehicle", states["vehicle"], right)
