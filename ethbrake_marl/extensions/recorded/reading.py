@@ -107,7 +107,8 @@ def read_columns(
                     columns[quantity] = compute.utf8_trim_whitespace(cells).to_pandas()
                 else:
                     columns[quantity] = _numbers(source, quantity, cells, first, entry.gaps and quantity != "time")
-            yield pd.DataFrame(columns).set_axis(range(first, first + batch.num_rows))
+            rows = pd.DataFrame(columns).set_axis(range(first, first + batch.num_rows))
+            yield rows[~rows["location"].isin(entry.streets)] if "location" in rows else rows
             first += batch.num_rows
 
 

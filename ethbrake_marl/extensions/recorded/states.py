@@ -76,25 +76,23 @@ def read_recording(file: Path, entry: Format, every_s: float, progress: Callable
     """
     source = open_source(file, entry)
     first = [quantity for quantity in ("time", "location") if quantity in source.at]
-    moments = pd.concat(list(read_columns(source, entry, first, progress)))
-    if "location" in moments:
-        moments = moments[~moments["location"].isin(entry.streets)]
-    times = moments["time"]
-    if times.empty:
+    moments = (each["time"].unique() for each in read_columns(source, entry, first, progress))
+    times = np.unique(np.concatenate([np.empty(0), *moments]))
+    if not len(times):
         right = f" except those from {' and '.join(entry.streets)}, which have crossings" * bool(entry.streets)
         raise InvalidInput(f"{file}: contains no rows of data{right}")
     if not entry.hertz:
-        entry = _with_rate(entry, times.to_numpy(), every_s)
+        entry = _with_rate(entry, times, every_s)
     stride = check_every(every_s, entry, entry.title)
-    ticks = (times - times.min()) * entry.ticks
-    whole = ticks.round()
-    source.refuse(
-        abs(ticks - whole) > OFF, "time", times, f"must be a multiple of {1 / entry.hertz:g} s after the first time"
-    )
     near = max(1, min(stride, int(CHECK_S * entry.hertz)))
-    used = whole[np.isin(whole % stride, (0, near % stride))].astype("int64").rename("tick")
-    pieces = (each.join(used, how="inner") for each in read_columns(source, entry, list(source.at), progress))
-    raw = pd.concat(list(pieces))
+    pieces = []
+    for piece in read_columns(source, entry, list(source.at), progress):
+        ticks = (piece["time"] - times[0]) * entry.ticks
+        whole = ticks.round()
+        right = f"must be a multiple of {1 / entry.hertz:g} s after the first time"
+        source.refuse(abs(ticks - whole) > OFF, "time", piece["time"], right)
+        pieces.append(piece.assign(tick=whole.astype("int64"))[np.isin(whole % stride, (0, near % stride))])
+    raw = pd.concat(pieces)
     names = dict[float, str]()
     if entry.gaps:
         states = _openacc(raw, source, entry)
