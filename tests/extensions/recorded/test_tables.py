@@ -99,20 +99,11 @@ def test_parquet__gives_the_same_rows_and_names_rows(tmp_path: Path, monkeypatch
     assert rows_of(made_of(write(CARS))) == ROWS
     numbered = [(k % 5 + 1, *row[1:2], int(row[2][-1]), *row[3:]) for k, row in enumerate(CARS)]
     assert made_of(write(numbered)).csv.endswith("a.parquet: 3-4-1\n")
-    for k, cell, right in (
-        (4, -1.0, r"a.parquet, row 3, column l: -1 m: the length must be above 0 and at most 40 m"),
-        (5, None, "a.parquet, row 3, column v: the value is empty"),
-        (0, None, "a.parquet, row 3, column who: the value is empty"),
-    ):
-        with pytest.raises(InvalidInput, match=right):
-            made_of(write([*CARS[:2], (*CARS[2][:k], cell, *CARS[2][k + 1 :]), *CARS[3:]]))
-    with pytest.raises(InvalidInput, match=r"a.parquet, row 1, column v: 'fast' is not a number"):
-        made_of(write([(*car[:5], "fast") for car in CARS]))
+    with pytest.raises(InvalidInput, match=r"a.parquet, row 3, column v: the value is empty"):
+        made_of(write([*CARS[:2], (*CARS[2][:5], None), *CARS[3:]]))
     monkeypatch.setattr(reading, "PIECE", 6)  # rows are counted over pieces
     with pytest.raises(InvalidInput, match=r"a.parquet, row 13, column l: 0 m: the length"):
         made_of(write([*CARS[:12], (*CARS[12][:4], 0.0, 20.0), *CARS[13:]]))
-    with pytest.raises(InvalidInput, match=r"a.parquet: cannot be read as Parquet \(Unsupported cast from list"):
-        made_of(write([(*car[:5], [car[5]]) for car in CARS]))
     (tmp_path / "a.parquet").write_bytes(b"PAR1 and no more")
     with pytest.raises(InvalidInput, match=r"a.parquet: cannot be read as Parquet"):
         made_of(tmp_path)
