@@ -125,15 +125,6 @@ def test_unreadable_file_and_folder__are_refused(tmp_path: Path) -> None:
     assert [text.count("Permission denied") for text in made.refused] == [1, 1]
 
 
-@pytest.mark.slow
-def test_ten_thousand_small_files__are_as_many_recordings(tmp_path: Path) -> None:
-    text = (good(tmp_path) / "a.csv").read_text()
-    for k in range(9_999):
-        (tmp_path / f"{k}.csv").write_text(text.replace("Date,", f"Date,{k},"))
-    made = scenario_from_data("mine", tmp_path, "openacc")
-    assert made.found[1] == "rows of 10,000 different trios of vehicles in 10,000 recordings"
-
-
 def test_copy_of_a_recording__counts_once(tmp_path: Path) -> None:
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "copy.csv").write_bytes((good(tmp_path / "a") / "a.csv").read_bytes())
