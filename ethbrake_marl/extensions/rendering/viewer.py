@@ -121,22 +121,26 @@ class Window(Viewer):
 
         clock = pygame.time.Clock()
         for frame in [] if self.closed else self.step_frames():
+            size = frame.shape[1::-1]
             if self.window is None:
-                self.window = _open(pygame, frame)
-            self.window.blit(pygame.image.frombuffer(frame.tobytes(), frame.shape[1::-1], "RGB"), (0, 0))
-            pygame.display.flip()
+                self.window = _open(pygame, size)
+            self.window.get_surface().blit(pygame.image.frombuffer(frame.tobytes(), size, "RGB"), (0, 0))
+            self.window.flip()
             clock.tick(SMOOTH_FPS)
-            if any(event.type == pygame.QUIT for event in pygame.event.get()):
-                self.closed = True
+            for event in pygame.event.get(pygame.WINDOWCLOSE):
+                if event.window is self.window:
+                    self.closed = True
+                else:  # another environment's
+                    pygame.event.post(event)
+            pygame.event.pump()
+            if self.closed:
                 self.close()
-                break
+                return
 
     def close(self) -> None:
-        """Close the window."""
+        """Close the window; those of other environments stay open."""
         if self.window is not None:
-            import pygame
-
-            pygame.display.quit()
+            self.window.destroy()
             self.window = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -144,14 +148,12 @@ class Window(Viewer):
         return {**self.__dict__, "window": None}
 
 
-def _open(pygame: Any, frame: Any) -> Any:
-    """Return a window of the frame's size. Raises ``InvalidInput`` without a display."""
+def _open(pygame: Any, size: tuple[int, int]) -> Any:
+    """Return a new window. Raises ``InvalidInput`` without a display."""
     try:
         pygame.display.init()
-        window = pygame.display.set_mode(frame.shape[1::-1])
+        return pygame.Window("EthBrake", size)
     except pygame.error as error:
         raise InvalidInput(
             f"render_mode = 'human': cannot open a window ({error}); use 'rgb_array', which needs no display"
         ) from None
-    pygame.display.set_caption("EthBrake")
-    return window

@@ -142,23 +142,28 @@ def test_many_worlds__begin_anew_row_by_row() -> None:
 
 def test_human__shows_each_step_in_real_time(monkeypatch: pytest.MonkeyPatch) -> None:
     pygame = pytest.importorskip("pygame", reason="needs the extra: pip install 'ethbrake-marl[render]'")
-    environment = EthBrakeEnv(CRASH, render_mode="human")
-    assert pygame.display.get_surface() is None  # no window before there is something to show
+    environment, other = (EthBrakeEnv(CRASH, render_mode="human") for _ in range(2))
+    assert environment.renderer.window is None  # before there is something to show
     environment.reset(seed=0)
+    other.reset(seed=0)
     before = pygame.time.get_ticks()
     environment.step(np.zeros(1, np.float32))
     assert pygame.time.get_ticks() - before >= 80  # a step of 0.1 s
     assert environment.render() is None
-    assert pygame.display.get_surface().get_size() == (800, 304)
+    assert environment.renderer.window.size == (800, 304)
     copy.deepcopy(environment).close()
-    pygame.event.post(pygame.event.Event(pygame.QUIT))
-    environment.step(np.zeros(1, np.float32))
-    environment.step(np.zeros(1, np.float32))
-    assert pygame.display.get_surface() is None  # the user has closed it
-    environment.reset(seed=0)
-    assert pygame.display.get_surface() is not None
+    pygame.event.post(pygame.event.Event(pygame.WINDOWCLOSE, window=other.renderer.window))
+    for _ in range(2):
+        environment.step(np.zeros(1, np.float32))
+        other.step(np.zeros(1, np.float32))
+    assert other.renderer.window is None  # its user has closed it
+    assert environment.renderer.window is not None
+    other.reset(seed=0)
     environment.close()
-    assert pygame.display.get_surface() is None
+    other.step(np.zeros(1, np.float32))
+    assert other.renderer.window is not None
+    other.close()
+    pygame.display.quit()
     monkeypatch.setenv("SDL_VIDEODRIVER", "nothing")
     with pytest.raises(InvalidInput, match=r"cannot open a window .*; use 'rgb_array', which needs no display"):
         EthBrakeParallelEnv(render_mode="human").reset(seed=0)
