@@ -20,7 +20,7 @@ from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.left_out import Impacts
 from ethbrake_marl.physics.state import Floats, Ints, Worlds, make_worlds
 from tests.golden.test_golden import GOLDEN, figures
-from tests.physics.exact_simulator import line_of, simulate
+from tests.reference.exact_simulator import simulate
 from tests.physics.manufacture import Case, manufactured, pressed, stored
 from tests.physics.random_worlds import (
     HARMS,
@@ -32,6 +32,7 @@ from tests.physics.random_worlds import (
     driving_lines,
     energy_rise_eps,
     last_digit_errors,
+    line_of,
     momentum_eps,
     nearly_joined,
     once,
