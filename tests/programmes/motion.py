@@ -23,7 +23,7 @@ OPTIONS = {
 }
 CLOSE, CLOSE_STEPS = 1e-7, 1e-3  # relative; a contact with a closing speed near 0 loses half of the digits
 FEW = 30  # impacts, after which rounding may change their order
-UNRESOLVED = 0.02  # largest share of worlds in which two plastic impacts take turns faster than small steps
+UNRESOLVED = 0.04  # largest share of worlds in which two plastic impacts take turns faster than small steps
 
 
 def cases(given: Given) -> Cases:
@@ -61,10 +61,14 @@ def by_steps(make: Callable[[], Runs]) -> Told:
         steps.append(f"{far.sum()} by {step_s:.0e} s")
         off[far] = differences(end[far], stepped(runs.take(far), step_s))
     far = ~(off <= CLOSE_STEPS)
-    unlike = far & (runs.car[:, at.RESTITUTION, 0] > 0.0)
+    ends = stepped(runs.take(far), step_s)
+    fewer = ends[:, at.COUNT, :-1].sum(axis=1) < end[far, at.COUNT, :-1].sum(axis=1)
+    ends[:, at.TOTAL] = end[far, at.TOTAL]  # small steps miss the last impacts of a series, and nothing else
+    unlike = ~fewer | (differences(end[far], ends) > CLOSE_STEPS)
     good = bool(far.mean() <= UNRESOLVED and not unlike.any() and bits)
     text = f"{len(end)} of {len(few)} worlds, {', '.join(steps) or 'none by finer steps'}: off by {off[~far].max():.1e}"
-    return Told(good, f"{text} at most, median {np.median(off):.1e}; {far.sum()} plastic series; same bits: {bits}")
+    text += f" at most, median {np.median(off):.1e}; {far.sum()} plastic series, {unlike.sum()} unlike them"
+    return Told(good, f"{text}; same bits: {bits}")
 
 
 def batch(runs: Runs) -> bool:
