@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 import numpy as np
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from ethbrake_marl.episode.objectives import OBJECTIVES, Declared, objectives_of
+from ethbrake_marl.episode.objectives import OBJECTIVES, Declared, objectives_of, parse_objective
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Rules, Step
 from ethbrake_marl.episode.terms import (
@@ -108,7 +108,10 @@ class RewardParams(FileModel):
     def _objective(cls, value: Any) -> Any:
         if value is not None:
             try:
-                objectives_of(value, 1 if isinstance(value, str) else len(value))
+                if isinstance(value, str):
+                    parse_objective(value)  # how many weights it needs, the scenario says
+                else:
+                    objectives_of(value, len(value))
             except (InvalidInput, TypeError) as error:
                 raise ValueError(str(error).removeprefix("objective: ")) from None
         return value

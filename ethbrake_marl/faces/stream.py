@@ -11,8 +11,9 @@ import numpy as np
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import NUMBER, State
 from ethbrake_marl.errors import InvalidInput, check_whole_number
-from ethbrake_marl.worlds.describe import columns_of, quantities_of
+from ethbrake_marl.worlds.describe import columns_of
 from ethbrake_marl.worlds.given import worlds_from_state
+from ethbrake_marl.worlds.sampling import Drawn, join
 from ethbrake_marl.worlds.scenario import Scenario
 
 OPTIONS = ("initial_state", "listed_world")
@@ -29,7 +30,7 @@ class Stream:
         self.scenario, self.game = scenario, game
         self.seed: int | None = None
         self.next = 0  # number of the next world
-        self.given: State | None = None  # the worlds at the alert that the last reset asked for
+        self.given: Drawn | None = None  # the worlds that the last reset asked for
 
     def restart(self, n: int, seed: int | None, options: Any = None, known: tuple[str, ...] = OPTIONS) -> State:
         """Return new episodes in n worlds. ``seed`` None: go on with the stream, or begin one with a random seed.
@@ -40,12 +41,12 @@ class Stream:
         if seed is not None or self.seed is None:
             self.seed, self.next = chosen_seed(seed), 0
         try:
-            worlds = self._asked_for(n, checked_options(options, known))
-            begun = self.draw(n) if worlds is None else self.game.begin(worlds)
+            given = self._asked_for(n, checked_options(options, known))
+            begun = self.draw(n) if given is None else self.game.begin(given.worlds)
         except Exception:
             self.seed, self.next = before
             raise
-        self.given = worlds
+        self.given = given
         return begun
 
     def draw(self, n: int) -> State:
@@ -56,23 +57,31 @@ class Stream:
         return state
 
     def describe(self, state: State) -> dict[str, Any]:
-        """Return what was drawn for each running world: a name such as ``gap_1_m`` or ``scenario`` -> [n]."""
-        parts: list[dict[str, Any]] = []
-        for row, number in enumerate(state.clock[:, NUMBER].astype(np.int64)):
-            if number >= 0:
-                drawn = self.scenario.draw(1, self.seed or 0, first=int(number), channel="training")
-                parts.append({"world_seed": np.array([self.seed]), **columns_of(drawn)})
-            else:
-                assert self.given is not None
-                parts.append({**quantities_of(self.given.take(slice(row, row + 1)))})
-        shared = [name for name in parts[0] if all(name in part for part in parts)]
-        return {name: np.concatenate([part[name] for part in parts]) for name in shared}
+        """Return what was drawn for each running world: a name such as ``gap_1_m`` or ``scenario`` -> [n].
 
-    def _asked_for(self, n: int, options: Mapping[str, Any]) -> State | None:
+        A column that only some of the worlds have is NaN or an empty text for the others.
+        """
+        numbers, columns = state.clock[:, NUMBER].astype(np.int64), dict[str, Any]()
+        if (numbers < 0).any():
+            assert self.given is not None
+            columns = columns_of(self.given)
+        columns |= {"world_seed": np.full(state.n, self.seed), "world": numbers}
+        if (rows := numbers >= 0).any():
+            ordered, places = np.unique(numbers[rows], return_inverse=True)
+            seed = self.seed or 0
+            drawn = join([self.scenario.draw(1, seed, first=int(k), channel="training") for k in ordered])
+            for name, column in columns_of(drawn).items():
+                if name not in columns:
+                    columns[name] = np.full(state.n, "" if column.dtype.kind == "U" else np.nan, column.dtype)
+                columns[name][rows] = column[places]
+        return columns
+
+    def _asked_for(self, n: int, options: Mapping[str, Any]) -> Drawn | None:
         if len(options.keys() & set(OPTIONS)) == 2:
             raise InvalidInput(f"reset: options has both {OPTIONS[0]} and {OPTIONS[1]}; pass only one of them")
         if "initial_state" in options:
-            return worlds_from_state(self.scenario, options["initial_state"]).take(np.zeros(n, np.int64))
+            one = worlds_from_state(self.scenario, options["initial_state"])
+            return Drawn(one.take(np.zeros(n, np.int64)))
         if "listed_world" not in options:
             return None
         wanted = options["listed_world"]
@@ -83,9 +92,9 @@ class Stream:
             )
         for name in ("seed", "number"):
             check_whole_number(f"reset: listed_world: {name}", wanted[name], 0)
-        worlds = self.scenario.sample(n, int(wanted["seed"]), first=int(wanted["number"]))
-        worlds.clock[:, NUMBER] = -1.0
-        return worlds
+        drawn = self.scenario.draw(n, int(wanted["seed"]), first=int(wanted["number"]))
+        drawn.worlds.clock[:, NUMBER] = -1.0
+        return drawn
 
 
 def chosen_seed(seed: int | None) -> int:

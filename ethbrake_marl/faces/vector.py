@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space
 from ethbrake_marl.episode.infos import arrays
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.episode.state import ENDED
-from ethbrake_marl.episode.step import TERMINATED, TRUNCATED, Step
+from ethbrake_marl.episode.step import TRUNCATED, Step
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.faces.actions import action_space, checked_actions
 from ethbrake_marl.faces.gymnasium import OneLearner
@@ -140,10 +140,10 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         self.episode = self.episode.put(rows, self.stream.draw(int(rows.sum())), donate=True)
 
     def _cut(self, step: Step, most: int) -> None:
-        """Truncate the episodes that have taken ``most`` steps."""
-        rows = (self.episode.steps >= most) & ~self.episode.ended
+        """Truncate the episodes that have taken ``most`` steps, ended or not, like Gymnasium's ``TimeLimit``."""
+        rows = (self.episode.steps >= most) & (step.terminated | ~self.episode.ended)
         self.episode.clock[rows, ENDED] = 1.0
-        step.out[TRUNCATED, rows & (step.out[TERMINATED] == 0.0)] = 1.0
+        step.out[TRUNCATED, rows] = 1.0
 
     def _heeded(self, actions: Any, before: Bools) -> Any:
         """Return the actions, with 0 in rows whose action is ignored."""

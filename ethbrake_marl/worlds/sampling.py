@@ -84,7 +84,7 @@ def draw(scenario: Scenario, n: int, seed: int, *, first: int = 0, channel: Chan
         if (chosen == k).any():
             part = _accepted(member, seed, channel, index[chosen == k])
             parts.append(part._replace(scenarios=np.full(part.worlds.n, member.name)))
-    return _join(parts)
+    return join(parts)
 
 
 def members_of(scenario: Scenario, seed: int, channel: str, index: Ints) -> Ints:
@@ -204,7 +204,7 @@ def has_early_impact(scenario: Scenario, alert: State) -> Bools:
     return np.asarray(state.line[:, COUNT].any(axis=1))
 
 
-def _join(parts: Sequence[Drawn]) -> Drawn:
+def join(parts: Sequence[Drawn]) -> Drawn:
     """Return the worlds of all parts in the order of their numbers."""
     if len(parts) == 1:
         return parts[0]

@@ -293,3 +293,52 @@ def test_changes_of_speed__are_the_largest_of_one_impact_at_each_side() -> None:
     _, _, scratch = driven(line, car, 0.0, 0.0, 4.0)
     assert scratch[0, at.FRONT_CHANGE, 1:] == pytest.approx([0.0, 16.0 / 3.0, 8.0 / 3.0])
     assert scratch[0, at.REAR_CHANGE, 1:] == pytest.approx([8.0 / 3.0, 8.0 / 3.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("speed", "rate", "way"), [(20.0, 12.65, 34.01572), (20.0, np.inf, 28.57143), (1.0, 12.65, 0.26508)]
+)
+def test_vehicle__stops_after_its_way_with_brakes_that_build_up(speed: float, rate: float, way: float) -> None:
+    # v b / (2 r) - b^3 / (24 r^2) + v^2 / (2 b) with b = 7; from 1 m/s it stops before its brakes have full force
+    after, _ = run(*lines([100.0], [0.0, speed], brake_rate_mps3=rate), [0.0, -7.0], [10.0])
+    assert 100.0 - after[at.GAP, 1] == pytest.approx(way, abs=1e-5) and after[at.SPEED, 2] == 0.0
+
+
+def test_command__that_ends_at_the_latency_never_acts() -> None:
+    # driven at +6 until 0.8, braked at 6 from then on, with a latency of 0.8: the brakes build up from a force of 0
+    line, car = lines([50.0], [0.0, 20.0], latency_s=0.8, brake_rate_mps3=12.65)
+    line, _, _ = driven(line, car, [0.0, 6.0], 0.0, 0.8)
+    after, _, _ = driven(line, car, [0.0, -6.0], 0.8, 1.2)
+    assert line[0, at.SPEED, 2] == 20.0 and after[0, at.SPEED, 2] == pytest.approx(20.0 - 12.65 * 0.4**2 / 2.0)
+
+
+@pytest.mark.parametrize("rate", [0.5, 12.65, 300.0])
+def test_vehicles__that_brake_alike_keep_their_gap(rate: float) -> None:
+    settings = {"latency_s": 0.3, "brake_rate_mps3": rate, "release_rate_mps3": 2.0 * rate}
+    line, car = lines([0.0, 3.0], [20.0] * 3, **settings)
+    for start, command in ((0.0, -7.0), (0.4, 2.0), (1.7, -9.0)):
+        line, _, _ = driven(line, car, command, start, start + 1.3)
+    assert line[0, at.GAP, 1:3].tolist() == [0.0, 3.0] and not line[0, at.COUNT].any()
+
+
+@pytest.mark.parametrize(
+    ("gaps", "speeds", "latencies", "deceleration", "least", "full"),
+    [
+        ([10.0, 8.0], [20.0, 18.0, 20.0], [0.5, 0.8], 4.86, 0.0, 28.98),
+        ([5.0, 9.0], [22.0, 18.0, 20.0], [0.5, 0.8], 4.81, 0.0, 30.98),
+        ([7.0, 7.0], [20.0, 18.0, 20.0], [0.5, 0.8], 5.17021, 4.03447, 26.98),
+        ([7.0, 7.0], [20.0, 18.0, 20.0], [0.2, 0.8], 4.41016, 6.94011, 46.72),
+        ([7.0, 7.0], [20.0, 18.0, 20.0], [0.8, 1.2], 6.24679, 22.2623, 31.12),
+    ],
+)
+def test_pairs__have_the_harm_of_the_closed_form(
+    gaps: list[float], speeds: list[float], latencies: list[float], deceleration: float, least: float, full: float
+) -> None:
+    # each pair alone: Vehicles 1 and 3 brake at 6, Vehicle 2 at the best constant deceleration, or with all it has (7)
+    for second, expected in ((deceleration, least), (7.0, full)):
+        harm, commands, onset = 0.0, [-6.0, -second, -6.0], [0.0, *latencies]
+        for p in range(2):
+            line, car = lines([gaps[p]], speeds[p : p + 2], latency_s=onset[p : p + 2])
+            _, events = run(line, car, commands[p : p + 2], [12.0])
+            harm += events[0][2] ** 2 if events else 0.0
+        assert harm == pytest.approx(expected, rel=4e-4, abs=1e-4)

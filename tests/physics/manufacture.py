@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from ethbrake_marl.physics.state import Worlds, make_worlds
-from tests.physics.exact_simulator import Line, Outcome, Rationals, Unexact, simulate
+from tests.reference.exact_simulator import Line, Outcome, Rationals, Unexact, simulate
 
 GRID = 1 << 14  # every state on the way is a multiple of 1 / GRID: squares and products then fit in 53 bits
 FAR = Fraction(1 << 20)

@@ -4,6 +4,7 @@ The worlds are the same doubles on any machine and with any version of numpy.
 """
 
 from dataclasses import fields, replace
+from fractions import Fraction
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.left_out import Impacts
 from ethbrake_marl.physics.motion import BOUND
 from ethbrake_marl.physics.state import Bools, Floats, Worlds, make_worlds
+from tests.reference.exact_simulator import Line
 from tests.reference.tolerances import ENERGY_EPS, EPS, FEW_IMPACTS
 
 CAPACITY_MPS2 = 8.0
@@ -267,3 +269,11 @@ class Watched:
         bounced = struck & (self.start.vehicles.restitution[:, None] > 0.0)
         sinking = (self.impacts == 0)[..., None] & (self.after < self.before - STEADY_MPS)
         return int(((self.after < 0.0) & (~bounced | sinking)).sum())
+
+
+def line_of(worlds: Worlds, command: list[float], k: int) -> Line:
+    """World ``k`` of a batch, exactly."""
+    v = worlds.vehicles
+    rows = (worlds.gaps_m[k], worlds.speeds_mps[k], command, v.latency_s[k], v.mass_t[k], v.speed_limit_mps[k])
+    obstacle = Fraction(float(worlds.obstacle_gap_m[k])) if worlds.obstacle_gap_m[k] < np.inf else None
+    return Line(*(tuple(Fraction(float(x)) for x in row) for row in rows), Fraction(float(v.restitution[k])), obstacle)

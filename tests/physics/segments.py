@@ -16,7 +16,8 @@ from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.left_out import ImpactRows
 from ethbrake_marl.physics.motion import BOUND
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds, make_worlds
-from tests.physics.exact_simulator import line_of, simulate
+from tests.physics.random_worlds import line_of
+from tests.reference.exact_simulator import simulate
 from tests.reference.tolerances import DISCRIMINANT_EPS, END_EPS, EPS, GAP_M
 
 CAPACITY_MPS2 = 9.0

@@ -13,10 +13,10 @@ from hypothesis import given, settings, strategies as st
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.motion import contact
 from ethbrake_marl.physics.state import Floats, Worlds
-from tests.physics.exact_simulator import Hit, Line, line_of, regression, simulate, square_root
 from tests.physics.manufacture import Case, floats, manufactured, pressed, stored, worlds_of
-from tests.physics.random_worlds import HORIZON_S, driving_lines, line, place_ahead, touching_lines
+from tests.physics.random_worlds import HORIZON_S, driving_lines, line, line_of, place_ahead, touching_lines
 from tests.physics.segments import meetings, random_segments, scan
+from tests.reference.exact_simulator import Hit, Line, regression, simulate, square_root
 from tests.reference.tolerances import CLUSTER_EPS, CONTACT_TIME_EPS, EPS
 
 # ---------------------------------------------------------------- rational arithmetic, contact times to 160 bits

@@ -20,7 +20,6 @@ from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.left_out import Impacts
 from ethbrake_marl.physics.state import Floats, Ints, Worlds, make_worlds
 from tests.golden.test_golden import GOLDEN, figures
-from tests.physics.exact_simulator import line_of, simulate
 from tests.physics.manufacture import Case, manufactured, pressed, stored
 from tests.physics.random_worlds import (
     HARMS,
@@ -32,6 +31,7 @@ from tests.physics.random_worlds import (
     driving_lines,
     energy_rise_eps,
     last_digit_errors,
+    line_of,
     momentum_eps,
     nearly_joined,
     once,
@@ -54,6 +54,7 @@ from tests.physics.test_one_physics import (
 )
 from tests.physics.test_oracles import accelerations, at_once, exact_accelerations, in_steps, law_error_eps
 from tests.programmes import Cases, Given, Told
+from tests.reference.exact_simulator import simulate
 from tests.reference.tolerances import (
     BOUNCE_SERIES_EPS,
     CLUSTER_EPS,

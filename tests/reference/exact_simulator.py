@@ -12,10 +12,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import accumulate, pairwise
-from math import inf, isqrt
+from math import isqrt
 from typing import Any, NamedTuple
-
-from ethbrake_marl.physics.state import Worlds
 
 Rationals = tuple[Fraction, ...]
 ZERO = Fraction(0)
@@ -61,14 +59,6 @@ class Outcome(NamedTuple):
     hits: list[Hit]
     kinds: Counter[str]
     obstacle: Fraction | None
-
-
-def line_of(worlds: Worlds, command: list[float], k: int) -> Line:
-    """World ``k`` of a batch, exactly."""
-    v = worlds.vehicles
-    rows = (worlds.gaps_m[k], worlds.speeds_mps[k], command, v.latency_s[k], v.mass_t[k], v.speed_limit_mps[k])
-    obstacle = Fraction(float(worlds.obstacle_gap_m[k])) if worlds.obstacle_gap_m[k] < inf else None
-    return Line(*(tuple(Fraction(float(x)) for x in row) for row in rows), Fraction(float(v.restitution[k])), obstacle)
 
 
 def simulate(line: Line, until: Fraction, *, bits: int | None = None, grid: int | None = None) -> Outcome:

@@ -1,0 +1,139 @@
+"""A state is a value: copies, parts, donated memory and a second step from it lead to the same bits."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.play import hold, price
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.motion.layout import BRAKING
+from ethbrake_marl.worlds.game import game_of
+
+N = 7
+REWARDS: dict[str, Any] = {
+    "paper-random": "harm",
+    "paper-random-obstacle": {"harm": 1.0, "harm_count": "total", "terminal": 1.0},
+    "cooperation-3-pair": {"harm": 0.05, "shaping": 0.05, "jerk": 1e-4, "objective": "own"},
+    "paper-random-buildup": "paper",
+    "mixture-universal": "total-harm",
+}
+
+
+@pytest.fixture(params=REWARDS)
+def game(request: pytest.FixtureRequest) -> Game:
+    return game_of(request.param, reward=REWARDS[request.param])[1]
+
+
+def actions(game: Game, seed: int, n: int = N) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    drawn = rng.uniform(-1.0, 1.0, (n, len(game.rules.learners)))
+    return np.where(rng.random(drawn.shape) < 0.4, -1.0, drawn)
+
+
+def middle(game: Game) -> State:
+    """Return episodes in their middle; some may have ended."""
+    state = game.start(N, 3, 0)
+    for k in range(25):
+        state, _ = game.step(state, actions(game, k))
+    return state
+
+
+def bits(state: State) -> bytes:
+    memories = b"".join(np.ascontiguousarray(state.memories[name]).tobytes() for name in sorted(state.memories))
+    return b"".join(np.ascontiguousarray(array).tobytes() for array in state[:5]) + memories
+
+
+def after(game: Game, state: State, rows: Any = slice(None), *, donate: bool = False) -> tuple[bytes, bytes]:
+    """Return the bits of the state three steps later, and of their rewards."""
+    rewards = b""
+    for k in range(3):
+        state, step = game.step(state, np.ascontiguousarray(actions(game, 100 + k)[rows]), donate=donate)
+        rewards += step.reward.tobytes()
+    return bits(state), rewards
+
+
+def test_step__leaves_the_state_before_it_as_it_was(game: Game) -> None:
+    state = middle(game)
+    before, first = bits(state), after(game, state)
+    assert bits(state) == before and after(game, state) == first
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda state: pickle.loads(pickle.dumps(state))])
+def test_copy__goes_on_like_the_state(game: Game, copied: Any) -> None:
+    state = middle(game)
+    assert after(game, copied(state)) == after(game, state)
+
+
+def test_donated_memory__leads_to_the_same_bits(game: Game) -> None:
+    state = middle(game)
+    assert after(game, copy.deepcopy(state), donate=True) == after(game, state)
+
+
+def test_rows__go_on_alone_as_together(game: Game) -> None:
+    state, rows = middle(game), np.array([5, 0, 3])
+    together, alone = state, state.take(rows)
+    for k in range(3):
+        together, step = game.step(together, actions(game, k))
+        alone, part = game.step(alone, actions(game, k)[rows])
+        assert part.reward.tobytes() == step.reward[rows].tobytes()
+    assert bits(alone) == bits(together.take(rows))
+
+
+@pytest.mark.parametrize("rows", [[1, 4], np.array([k in (2, 6) for k in range(N)]), slice(2, 5)])
+def test_put__replaces_these_rows_and_no_others(game: Game, rows: Any) -> None:
+    state = middle(game)
+    before, new = bits(state), game.start(N, 3, 50).take(rows)
+    placed = state.put(rows, new)
+    others = np.setdiff1d(np.arange(N), np.arange(N)[rows])
+    assert bits(placed.take(rows)) == bits(new) and bits(placed.take(others)) == bits(state.take(others))
+    assert bits(state) == before
+    owned = copy.deepcopy(state)
+    assert bits(owned.put(rows, new, donate=True)) == bits(placed) == bits(owned)
+
+
+def test_episode__that_has_ended_stays_and_pays_nothing(game: Game) -> None:
+    state = middle(game)
+    while not state.ended.all():
+        state, _ = game.step(state, actions(game, 1))
+    same, step = game.step(state, actions(game, 2))
+    assert bits(same) == bits(state) and not step.reward.any() and not step.out.any()
+
+
+@pytest.mark.parametrize("bad", [np.nan, 1.001, -np.inf])
+def test_bad_action__is_refused_and_changes_nothing(game: Game, bad: float) -> None:
+    state = middle(game).take(slice(2, 5))
+    state.clock[:, 4] = 0.0
+    before, wrong = bits(state), actions(game, 1, 3)
+    wrong[1, -1] = bad
+    with pytest.raises(InvalidInput, match=rf"action of vehicle_{game.rules.learners[-1]} = .*: must be from -1"):
+        game.step(state, wrong, donate=True)
+    assert bits(state) == before
+
+
+@pytest.mark.parametrize("count", ["first", "total"])
+def test_price__is_the_harm_that_happens_to_the_last_bit(game: Game, count: str) -> None:
+    state = middle(game)
+    plans = np.random.default_rng(0).uniform(-1.0, 1.0, (N, 60, len(game.rules.learners)))
+    expected, now = price(game, state, plans, count), state
+    while not now.ended.all():
+        now, _ = game.step(now, plans[np.arange(N), np.minimum(now.steps, 59)])
+    assert expected.tobytes() == now.harm(count).tobytes()
+
+
+def test_hold__is_the_harm_of_constant_commands() -> None:
+    _, game = game_of("paper-random-obstacle")
+    state = game.start(N, 3, 0)
+    tried = -state.car[:, BRAKING, [2]] * np.array([0.0, 0.5, 1.0])
+    found = hold(state, state.wanted, [2], tried[:, :, np.newaxis], game.rules.horizon_s, "total")
+    for c, share in enumerate((0.0, -0.5, -1.0)):
+        now = state
+        while not now.ended.all():
+            now, _ = game.step(now, np.full((N, 1), share))
+        np.testing.assert_allclose(found[:, :, c], [now.harm("total"), now.harm("first")], rtol=1e-9, atol=1e-9)

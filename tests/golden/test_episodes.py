@@ -1,0 +1,73 @@
+"""Episodes of the shipped scenarios, as both editions played them: what must stay when the first edition is gone.
+
+``episodes.json`` has digests of every bit, ``episodes.npz`` numbers: where only a digest differs, rounding has changed.
+``python -m tests.golden.test_episodes`` records them anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.worlds.catalogue import list_scenarios, load_scenario
+from ethbrake_marl.worlds.game import game_of
+
+DIGESTS, NUMBERS = (Path(__file__).with_name(f"episodes.{end}") for end in ("json", "npz"))
+RECORDED = json.loads(DIGESTS.read_text("utf-8")) if DIGESTS.exists() else {}
+N = 10
+REWARDS: dict[str, Any] = {
+    "paper": "paper",
+    "ppo": {"harm": 0.05, "terminal": 0.02, "shaping": 0.05, "shaping_discount": 0.995},
+    **{
+        objective: {"harm": 1.0, "harm_count": "total", "objective": objective}
+        for objective in ("own", "social:45", "maximin", "mass-weighted", "weighted:1,4,1", "injury:lr4s")
+    },
+}
+
+
+def played(name: str, reward: Any = "harm") -> tuple[str, dict[str, np.ndarray]]:
+    """Return the digest of ten episodes under random actions, and their last lines, rewards and observations."""
+    _, game = game_of(name, reward=reward)
+    state, rng, sha256 = game.begin(load_scenario(name).sample(N, 7)), np.random.default_rng(7), hashlib.sha256()
+    sums = np.zeros((N, state.vehicles))
+    while not state.ended.all():
+        actions = rng.integers(-8, 9, (N, len(game.rules.learners))) / 8.0
+        state, step = game.step(state, actions)
+        seen = game.observe(state, game.rules.learners)
+        for array in (state.line, state.clock[:, :5], step.reward, *seen):
+            sha256.update(np.ascontiguousarray(array, array.dtype.newbyteorder("<")).tobytes())
+        sums += step.reward
+    observed = {f"observation_{i}": array for i, array in zip(game.rules.learners, seen, strict=True)}
+    return sha256.hexdigest()[:16], {"line": np.minimum(state.line, 1e9), "rewards": sums, **observed}
+
+
+CASES: dict[str, tuple[str, Any]] = {
+    **{entry.name: (entry.name, "harm") for entry in list_scenarios() if load_scenario(entry.name).learners},
+    **{f"paper-random-obstacle, {name}": ("paper-random-obstacle", reward) for name, reward in REWARDS.items()},
+}
+
+
+def test_every_scenario_with_learners__is_recorded() -> None:
+    assert [*RECORDED] == [*CASES]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_episodes__are_those_of_the_record(name: str) -> None:
+    digest, arrays = played(*CASES[name])
+    with np.load(NUMBERS) as recorded:
+        for key, array in arrays.items():
+            np.testing.assert_allclose(array, recorded[f"{name}/{key}"], rtol=1e-9, atol=1e-9, err_msg=key)
+    assert digest == RECORDED[name]
+
+
+if __name__ == "__main__":
+    found = {name: played(*case) for name, case in CASES.items()}
+    DIGESTS.write_text(json.dumps({name: digest for name, (digest, _) in found.items()}, indent=1) + "\n", "utf-8")
+    np.savez_compressed(
+        NUMBERS, **{f"{n}/{key}": array for n, (_, each) in found.items() for key, array in each.items()}
+    )

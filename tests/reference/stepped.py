@@ -1,0 +1,226 @@
+"""The motion of a line in small steps: a simulator that shares nothing with the package, for the tests of ``motion``.
+
+Every step solves one convex problem (Moreau's time stepping). Bodies of mass m and speed v, free forces included, get
+the speeds x that minimise ``sum m (x - v)^2 / 2 + sum phi(x)`` where no body may be faster than a touching one in
+front. The potential phi of a brake of force b is ``h m b |x|`` (dry friction), of an engine of force f with the limit L
+it is ``-h m f min(x, L)``. The minimum is an isotonic regression, whose blocks minimise their own sum. A step in which
+a gap would close is cut at that moment, so that the error is of the order ``h^2``.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from math import ceil, inf
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+
+TOUCH_MPS, PLASTIC_MPS = 1e-5, 0.05
+SAME_MPS = 1e-9  # closing speeds below this are rounding
+ALIKE_MPS = 1e-12  # touching bodies whose speeds differ by less move as one: rounding does not part them
+
+
+class Line(NamedTuple):
+    """One world; index 0 of vehicles is the front one, gap 0 that to the obstacle (infinite: none)."""
+
+    gaps: Any  # [N] m
+    speeds: Any  # [N] m/s
+    forces: Any  # [N] m/s2
+    mass: Any  # [N] t
+    limit: Any  # [N] m/s
+    latency: Any  # [N] s
+    brake_rate: Any  # [N] m/s3
+    release_rate: Any  # [N] m/s3
+    restitution: float
+
+
+@numba.njit(cache=True)
+def rest_of_block(mass, speeds, forces, limit, h, i, j):
+    """The speed that minimises the sum of the bodies i to j."""
+    momentum, weight = 0.0, 0.0
+    for k in range(i, j + 1):
+        momentum += mass[k] * speeds[k]
+        weight += mass[k]
+    for k in range(i, j + 1):  # is the minimum at a kink?
+        kink = 0.0 if forces[k] < 0.0 else limit[k]
+        below, above = weight * kink - momentum, weight * kink - momentum
+        for q in range(i, j + 1):
+            at = 0.0 if forces[q] < 0.0 else limit[q]
+            size = h * mass[q] * abs(forces[q])
+            falls = -size
+            rises = size if forces[q] < 0.0 else 0.0
+            below += falls if kink <= at else rises
+            above += rises if kink >= at else falls
+        if below <= 0.0 <= above:
+            return kink
+    best, least = 0.0, np.inf
+    for k in range(i - 1, j + 1):  # between two kinks: the slopes are those just above kink k
+        at = -np.inf if k < i else (0.0 if forces[k] < 0.0 else limit[k])
+        push = 0.0
+        for q in range(i, j + 1):
+            kink = 0.0 if forces[q] < 0.0 else limit[q]
+            size = h * mass[q] * abs(forces[q])
+            push += (size if forces[q] < 0.0 else 0.0) if at >= kink else -size
+        x = (momentum - push) / weight
+        wrong = 0.0
+        for q in range(i, j + 1):
+            kink = 0.0 if forces[q] < 0.0 else limit[q]
+            wrong = max(wrong, kink - x if at >= kink else x - kink)
+        if wrong < least:
+            best, least = x, wrong
+    return best
+
+
+@numba.njit(cache=True)
+def regression(gaps, mass, speeds, forces, limit, h, out):
+    """Speeds after a step of ``h`` (0: the speeds of a plastic impact): pools of touching bodies, front to rear."""
+    n = len(speeds)
+    heads, values = np.zeros(n + 1, np.int64), np.zeros(n + 1)
+    count = 0
+    for k in range(n):
+        heads[count], values[count] = k, rest_of_block(mass, speeds, forces, limit, h, k, k)
+        if gaps[k] <= 0.0 and k == 0 and values[count] > 0.0:
+            values[count] = 0.0
+        while count > 0 and gaps[heads[count]] <= 0.0 and values[count] > values[count - 1] - ALIKE_MPS:
+            count -= 1
+            values[count] = rest_of_block(mass, speeds, forces, limit, h, heads[count], k)
+            if heads[count] == 0 and gaps[0] <= 0.0 and values[count] > 0.0:
+                values[count] = 0.0
+        count += 1
+    for block in range(count):
+        for k in range(heads[block], heads[block + 1] if block + 1 < count else n):
+            out[k] = values[block]
+
+
+@numba.njit(cache=True)
+def impacts(gaps, mass, speeds, limit, restitution, book):
+    """Resolve impacts, round after round; ``book`` [4, N]: hit, first harm, total harm, count."""
+    n = len(speeds)
+    closing, pooled, nothing = np.zeros(n), np.zeros(n), np.zeros(n)
+    for _ in range(100_000):
+        largest = 0.0
+        for p in range(n):
+            closing[p] = speeds[p] - (speeds[p - 1] if p > 0 else 0.0) if gaps[p] <= 0.0 else 0.0
+            largest = max(largest, closing[p])
+        if largest <= SAME_MPS:
+            return
+        regression(gaps, mass, speeds, nothing, limit, 0.0, pooled)
+        head = 0
+        for k in range(n):
+            if k + 1 == n or gaps[k + 1] > 0.0:
+                largest = 0.0
+                for p in range(head, k + 1):
+                    if p > head or (p == 0 and gaps[0] <= 0.0):
+                        largest = max(largest, closing[p])
+                e = restitution if largest >= PLASTIC_MPS else 0.0
+                for i in range(head, k + 1):
+                    if largest > 0.0:
+                        speeds[i] = (1.0 + e) * pooled[i] - e * speeds[i]
+                head = k + 1
+        for p in range(n):
+            if closing[p] > TOUCH_MPS:
+                harm = closing[p] * closing[p]
+                book[1, p] += harm if book[0, p] == 0.0 else 0.0
+                book[0, p] = 1.0
+                book[2, p] += harm
+                book[3, p] += 1.0
+
+
+MASS, LIMIT, BRAKE_RATE, RELEASE_RATE = range(4)  # rows of `car`
+GAP, SPEED, FORCE, MEAN = range(4)  # rows of `now` and of what comes next; mean force of the step
+
+
+@numba.njit(cache=True)
+def build_up(now, wanted, car, h, new):
+    """The forces after a step of ``h``, and their means."""
+    for k in range(len(wanted)):
+        rate = car[BRAKE_RATE, k] if wanted[k] < now[FORCE, k] else car[RELEASE_RATE, k]
+        way = wanted[k] - now[FORCE, k]
+        if rate == np.inf or way == 0.0:
+            new[FORCE, k] = new[MEAN, k] = wanted[k]
+        elif abs(way) <= rate * h:
+            new[FORCE, k] = wanted[k]
+            new[MEAN, k] = wanted[k] - 0.5 * way * abs(way) / (rate * h)
+        else:
+            new[FORCE, k] = now[FORCE, k] + (rate if way > 0.0 else -rate) * h
+            new[MEAN, k] = 0.5 * (now[FORCE, k] + new[FORCE, k])
+
+
+@numba.njit(cache=True)
+def trial(now, wanted, car, h, new):
+    """One step of ``h``; return the smallest new gap."""
+    build_up(now, wanted, car, h, new)
+    regression(now[GAP], car[MASS], now[SPEED], new[MEAN], car[LIMIT], h, new[SPEED])
+    least = np.inf
+    for k in range(len(wanted)):
+        way = 0.5 * (now[SPEED, k] + new[SPEED, k]) * h
+        ahead = 0.5 * (now[SPEED, k - 1] + new[SPEED, k - 1]) * h if k > 0 else 0.0
+        new[GAP, k] = now[GAP, k] + (ahead - way)
+        if now[GAP, k] <= 0.0 and new[SPEED, k] == (new[SPEED, k - 1] if k > 0 else 0.0):
+            new[GAP, k] = 0.0
+        least = min(least, new[GAP, k])
+    return least
+
+
+@numba.njit(cache=True)
+def through(now, wanted, car, restitution, duration, step_s, book):
+    """Through an interval without an onset, in place; return False if there are too many steps."""
+    new, time, steps = now.copy(), 0.0, 0
+    impacts(now[GAP], car[MASS], now[SPEED], car[LIMIT], restitution, book)
+    while time < duration:
+        steps += 1
+        if steps > 50.0 * (duration / step_s + 1000.0):
+            return False
+        h = min(step_s, duration - time)
+        if trial(now, wanted, car, h, new) < 0.0:
+            low, high = 0.0, h
+            for _ in range(1100):  # to the last bit
+                middle = 0.5 * (low + high)
+                if middle in (low, high):
+                    break
+                if trial(now, wanted, car, middle, new) < 0.0:
+                    high = middle
+                else:
+                    low = middle
+            h = high
+            trial(now, wanted, car, h, new)
+        now[:] = new
+        for k in range(len(wanted)):
+            now[GAP, k] = max(now[GAP, k], 0.0)
+        time += h
+        impacts(now[GAP], car[MASS], now[SPEED], car[LIMIT], restitution, book)
+    return True
+
+
+class Outcome(NamedTuple):
+    """A world at the end of its run."""
+
+    gaps: Any
+    speeds: Any
+    forces: Any
+    book: Any  # [4, N] hit, first harm, total harm, count of the pair of each vehicle and what is ahead of it
+    finished: bool
+
+
+def simulate(line: Line, times: Any, commands: Any, step_s: float) -> Outcome:
+    """Run a line through the intervals between ``times`` [T + 1] under ``commands`` [T, N] in steps of ``step_s``.
+
+    A command acts once the latency has elapsed; what is chosen for an interval that ends at the latency never acts.
+    """
+    latency = np.array(line.latency)
+    now = np.array([line.gaps, line.speeds, line.forces, line.forces], np.float64)
+    car = np.array([line.mass, line.limit, line.brake_rate, line.release_rate], np.float64)
+    book, finished = np.zeros((4, len(latency))), True
+    for (start, end), command in zip(pairwise(times), commands, strict=True):
+        for one, other in pairwise(sorted({start, end, *(float(x) for x in latency if start < x < end - 1e-9)})):
+            wanted, length = np.where(latency <= one, command, 0.0), other - one
+            step = length / max(1, ceil(length / step_s)) * (1.0 + 1e-12)
+            finished &= through(now, wanted, car, float(line.restitution), length, step, book)
+        now[FORCE] = np.where((latency <= 0.0) | (latency < end - 1e-9), now[FORCE], 0.0)
+    return Outcome(now[GAP], now[SPEED], now[FORCE], book, finished)
+
+
+def infinite_where_far(gap: float) -> float:
+    """The gap to an obstacle; infinite where there is none."""
+    return gap if gap < 1e299 else inf
