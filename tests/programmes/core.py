@@ -27,7 +27,7 @@ OPTIONS = {
     "--whole": {"action": "store_true", "help": "run all cases of all tests of the core (minutes)"},
 }
 COPIED = (".ci", "docs", "ethbrake_marl", "scenarios", "tests", "train", "Makefile", "README.md", "pyproject.toml")
-APART = ("docs", "programmes")  # tests of the whole repository, not only of the core
+APART = ("docs", "programmes", "second")  # tests of the whole repository, not only of the core
 INSTALLATION = ("test_imports.py", "test_kernel_store.py")  # start many processes
 RUN = "runs/core"
 COMMANDS = {

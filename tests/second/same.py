@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.motion.layout import BRAKE_RATE
-from ethbrake_marl.worlds.catalogue import list_scenarios, load_scenario
+from ethbrake_marl.worlds.catalogue import load_scenario
+from tests.fixtures.scenarios import SHIPPED
 
-NAMES = [entry.name for entry in list_scenarios()]
-LEARNING = [name for name in NAMES if load_scenario(name).learners]
-ALONE = [name for name in NAMES if len(load_scenario(name).learners) == 1]
+LEARNING = [name for name in SHIPPED if load_scenario(name).learners]
+ALONE = [name for name in SHIPPED if len(load_scenario(name).learners) == 1]
 OF_MESSAGES = ("known_from_s", "age_s", "_known_from_s", "_age_s")  # infos that an extension adds
 
 

@@ -15,7 +15,8 @@ from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
 from ethbrake_marl.faces.sb3 import make_sb3_vec_env
 from ethbrake_marl.faces.vector import EthBrakeVectorEnv
 from ethbrake_marl.worlds.catalogue import load_scenario
-from tests.second.same import ALONE, LEARNING, NAMES, draws, same
+from tests.fixtures.scenarios import SHIPPED
+from tests.second.same import ALONE, LEARNING, draws, same
 
 MODES = list(gymnasium.vector.AutoresetMode)
 PARALLEL: list[dict[str, Any]] = [
@@ -41,7 +42,7 @@ def described(new: dict[str, Any], old: dict[str, Any]) -> None:
     assert new.keys() >= {key for key in old if not key.endswith("_type")}
 
 
-@pytest.mark.parametrize(("name", "settings"), in_turn(NAMES, PARALLEL))
+@pytest.mark.parametrize(("name", "settings"), in_turn(SHIPPED, PARALLEL))
 def test_parallel_env__is_like_the_first(name: str, settings: dict[str, Any]) -> None:
     if not load_scenario(name).learners:
         settings = {}
