@@ -85,18 +85,16 @@ def of_step(game: Game, state: State, step: Step | None, seed: int) -> dict[str,
         found["cost"] = step.total_harm if params.harm_count == "total" else step.first_impact_harm
         terms = step.terms or game.rewarding.shared(step)
         found |= {f"reward_{name}": terms[name] for name in params.counted}
-    return found
+    return found | game.own_infos(state)
 
 
 def dictionaries(game: Game, state: State, step: Step | None, seed: int, bodies: Ints) -> list[dict[str, Any]]:
     """Return one dictionary for each world and body, world by world."""
     infos: list[dict[str, Any]] = []
     of_worlds = of_step(game, state, step, seed)
-    shield = {} if game.shield is None else {f"shield_{k}": v for k, v in game.shield.infos(game, state).items()}
     for k, world in enumerate(numbers(state, bodies).tolist()):
         shared = {name: value[k].item() for name, value in of_worlds.items() if value.ndim == 1}
         shared["world"] = int(shared["world"])
-        shared |= {name: value[k].item() for name, value in shield.items()}
         each = [(name, value[k, bodies - 1].tolist()) for name, value in of_worlds.items() if value.ndim == 2]
         for o, values in enumerate(world):
             info = dict(zip(NUMBERS, values, strict=True))
@@ -112,6 +110,4 @@ def arrays(game: Game, state: State, step: Step | None, seed: int, body: int) ->
     for name, value in of_step(game, state, step, seed).items():
         columns[name] = value if value.ndim == 1 else value[:, body - 1]
     columns["world"] = columns["world"].astype(np.int64)
-    if game.shield is not None:
-        columns |= {f"shield_{name}": value for name, value in game.shield.infos(game, state).items()}
     return columns

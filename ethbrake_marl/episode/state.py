@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -63,6 +63,13 @@ class State(NamedTuple):
             put(old, rows, part, donate) for old, part in zip(self[:5], new[:5], strict=True)
         )
         memories = {who: put(memory, rows, new.memories[who], donate) for who, memory in self.memories.items()}
+        return State(line, car, clock, know, wanted, memories)
+
+    @staticmethod
+    def join(parts: Sequence[State]) -> State:
+        """Return all episodes of the parts, which have memories of the same kinds, in one state."""
+        memories = {who: join([part.memories[who] for part in parts]) for who in parts[0].memories}
+        line, car, clock, know, wanted = (np.concatenate(each) for each in zip(*(p[:5] for p in parts), strict=True))
         return State(line, car, clock, know, wanted, memories)
 
     @property
@@ -176,6 +183,14 @@ def put(memory: Any, rows: Any, new: Any, donate: bool = False) -> Any:
         memory = memory if donate else memory.copy()
         memory[rows] = new
     return memory
+
+
+def join(memories: Sequence[Any]) -> Any:
+    """Return memories of one kind, one after the other, as one."""
+    if isinstance(memories[0], tuple):
+        parts = [join(part) for part in zip(*memories, strict=True)]
+        return type(memories[0])(*parts) if hasattr(memories[0], "_fields") else tuple(parts)
+    return None if memories[0] is None else np.concatenate(memories)
 
 
 @kernel

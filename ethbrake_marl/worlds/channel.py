@@ -20,17 +20,23 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from operator import not_
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
-from pydantic import AfterValidator, Field, GetJsonSchemaHandler, ValidationError, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, GetJsonSchemaHandler, ValidationError, model_validator
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.files.model import NAME_PATTERN, FileModel, Wording, explain, require
+from ethbrake_marl.files.model import NAME_PATTERN, UNSHOWN, FileModel, Wording, explain, require, suggestion
 from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.motion.layout import Bools, Floats, Ints
+from ethbrake_marl.registry import Registry
+from ethbrake_marl.worlds.counters import Numbers
+
+if TYPE_CHECKING:
+    from ethbrake_marl.episode.game import Game
+    from ethbrake_marl.worlds.scenario import Scenario
 
 PER_LINK = 4  # uniform numbers of a link: wait, burst, loss, hop
 
@@ -145,6 +151,42 @@ def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
     return periods
 
 
+class Extension(Protocol):
+    """What a package adds to the knowledge of vehicles, declared by keys of ``v2x``."""
+
+    name: str  # of its memory in `State.memories`
+    keys: tuple[str, ...]  # of `v2x`
+    schemas: Mapping[str, JsonSchemaValue]  # JSON schema of each key, with a description
+
+    def read(self, key: str, value: Any) -> Any:
+        """Return the value of a key as plain data. Refuses (``files.model.refuse``) a bad value."""
+
+    def uses(self, v2x: V2X) -> tuple[str, ...]:
+        """Return the keys of messages that have an effect because of this extension. Refuses keys without effect."""
+
+    def is_random(self, v2x: V2X) -> bool:
+        """Return whether random numbers determine what vehicles know, beside those of the channel."""
+
+    def check(self, scenario: Scenario) -> None:
+        """Refuse a scenario in which these keys cannot be used."""
+
+    def check_alike(self, where: str, first: Scenario, other: Scenario) -> None:
+        """Raise ``InvalidInput`` unless worlds of both scenarios can be drawn together."""
+
+    def at_alert(self, scenario: Scenario, numbers: Numbers, equipped: Equipped, n: int) -> Any:
+        """Return the memory of n worlds at the alert."""
+
+    def game(self, game: Game) -> Game:
+        """Return the game with this extension."""
+
+
+def register_v2x_extension(key: str, extension: Extension) -> None:
+    """Register what the key ``key`` of ``v2x`` declares. Entry points: ``ethbrake_marl.v2x_extensions``."""
+    EXTENSIONS.add(key, extension, lambda other: other is extension)
+
+
+EXTENSIONS: Registry[Extension] = Registry("key of v2x", "v2x_extensions", register_v2x_extension)
+
 CHANNELS = {
     "paper": Channel("latency", senses="none"),
     "clear": Channel("messages", loss_begins=0.01, loss_ends=0.5),
@@ -170,7 +212,12 @@ class _PresetSchema:
 
 
 class V2X(FileModel):
-    """The key ``v2x`` of a scenario: the name of a preset, or a mapping with settings that differ from a preset."""
+    """The key ``v2x`` of a scenario: the name of a preset, or a mapping with settings that differ from a preset.
+
+    Other packages may add keys (``EXTENSIONS``).
+    """
+
+    model_config = ConfigDict(extra="allow")
 
     preset: Annotated[str, AfterValidator(_known_preset), _PresetSchema] = Field(
         default="paper", description="preset whose values are used for keys that are left out"
@@ -213,16 +260,24 @@ class V2X(FileModel):
     def _by_name(cls, value: Any) -> Any:
         right = f"must be a preset ({', '.join(CHANNELS)}), or a mapping such as {{preset: nominal, lost: 0.1}}"
         require(isinstance(value, str | dict | V2X), (), value, right)
-        return {"preset": value} if isinstance(value, str) else value
+        if not isinstance(value, dict):
+            return {"preset": value} if isinstance(value, str) else value
+        known = cls.model_fields
+        for key in value.keys() - known.keys():
+            close = suggestion(str(key), [*known, *EXTENSIONS]) or f"known: {', '.join((*known, *EXTENSIONS))}"
+            require(key in EXTENSIONS, (key,), UNSHOWN, f"unknown key; {close}")
+        return {key: each if key in known else EXTENSIONS[key].read(key, each) for key, each in value.items()}
 
     @model_validator(mode="after")
     def _possible(self) -> V2X:
         channel = self.channel
+        used = [key for extension in self.extensions for key in extension.uses(self)]
         if channel.hears == "none":
             why = "hears: none means that no vehicle gets messages"
             self._leave_out(("link_latency_s", "lost", "vehicles", *_OF_MESSAGES), why)
         elif channel.timing == "fixed":
-            self._leave_out(_OF_MESSAGES, "link_latency_s fixes the delay of messages")
+            unused = tuple(key for key in _OF_MESSAGES if key not in used)
+            self._leave_out(unused, "link_latency_s fixes the delay of messages")
         elif channel.timing == "latency":
             self._leave_out((*_OF_MESSAGES, "vehicles"), f"preset {self.preset} generates no messages")
         if channel.senses == "none":
@@ -244,7 +299,14 @@ class V2X(FileModel):
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         mapping = handler(core)
+        added = {key: extension.schemas[key] for key, extension in EXTENSIONS.usable().items()}
+        mapping = {**mapping, "properties": {**mapping["properties"], **added}, "additionalProperties": False}
         return {"anyOf": [{"enum": list(CHANNELS), "type": "string"}, mapping]}
+
+    @property
+    def extensions(self) -> tuple[Extension, ...]:
+        """The extensions whose keys are written here."""
+        return tuple(dict.fromkeys(EXTENSIONS[key] for key in self.model_extra or ()))
 
     @property
     def channel(self) -> Channel:
@@ -264,7 +326,8 @@ class V2X(FileModel):
         channel = self.channel
         heard = channel.hears != "none" and (channel.timing == "messages" or 0.0 < channel.lost < 1.0)
         seen = channel.senses != "none" and channel.sensing_s[0] != channel.sensing_s[1]
-        return self.by_link and (heard or seen)
+        own = any(extension.is_random(self) for extension in self.extensions)
+        return self.by_link and (heard or seen or own)
 
 
 def register_preset(name: str, settings: Mapping[str, Any]) -> None:

@@ -98,6 +98,8 @@ def _check_news(scenario: Scenario) -> None:
             f" ({scenario.horizon_s:g} s); use a faster channel or raise horizon_s"
         )
         require(bool(latest < scenario.horizon_s), ("v2x",), v2x, right)
+    for extension in v2x.extensions:
+        extension.check(scenario)
 
 
 def _check_speeds(scenario: Scenario) -> None:

@@ -14,7 +14,6 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.model import suggestion
 from ethbrake_marl.motion.layout import Bools, Floats
-from ethbrake_marl.worlds.channel import PER_LINK
 from ethbrake_marl.worlds.checks import LEAST_WEIGHT
 from ethbrake_marl.worlds.derived import obstacle_gap, on_road
 from ethbrake_marl.worlds.quantity import support
@@ -199,8 +198,11 @@ def _worlds(scenario: Scenario, given: Mapping[Entry, Floats], where: str, name:
             " when; worlds of your own need a channel in which this is not random, for instance"
             " scenario.replace(v2x='paper')"
         )
-    links = np.zeros((n, PER_LINK * N * N)) if scenario.v2x.by_link else None
-    return state_of(scenario, on_road(whole), links, scenario.equipped(), np.full(n, -1, np.int64))
+
+    def no_chance(width: int, stream: tuple[int, ...]) -> Floats:
+        return np.zeros((n, width))
+
+    return state_of(scenario, on_road(whole), no_chance, scenario.equipped(), np.full(n, -1, np.int64))
 
 
 def _fixed(scenario: Scenario, key: str, index: int, whole: Mapping[str, Floats]) -> Floats | None:

@@ -117,6 +117,19 @@ def _check_members(document: Document, members: Sequence[Scenario]) -> None:
                     f"{where}: {key} must be the same in all scenarios of the mixture, but {first.name} has {one} and"
                     f" {member.name} has {other}{way}"
                 )
+        _check_extensions(where, first, member)
+
+
+def _check_extensions(where: str, first: Scenario, member: Scenario) -> None:
+    for giver, silent in ((first, member), (member, first)):
+        for extension in giver.v2x.extensions:
+            if extension not in silent.v2x.extensions:
+                keys = " or ".join(f"v2x.{key}" for key in extension.keys)
+                raise InvalidInput(
+                    f"{where}: scenario {giver.name} has the key {keys}, but scenario {silent.name} does not; write"
+                    " one of them in every scenario of the mixture"
+                )
+            extension.check_alike(where, first, member)
 
 
 def _text(scenario: Scenario, key: str) -> str:

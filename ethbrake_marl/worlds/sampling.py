@@ -103,8 +103,7 @@ def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> Drawn:
     gap = obstacle_gap(scenario, whole, declared)
     if gap is not None:
         whole["obstacle_gap_m"] = gap
-    links = numbers(PER_LINK * N * N, NEWS) if scenario.v2x.by_link else None
-    state = state_of(scenario, whole, links, scenario.equipped(kind), index)
+    state = state_of(scenario, whole, numbers, scenario.equipped(kind), index)
     friction = dry["friction"][:, 0] if "friction" in dry else None
     types = None if line is None or kind is None else np.array(line.names)[kind]
     column = scenario.recordings
@@ -144,10 +143,10 @@ def _declared_values(
     return declared
 
 
-def state_of(scenario: Scenario, whole: Values, links: Floats | None, equipped: Equipped, index: Ints) -> State:
+def state_of(scenario: Scenario, whole: Values, numbers: Numbers, equipped: Equipped, index: Ints) -> State:
     """Return worlds at the alert from all their quantities, and the random numbers of their links.
 
-    Without ``links`` (the channel of the paper) a vehicle knows everything once its own latency is over.
+    With the channel of the paper a vehicle knows everything once its own latency is over.
     """
     n, N = whole["speeds_mps"].shape
     line, car = np.zeros((n, LINE_ROWS, N + 1)), np.zeros((n, CAR_ROW_COUNT, N + 1))
@@ -160,14 +159,16 @@ def state_of(scenario: Scenario, whole: Values, links: Floats | None, equipped: 
             car[:, row, 1:] = whole[key]
     know = np.zeros((n, N + 1, N + 1))
     car[:, OWN_LATENCY, 1:] = whole["latency_s"]
-    if links is None:
+    if not scenario.v2x.by_link:
         know[:, 1:, 1:] = whole["latency_s"][:, :, np.newaxis]
     else:
+        links = numbers(PER_LINK * N * N, NEWS)
         car[:, LATENCY, 1:], know[:, 1:, 1:] = scenario.v2x.channel.news(whole["latency_s"], links, equipped)
     wanted = np.zeros((n, N + 1))
     for i, name in enumerate(scenario.vehicle_names):
         wanted[:, i + 1] = first_command(scenario.roles[name], car[:, BRAKING, i + 1])
-    return at_alert(line, car, know, wanted, index)
+    memories = {each.name: each.at_alert(scenario, numbers, equipped, n) for each in scenario.v2x.extensions}
+    return at_alert(line, car, know, wanted, index)._replace(memories=memories)
 
 
 def _accepted(scenario: Scenario, seed: int, channel: str, index: Ints) -> Drawn:
@@ -183,7 +184,8 @@ def _accepted(scenario: Scenario, seed: int, channel: str, index: Ints) -> Drawn
         if attempt == _PATIENCE and len(pending) > 1:
             _accepted(scenario, seed, channel, index[pending[:1]])
         again = draw_once(scenario, numbers_of(seed, channel, attempt, index[pending]), index[pending])
-        for whole, part in zip((*drawn.worlds[:5], *drawn[2:]), (*again.worlds[:5], *again[2:]), strict=True):
+        drawn.worlds.put(pending, again.worlds, donate=True)
+        for whole, part in zip(drawn[2:], again[2:], strict=True):
             if whole is not None:
                 whole[pending] = part
         pending = pending[has_early_impact(scenario, again.worlds)]
@@ -208,9 +210,7 @@ def _join(parts: Sequence[Drawn]) -> Drawn:
     """Return the worlds of all parts in the order of their numbers."""
     if len(parts) == 1:
         return parts[0]
-    arrays = zip(*(part.worlds[:5] for part in parts), strict=True)
-    line, car, clock, know, wanted = (np.concatenate(each) for each in arrays)
-    whole = State(line, car, clock, know, wanted, {})
+    whole = State.join([part.worlds for part in parts])
     order = np.argsort(whole.clock[:, NUMBER])
     blanks = {"friction": np.nan, "types": "", "scenarios": "", "recordings": ""}
     columns = {}

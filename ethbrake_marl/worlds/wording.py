@@ -21,8 +21,6 @@ _INSTEAD = {
     "mu": "declare the friction of the road with the key friction, for instance friction: 0.5",
     "follower": "give the line one more vehicle: raise vehicles, and add its gap, speed, latency_s and the like to the"
     " lists",
-    "tells": "contents of messages belong to the extension messages",
-    "persistence": "periodic messages belong to the extension messages",
 }
 
 
