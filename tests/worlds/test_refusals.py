@@ -206,12 +206,8 @@ def test_vehicle_types__that_say_too_little_or_twice_are_refused(message: str) -
 
 GONE: dict[str, Callable[[], object]] = {
     "line 15: follower: unknown key; give the line one more vehicle": lambda: given(follower="{time_gap_s: 1}"),
-    "line 15: v2x.tells: unknown key; contents of messages belong to the extension messages": lambda: given(
-        v2x="{preset: nominal, tells: [speed]}"
-    ),
-    "line 15: v2x.persistence: unknown key; periodic messages belong to the extension messages": lambda: given(
-        v2x="{preset: nominal, persistence: periodic}"
-    ),
+    "line 15: v2x.senss: unknown key; did you mean senses?": lambda: given(v2x="{preset: nominal, senss: both}"),
+    "line 15: v2x.colour: unknown key; known: preset, hears,": lambda: given(v2x="{preset: nominal, colour: 3}"),
     "line 13: roles.vehicle_1 = {profile: [[0, 3]]}: must be learner or the name of a script, such as": lambda: given(
         roles="{vehicle_1: {profile: [[0, 3]]}, vehicle_2: learner}"
     ),

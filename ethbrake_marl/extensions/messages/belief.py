@@ -21,10 +21,9 @@ from ethbrake_marl.extensions.messages.links import (
     P_PLACE,
     P_SPEED,
     PIECES,
-    PLACE,
     Memory,
-    estimate_worlds,
-    present,
+    estimated,
+    newest,
 )
 from ethbrake_marl.motion.layout import (
     BRAKE_RATE,
@@ -32,7 +31,6 @@ from ethbrake_marl.motion.layout import (
     DRIVING,
     FORCE,
     LATENCY,
-    LIMIT,
     MASS,
     OWN_LATENCY,
     RELEASE_RATE,
@@ -80,14 +78,16 @@ def believed(state: State, observer: int) -> State:
     nothing. ``wanted`` holds the newest intents. Gaps add up to the distances of bodies with a known place.
     """
     known = known_pieces(state, observer)
-    news = _newest(state, observer)
-    line, car = _estimated(state, observer, known, news), state.car.copy()
+    news = newest(state, observer)
+    line, car = estimated(state, observer, known, news), state.car.copy()
     for rows, array in ((LINE_PIECES, line), (CAR_PIECES, car)):
         for row, piece in rows.items():
             array[:, row][~known[:, :, piece]] = np.nan
     wanted = np.where(known[:, :, P_INTENT], news[:, INTENT], np.nan)
     wanted[:, [0, observer]] = state.wanted[:, [0, observer]]
-    return state._replace(line=line, car=car, know=_known_if(state, observer, known.any(axis=2)), wanted=wanted)
+    return state._replace(
+        line=line, car=car, know=_known_if(state, observer, np.asarray(known.any(axis=2))), wanted=wanted
+    )
 
 
 def believed_whole(state: State, observer: int) -> State:
@@ -96,27 +96,8 @@ def believed_whole(state: State, observer: int) -> State:
     It can predict a body of which it knows all pieces but the intent.
     """
     known = known_pieces(state, observer)
-    line = _estimated(state, observer, known, _newest(state, observer))
-    return state._replace(line=line, know=_known_if(state, observer, known[:, :, :P_INTENT].all(axis=2)))
-
-
-def _newest(state: State, observer: int) -> Floats:
-    """Return the newest sample of each body that the observer has, [n, SAMPLE_ROWS, N + 1]."""
-    memory: Memory = state.memories[NAME]
-    if not memory.is_periodic:
-        return present(state)
-    news = memory.news[:, :, observer].copy()
-    news[:, :, observer], news[:, PLACE, 0] = memory.samples[:, 0, :, observer], memory.samples[:, 0, PLACE, 0]
-    return news
-
-
-def _estimated(state: State, observer: int, known: Bools, news: Floats) -> Floats:
-    line, bodies = state.line.copy(), known.shape[1]
-    aged = state.memories[NAME].is_periodic
-    working = np.empty(bodies), np.empty(bodies, np.bool_)
-    time, limit = state.time_s.copy(), state.car[:, LIMIT].copy()
-    estimate_worlds(observer, time, limit, known, news, aged, line, *working)
-    return line
+    line, whole = estimated(state, observer, known, newest(state, observer)), known[:, :, :P_INTENT].all(axis=2)
+    return state._replace(line=line, know=_known_if(state, observer, np.asarray(whole)))
 
 
 def _known_if(state: State, observer: int, holds: Bools) -> Floats:
@@ -144,9 +125,9 @@ def require_pieces(state: State, observers: Sequence[int], who: str, needs: Sequ
 
     One that drives several vehicles needs messages of them, too.
     """
-    memory = state.memories.get(NAME)
-    for sender in range(1, state.vehicles + 1) if memory is not None else ():
-        missing = [piece for piece in needs if not memory.contents[:, sender, PIECES.index(piece)].all()]
+    for sender in range(1, state.vehicles + 1) if NAME in state.memories else ():
+        contents = state.memories[NAME].contents[:, sender]
+        missing = [piece for piece in needs if not contents[:, PIECES.index(piece)].all()]
         if missing and tuple(observers) != (sender,):
             raise InvalidInput(
                 f"{who}: messages of vehicle_{sender} do not contain its {missing[0]} (key v2x.tells), but"

@@ -25,6 +25,7 @@ from ethbrake_marl.motion.layout import (
     GAP,
     HIT,
     LATENCY,
+    LIMIT,
     OWN_LATENCY,
     RELEASE_RATE,
     SPEED,
@@ -168,6 +169,24 @@ def _sample(memory: Memory, state: State, way_m: Floats, rows: Bools) -> None:
     samples[rows, 1:] = samples[rows, :-1]
     samples[rows, 0] = sample[rows]
     receive_worlds(rows, state.time_s.copy(), memory.channel, memory.seen_s, samples, memory.links, memory.news)
+
+
+def newest(state: State, observer: int) -> Floats:
+    """Return the newest sample of each body that the observer has, [n, SAMPLE_ROWS, N + 1]."""
+    memory: Memory = state.memories[NAME]
+    if not memory.is_periodic:
+        return present(state)
+    news = memory.news[:, :, observer].copy()
+    news[:, :, observer], news[:, PLACE, 0] = memory.samples[:, 0, :, observer], memory.samples[:, 0, PLACE, 0]
+    return news
+
+
+def estimated(state: State, observer: int, known: Bools, news: Floats) -> Floats:
+    """Return the lines as the observer estimates them from what it knows (``estimate_worlds``)."""
+    line, bodies, aged = state.line.copy(), known.shape[1], state.memories[NAME].is_periodic
+    working = np.empty(bodies), np.empty(bodies, np.bool_)
+    estimate_worlds(observer, state.time_s.copy(), state.car[:, LIMIT].copy(), known, news, aged, line, *working)
+    return line
 
 
 @large
