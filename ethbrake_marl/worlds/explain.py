@@ -12,7 +12,7 @@ from ethbrake_marl.files.json_schema import FileSchema, schema_lines
 from ethbrake_marl.files.model import NAME_PATTERN
 from ethbrake_marl.files.yaml import flow_text
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.channel import CHANNELS
+from ethbrake_marl.worlds.channel import CHANNELS, EXTENSIONS
 from ethbrake_marl.worlds.describe import recording_of
 from ethbrake_marl.worlds.mixture import member_content
 from ethbrake_marl.worlds.quantity import DISTRIBUTIONS
@@ -137,6 +137,8 @@ def _news(scenario: Scenario) -> str:
     channel = scenario.v2x.channel._asdict()
     other = {key: value for key, value in channel.items() if key in about and value != usual[key]}
     parts = [f"{key} {flow_text(value)} ({about[key].description})" for key, value in other.items()]
+    for key, value in (scenario.v2x.model_extra or {}).items():
+        parts.append(f"{key} {flow_text(value)} ({EXTENSIONS[key].schemas[key]['description']})")
     parts += [flow_text(scenario.v2x.vehicles)] if scenario.v2x.vehicles else []
     text = "; ".join(parts) or "each vehicle knows the whole line from its own latency on"
     return f"V2X preset {scenario.v2x.preset}: {text}."

@@ -7,7 +7,7 @@ import pytest
 
 from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.explain import scenario_json_schema
+from ethbrake_marl.worlds.explain import scenario_json_schema, sentences
 from ethbrake_marl.worlds.given import worlds_from_state
 from ethbrake_marl.worlds.scenario import Scenario
 from tests.extensions.messages.line import LINE
@@ -88,6 +88,9 @@ def test_scenario__says_what_is_declared_and_can_be_made_of_it() -> None:
     assert scenario.declared()["v2x"] == {**v2x, "tells": {"vehicle_2": ["place", "mass"]}}
     assert Scenario(**scenario.declared()) == scenario == scenario.replace(title=scenario.title)
     assert scenario != PAPER.replace(v2x={**v2x, "tells": ["mass"]})
+    (news,) = (text for text in sentences(scenario) if text.startswith("V2X preset nominal: "))
+    assert "; persistence periodic (what a receiver knows after the first message: " in news
+    assert "; tells {vehicle_2: [place, mass]} (contents of messages, " in news
     assert scenario.v2x.drawn and PAPER.v2x.extensions == ()
 
 
