@@ -45,7 +45,7 @@ PLACE = 1  # of its front (m along the road; 0 is the front of Vehicle 1 at the 
 SAMPLE_SPEED = 2  # m/s
 SAMPLE_FORCE = 3  # m/s2
 OBSTACLE_HIT = 4  # 1 once Vehicle 1 has hit the obstacle
-INTENT = 5  # command chosen at the last decision (m/s2)
+INTENT = 5  # command chosen at the last decision (m/s2); the rows before it can be measured
 SAMPLE_ROWS = 6
 
 # columns of `Memory.channel`
@@ -202,24 +202,21 @@ def receive_worlds(rows, time, channel, seen, samples, links, news):
                     u = chance(channel[k, KEY], (i - 1) * (bodies - 1) + j - 1, number)
                     bad = u >= channel[k, LOSS_ENDS] if bad else u < channel[k, LOSS_BEGINS]
                 if not bad:
-                    take_sample(samples[k], news[k], i, j, links[k, SENT, i, j], True)
+                    take_sample(samples[k], news[k], i, j, links[k, SENT, i, j], SAMPLE_ROWS)
                 links[k, BAD, i, j] = 1.0 if bad else 0.0
                 links[k, NUMBER, i, j] += 1.0
                 links[k, SENT, i, j] += channel[k, PERIOD]
             if seen[k, i, j] <= time[k]:
-                take_sample(samples[k], news[k], i, j, time[k], False)
+                take_sample(samples[k], news[k], i, j, time[k], INTENT)
 
 
 @kernel
-def take_sample(samples, news, i, j, sent, with_intent):
-    """Let i receive the newest sample of j that is not after ``sent`` (s). An older one than it has says no more."""
+def take_sample(samples, news, i, j, sent, rows):
+    """Let i receive the newest sample of j that is not after ``sent`` (s): all its rows, or those that are measured."""
     for s in range(samples.shape[0]):
         if samples[s, AT, j] <= sent + ON_GRID:
-            if samples[s, AT, j] >= news[AT, i, j]:
-                for row in range(INTENT):
-                    news[row, i, j] = samples[s, row, j]
-            if with_intent:  # a later message carries a later intent
-                news[INTENT, i, j] = samples[s, INTENT, j]
+            for row in range(rows):
+                news[row, i, j] = samples[s, row, j]
             return
 
 

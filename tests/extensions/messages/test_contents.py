@@ -5,7 +5,18 @@ import pytest
 
 from ethbrake_marl.extensions.messages.belief import believed, known_pieces
 from ethbrake_marl.extensions.messages.links import PIECES
-from ethbrake_marl.motion.layout import BRAKING, FORCE, GAP, MASS, SPEED
+from ethbrake_marl.motion.layout import (
+    BRAKE_RATE,
+    BRAKING,
+    DRIVING,
+    FORCE,
+    GAP,
+    LATENCY,
+    MASS,
+    OWN_LATENCY,
+    RELEASE_RATE,
+    SPEED,
+)
 from tests.extensions.messages.line import LINE, played, seen_by, stepped
 
 SEEN = ["own", "front_1", "rear_1", "front_1.intent", "rear_1.intent"]
@@ -44,6 +55,15 @@ def test_place_and_speed_alone() -> None:
     assert (seen["rear_1.intent"], seen["front_1.build_up_time"]) == (0.0, 0.0)
 
 
+@pytest.mark.parametrize("missing", ["place", "speed", "braking_capacity", "latency"])
+def test_stopping__needs_four_pieces(missing: str) -> None:
+    pieces = [piece for piece in ("place", "speed", "braking_capacity", "latency") if piece != missing]
+    game, state = played({"tells": {"vehicle_3": pieces}})
+    seen = seen_by(game, state, 2)
+    assert seen["rear_1.stopping_margin"] == seen["rear_1.fitting_deceleration"] == 0.0
+    check(seen, "front_1", FRONT)
+
+
 def test_each_vehicle_tells_something_else() -> None:
     tells = {"vehicle_1": ["speed", "braking_capacity", "latency"], "vehicle_2": ["intent"], "vehicle_3": [*PIECES]}
     game, state = played({"tells": tells}, SEEN)
@@ -70,6 +90,8 @@ def test_believed__is_nan_where_nothing_is_known() -> None:
     assert two.line[0, FORCE, 1:] == pytest.approx([np.nan, -7.0, np.nan], nan_ok=True)
     assert two.car[0, MASS, 1:] == pytest.approx([4.5, 5.5, np.nan], nan_ok=True)
     assert two.car[0, BRAKING, 1:] == pytest.approx([np.nan, 7.0, np.nan], nan_ok=True)
+    for row in (DRIVING, BRAKE_RATE, RELEASE_RATE, LATENCY, OWN_LATENCY):
+        assert np.isnan(two.car[0, row, 1:]).tolist() == [True, False, True]
     assert two.wanted[0, 1:] == pytest.approx([np.nan, -7.0, np.nan], nan_ok=True)
     assert two.line[0, GAP, 1:3].tolist() == [0.0, 0.0]  # no place is known but its own
     assert two.know[0, 2, 1:].tolist() == [0.5, 0.5, np.inf]  # of Vehicle 3 it has the alert alone

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ethbrake_marl.extensions.messages.belief import ages_s, believed
-from ethbrake_marl.extensions.messages.links import NAME, samples_kept
+from ethbrake_marl.extensions.messages.belief import ages_s, believed, known_pieces
+from ethbrake_marl.extensions.messages.links import NAME, chance, moved_on, samples_kept
 from ethbrake_marl.motion.layout import GAP, HIT, SPEED
 from ethbrake_marl.worlds.catalogue import load_scenario
 from tests.extensions.messages.line import LINE, played, seen_by, stepped
@@ -31,6 +31,46 @@ def test_old_news__is_moved_on_with_what_it_contains(tells, gap, closing) -> Non
     assert seen["front_1.gap"] == pytest.approx(gap / 10, abs=1e-6)
     assert seen["front_1.closing_speed"] == pytest.approx(closing / 10, abs=1e-6)
     assert seen["front_1.age"] == pytest.approx(0.3, abs=1e-6)
+
+
+def test_sample_of_the_alert__has_the_force_that_acts_at_once() -> None:
+    game, state = played({"link_latency_s": 0.5, "senses": "none", **PERIODIC}, SEEN)
+    seen = seen_by(game, state, 2)  # of Vehicle 1 at the alert: 20 m/s, -6 m/s2; Vehicle 3 coasts until 1 s
+    assert (seen["front_1.age"], seen["front_1.acceleration"]) == pytest.approx((0.5, -0.6))
+    assert seen["front_1.gap"] == pytest.approx((8 + 9.25 - 9) / 10, abs=1e-6)
+    assert seen["rear_1.acceleration"] == 0.0
+
+
+def test_alert__nothing_has_been_received() -> None:
+    alert = LINE.replace(v2x={"link_latency_s": 0.0, "senses": "none", **PERIODIC}, latency_s=0.0).sample(1, 7)
+    assert (alert.know[0, 1:, 1:] == 0.0).all()
+    assert known_pieces(alert, 2)[0, 1:].any(axis=1).tolist() == [False, True, False]
+
+
+def test_episode_that_has_ended__hears_no_more() -> None:
+    game, state = played(EVERY_SECOND)
+    while not state.ended[0]:
+        state = stepped(game, state, -1.0)
+    later = stepped(game, state, -1.0)
+    assert [a.tobytes() for a in later.memories[NAME]] == [a.tobytes() for a in state.memories[NAME]]
+
+
+def test_moved_on__by_hand() -> None:
+    assert moved_on(10.0, -4.0, 40.0, 1.0) == (6.0, 8.0)
+    assert moved_on(10.0, -4.0, 40.0, 9.0) == (0.0, 12.5)  # at rest after 2.5 s
+    assert moved_on(10.0, 2.0, 11.0, 1.0) == (11.0, 10.75)  # the limit comes after 0.5 s
+    assert moved_on(-2.0, -4.0, 40.0, 0.25) == moved_on(-2.0, 4.0, 40.0, 0.25) == (-1.0, -0.375)
+    assert moved_on(-2.0, 4.0, 40.0, 3.0) == (0.0, -0.5)
+    assert moved_on(-2.0, 0.0, 40.0, 3.0) == (-2.0, -6.0)
+
+
+def test_chance__is_uniform_and_of_its_own_for_every_link_and_message() -> None:
+    u = np.array(
+        [[[chance(key, link, number) for number in range(40)] for link in range(9)] for key in (0.0, 1.0, 2.0**53 - 1)]
+    )
+    assert len(np.unique(u)) == u.size and ((u >= 0.0) & (u < 1.0)).all()
+    assert abs(u.mean() - 0.5) < 0.03
+    assert abs(np.corrcoef(u[0, :, :-1].ravel(), u[0, :, 1:].ravel())[0, 1]) < 0.1
 
 
 def test_ages__by_hand() -> None:
@@ -62,6 +102,19 @@ def test_believed__knows_of_no_impact_between_others() -> None:
     assert (three.line[0, HIT, 1], believed(state, 2).line[0, HIT, 1]) == (0.0, 1.0)
     assert three.line[0, SPEED, 1] < state.line[0, SPEED, 1]  # as if it had braked on
     assert three.line[0, GAP, 1] == 0.0  # moved on, the two would overlap
+    present = played({"tells": ["place"]}, scenario=LINE.replace(gaps_m=[2, 30]))
+    while not present[1].pair_hit[0, 0]:
+        present = present[0], stepped(*present, 0.0)
+    assert believed(present[1], 3).line[0, HIT, 1] == 1.0
+
+
+def test_obstacle_hit__is_known_from_a_message() -> None:
+    game, state = played(EVERY_SECOND, scenario=LINE.replace(obstacle_gap_m=20, gaps_m=[60, 60]))
+    known = []
+    while len(known) < 14:  # Vehicle 1 hits it at 1.23 s; the samples of 1.3 s and 1.4 s are used at 1.5 s or 1.6 s
+        known.append((round(float(state.time_s[0]), 1), believed(state, 2).line[0, HIT, 0], state.line[0, HIT, 0]))
+        state = stepped(game, state, -1.0)
+    assert [min(time for time, *hit in known if hit[k] == 1.0) for k in (0, 1)] == [1.6, 1.3]
 
 
 def test_in_sight__news_is_never_old() -> None:
