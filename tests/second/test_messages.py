@@ -8,9 +8,10 @@ import ethbrake_marl.scenario as first
 from ethbrake_marl.agents.driving import script_agents
 from ethbrake_marl.physics.messages import Messages
 from ethbrake_marl.worlds.catalogue import load_scenario
+from ethbrake_marl.worlds.channel import EXTENSIONS
 from ethbrake_marl.worlds.game import game_of
 
-pytest.importorskip("ethbrake_marl.extensions.messages", reason="an extension that can be deleted")
+pytestmark = pytest.mark.skipif("tells" not in EXTENSIONS, reason="messages are an extension")
 
 PIECES = ["place", "speed", "acceleration", "braking_capacity", "latency", "mass", "intent"]
 SEEN = [
