@@ -18,6 +18,7 @@ from ethbrake_marl.worlds.counters import numbers_of
 from ethbrake_marl.worlds.describe import clusters_of, count_kinds, kinds_of
 from ethbrake_marl.worlds.scenario import Scenario
 from ethbrake_marl.worlds.table import rows_text
+from tests.fixtures.scenarios import SHIPPED
 from tests.refused import refused
 
 PAPER = load_scenario("paper-random")
@@ -229,7 +230,7 @@ def test_mixture__is_world_by_world_that_of_its_members(empty_folder: Path) -> N
 # ---------------------------------------------------------------- the object
 
 
-@pytest.mark.parametrize("name", [entry.name for entry in list_scenarios()])
+@pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_scenario__goes_round(name: str, empty_folder: Path) -> None:
     scenario = load_scenario(name)
     assert Scenario(**scenario.declared()) == scenario
