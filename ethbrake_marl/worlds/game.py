@@ -58,8 +58,6 @@ def game_of(
     """
     loaded = load_scenario(scenario)
     if learners is not None:
-        if isinstance(learners, str) or not isinstance(learners, Iterable):
-            raise InvalidInput(f"learners = {learners!r}: must be a list of vehicle names, for instance ['vehicle_2']")
         loaded = loaded.with_learners(learners)
     bodies = np.array(loaded.learners, np.int64)
     rewarding, rules = Rewarding.of(

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from ethbrake_marl.files.model import UNITS
+from ethbrake_marl.files.model import UNITS, UNSHOWN, require
 from ethbrake_marl.motion.layout import BRAKE_RATE, BRAKING, DRIVING, LATENCY, LIMIT, MASS, RELEASE_RATE, WEIGHT
+from ethbrake_marl.worlds.quantity import DISTRIBUTIONS, support
 
 # A stream is an independent sequence of uniform random numbers, named by a tuple.
 MAIN: tuple[int, ...] = ()
@@ -60,9 +61,23 @@ class Rule(NamedTuple):
         unit = f" {self.symbol} ({UNITS[self.unit]})" if self.unit else ""
         return f"finite and in {'(' if self.positive else '['}{self.low:g}, {self.high:g}]{unit}"
 
+    @property
+    def schema(self) -> dict[str, Any]:
+        """JSON Schema of the range, in lists and distributions too, with which editors check a file."""
+        number = {"exclusiveMinimum" if self.positive else "minimum": self.low, "maximum": self.high}
+        shape = {**number, "items": number, "properties": {"low": number, "high": number}}
+        quantity = {**number, "properties": dict.fromkeys((*DISTRIBUTIONS, "with_load"), shape)}
+        return {"allOf": [{**quantity, "items": quantity}]}
+
     def allows(self, low: float, high: float) -> bool:
         """Return whether all values from ``low`` to ``high`` are allowed; False for NaN."""
         return (low > 0.0 if self.positive else low >= self.low) and high <= self.high
+
+    def check(self, quantity: Any, at: tuple[int, ...] = ()) -> None:
+        """Raise, in a pydantic validator, the error for a number or distribution out of range."""
+        low, high = support(quantity)
+        overlap = "; a negative gap means overlapping vehicles" if self.per == "pair" and low < 0.0 else ""
+        require(self.allows(low, high), at, quantity, f"must be {self.interval}{overlap}")
 
     def count(self, vehicles: int) -> int:
         """Return how many values the quantity has in a world."""
@@ -187,6 +202,18 @@ CAR_ROWS = {
     "release_rate_mps3": RELEASE_RATE,
     "harm_weight": WEIGHT,
 }  # rows of `State.car`
+
+
+def width_of(stream: tuple[int, ...], vehicles: int) -> int:
+    """Return how many numbers a world has in a stream of quantities."""
+    return BLOCK * vehicles if stream in (MAIN, BRAKES) else OF_WORLD
+
+
+def check_count(value: Any, count: int, per: str) -> None:
+    """Raise, in a pydantic validator, the error for a list that does not have ``count`` entries."""
+    right = f"must have {count}, one per {per}, or be a single entry for all"
+    holds = not isinstance(value, tuple) or len(value) == count
+    require(holds, (), UNSHOWN, f"has {len(value) if isinstance(value, tuple) else 1} entries; {right}")
 
 
 def table_columns(keys: tuple[str, ...], vehicles: int) -> dict[str, Entry]:
