@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from difflib import get_close_matches
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pydantic_core import PydanticCustomError
 
@@ -62,7 +62,7 @@ def _check_speeds(scenario: Scenario) -> None:
         key = "speeds_mps" if scenario.line_speed_mps is None else "line_speed_mps"
         drives = f"vehicle_{i + 1} has a speed of {low:g}" + ("" if low == high else f" to {high:g}")
         right = f"{drives} m/s; its speed must be from 0 to its speed_limit_mps, {limits[i][0]:g} m/s"
-        require(low >= 0.0 and high <= limits[i][0], _path(scenario, key, i), getattr(scenario, key), right)
+        require(low >= 0.0 and high <= limits[i][0], *_entry(scenario, key, i), right)
 
 
 def _check_reactions(scenario: Scenario) -> None:
@@ -82,7 +82,7 @@ def _check_reactions(scenario: Scenario) -> None:
     for i, latest in enumerate(channel.latest_reaction_s(own, scenario.equipped())):
         key = "v2x" if latest > own[i] else "latency_s" if scenario.alert_s is None else "alert_s"
         right = f"vehicle_{i + 1} may not be able to act until {latest:g} s; this time must be below {horizon}"
-        require(latest < scenario.horizon_s, _path(scenario, key, i), getattr(scenario, key), right)
+        require(latest < scenario.horizon_s, *_entry(scenario, key, i), right)
 
 
 def _check_roles(scenario: Scenario) -> None:
@@ -101,5 +101,7 @@ def _check_roles(scenario: Scenario) -> None:
     require(1 not in scenario.learners or scenario.has_obstacle, ("roles", "vehicle_1"), LEARNER, right)
 
 
-def _path(scenario: Scenario, key: str, index: int) -> YamlPath:
-    return (key, index) if isinstance(getattr(scenario, key), tuple) else (key,)
+def _entry(scenario: Scenario, key: str, index: int) -> tuple[YamlPath, Any]:
+    """Return path and value of the entry of one vehicle, or of the entry for all."""
+    value = getattr(scenario, key)
+    return ((key, index), value[index]) if isinstance(value, tuple) else ((key,), value)

@@ -62,6 +62,12 @@ def worlds_from_table(scenario: Scenario, columns: Any) -> State:
             f"{where} = {columns!r:.60}: must be a mapping from columns to lists of numbers, a data frame or a pyarrow"
             " table"
         )
+    series = [columns[name] for name in names if hasattr(columns[name], "iloc")]
+    if not all(one.index.equals(series[0].index) for one in series):
+        raise InvalidInput(
+            f"{where}: columns have different pandas indexes; give them the same index, or pair them by position with"
+            " .to_numpy()"
+        )
     header = [str(name) for name in names]
     entries = _entries(header, scenario, where)
     arrays = [_numbers(f"{where}: {name}", columns[name]) for name in names]
@@ -191,5 +197,7 @@ def _numbers(what: str, value: Any) -> Floats:
     except (TypeError, ValueError, RuntimeError) as error:  # ragged lists, tensors with gradients or on a GPU
         raise InvalidInput(f"{what} = {value!r:.60}: must be a number or a list of numbers: {error}") from None
     if cells.dtype.kind not in "fiu" or isinstance(value, np.ma.MaskedArray) or kinds & {bool, np.bool_}:
-        raise InvalidInput(f"{what} = {value!r:.60}: must be a number or a list of numbers, unmasked")
+        raise InvalidInput(
+            f"{what} = {value!r:.60}: must be a number or a list of numbers; no booleans, texts or masks"
+        )
     return cells.astype(np.float64)

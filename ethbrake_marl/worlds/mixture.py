@@ -52,7 +52,8 @@ def build_members(
     cannot be drawn together.
     """
     listed, content = document.content["mixture"], document.content
-    if not isinstance(listed, list | tuple) or not all(isinstance(e, dict) and "scenario" in e for e in listed):
+    whole = isinstance(listed, list | tuple) and all(isinstance(e, dict) and "scenario" in e for e in listed)
+    if not whole or not listed:
         return document, ()
     beside = {key: value for key, value in content.items() if key in keys and key not in _OWN}
     members: list[Scenario] = []

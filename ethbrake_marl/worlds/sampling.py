@@ -12,7 +12,7 @@ from ethbrake_marl.episode.state import NUMBER, State
 from ethbrake_marl.episode.step import at_alert, begin
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion import layout
-from ethbrake_marl.motion.layout import BRAKE_RATE, BRAKING, COUNT, FAR_M, GAP, LATENCY, Bools, Floats, Ints
+from ethbrake_marl.motion.layout import BRAKE_RATE, COUNT, FAR_M, GAP, LATENCY, Bools, Floats, Ints
 from ethbrake_marl.worlds.channel import PER_LINK, Equipped
 from ethbrake_marl.worlds.counters import Channel, Numbers, numbers_of, world_numbers
 from ethbrake_marl.worlds.derived import Values, obstacle_gap, world_values
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.worlds.scenario import Scenario
 
 MOST_ATTEMPTS = 1000  # draws of one world after which its scenario counts as unusable
-TOGETHER = 4096  # worlds that are drawn in one piece: their arrays fit into the cache of a processor
+IN_CACHE = 1024  # worlds whose arrays fit into a processor's cache
 
 Texts = NDArray[np.str_]
 
@@ -48,19 +48,15 @@ def draw(scenario: Scenario, n: int, seed: int, *, first: int = 0, channel: Chan
     World k of a mixture is world k of the member that is chosen for it. Raises ``InvalidInput`` for bad arguments, and
     for a world that is rejected in ``MOST_ATTEMPTS`` draws.
     """
-    index, parts = world_numbers(n, seed, first, channel), []
-    for begins in range(0, n, TOGETHER):
-        piece = index[begins : begins + TOGETHER]
-        if not scenario.members:
-            parts.append(_accepted(scenario, seed, channel, piece))
-            continue
-        u = numbers_of(seed, channel, 0, piece)(OF_WORLD, MIXTURE)[:, 0]
-        chosen = pick([member.weight for member in scenario.mixture or ()], u)
-        for k in np.unique(chosen):
-            member = scenario.members[k]
-            part = _accepted(member, seed, channel, piece[chosen == k])
-            parts.append(part._replace(scenarios=np.full(part.worlds.n, member.name)))
-    return _join(parts)
+    index = world_numbers(n, seed, first, channel)
+    if not scenario.members:
+        return _accepted(scenario, seed, channel, index)
+    u = numbers_of(seed, channel, 0, index)(OF_WORLD, MIXTURE)[:, 0]
+    chosen, parts = pick([member.weight for member in scenario.mixture or ()], u), []
+    for k in np.unique(chosen):
+        part = _accepted(scenario.members[k], seed, channel, index[chosen == k])
+        parts.append(part._replace(scenarios=np.full(part.worlds.n, scenario.members[k].name)))
+    return _merged(parts, np.argsort(chosen, kind="stable"))
 
 
 def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> Drawn:
@@ -116,22 +112,24 @@ def state_of(scenario: Scenario, whole: Values, links: Floats | None, equipped: 
     """
     n, N = whole["speeds_mps"].shape
     line, car = np.zeros((n, layout.LINE_ROWS, N + 1)), np.zeros((n, layout.CAR_ROWS, N + 1))
-    line[:, layout.SPEED, 1:], line[:, GAP, 1:N], line[:, GAP, N] = whole["speeds_mps"], whole["gaps_m"], np.inf
-    line[:, GAP, 0] = whole["obstacle_gap_m"][:, 0] if "obstacle_gap_m" in whole else FAR_M
-    car[:, layout.MASS, 0] = car[:, BRAKE_RATE] = car[:, layout.RELEASE_RATE] = np.inf
-    car[:, layout.RESTITUTION], car[:, layout.WEIGHT, 1:] = whole["restitution"], 1.0
-    for key, row in CAR_ROWS.items():
-        if key in whole:
-            car[:, row, 1:] = whole[key]
-    know = np.zeros((n, N + 1, N + 1))
-    car[:, layout.OWN_LATENCY, 1:] = whole["latency_s"]
-    if links is None:
-        know[:, 1:, 1:] = whole["latency_s"][:, :, np.newaxis]
-    else:
-        car[:, LATENCY, 1:], know[:, 1:, 1:] = scenario.v2x.channel.news(whole["latency_s"], links, equipped)
-    wanted = np.zeros((n, N + 1))
+    know, wanted = np.zeros((n, N + 1, N + 1)), np.zeros((n, N + 1))
+    latency, known = whole["latency_s"], whole["latency_s"][:, :, np.newaxis]
+    if links is not None:
+        latency, known = scenario.v2x.channel.news(latency, links, equipped)
+    obstacle = whole.get("obstacle_gap_m", np.full((n, 1), FAR_M))
+    of_car = [(row, whole[key]) for key, row in CAR_ROWS.items() if key in whole and row != LATENCY]
+    of_car += [(LATENCY, latency), (layout.OWN_LATENCY, whole["latency_s"])]
+    for first in range(0, n, IN_CACHE):
+        rows = slice(first, first + IN_CACHE)
+        line[rows, layout.SPEED, 1:], line[rows, GAP, 0] = whole["speeds_mps"][rows], obstacle[rows, 0]
+        line[rows, GAP, 1:N], line[rows, GAP, N] = whole["gaps_m"][rows], np.inf
+        car[rows, layout.MASS, 0] = car[rows, BRAKE_RATE] = car[rows, layout.RELEASE_RATE] = np.inf
+        car[rows, layout.RESTITUTION], car[rows, layout.WEIGHT, 1:] = whole["restitution"][rows], 1.0
+        for row, each in of_car:
+            car[rows, row, 1:] = each[rows]
+        know[rows, 1:, 1:] = known[rows]
     for i, name in enumerate(scenario.vehicle_names):
-        wanted[:, i + 1] = first_command(scenario.roles[name], car[:, BRAKING, i + 1])
+        wanted[:, i + 1] = first_command(scenario.roles[name], whole["braking_capacity_mps2"][:, i])
     return at_alert(line, car, know, wanted, index)
 
 
@@ -165,12 +163,16 @@ def has_early_impact(scenario: Scenario, alert: State) -> Bools:
     return np.asarray(state.line[:, COUNT].any(axis=1))
 
 
-def _join(parts: Sequence[Drawn]) -> Drawn:
-    """Return the worlds of all parts in the order of their numbers."""
-    if len(parts) == 1:
-        return parts[0]
-    line, car, clock, know, wanted = map(np.concatenate, zip(*(part.worlds[:5] for part in parts), strict=True))
-    columns = map(np.concatenate, zip(*(part[1:5] for part in parts), strict=True))
-    order = np.argsort(clock[:, NUMBER], kind="stable")
-    worlds = State(line, car, clock, know, wanted, {}).take(order)
-    return Drawn(worlds, *(column[order] for column in columns), sum(part.rejected for part in parts))
+def _merged(parts: Sequence[Drawn], place: Ints) -> Drawn:
+    """Return the worlds of all parts in one, with row i of them in row ``place[i]``."""
+
+    def merged(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
+        whole, begins = np.empty((len(place), *arrays[0].shape[1:]), np.result_type(*arrays)), 0
+        for array in arrays:
+            whole[place[begins : begins + len(array)]] = array
+            begins += len(array)
+        return whole
+
+    worlds = State(*map(merged, zip(*(part.worlds[:5] for part in parts), strict=True)), memories={})
+    columns = map(merged, zip(*(part[1:5] for part in parts), strict=True))
+    return Drawn(worlds, *columns, rejected=sum(part.rejected for part in parts))

@@ -50,11 +50,11 @@ class ScenarioWording(Wording):
 
     def right(self, detail: ErrorDetails) -> str:
         """Return what would be valid instead of a bad quantity or role."""
-        given = detail["input"]
-        if detail["type"] == "quantity" or detail["loc"][-1] == "#number":
+        given, kind = detail["input"], detail["type"]
+        if kind == "quantity" or (kind == "float_type" and detail["loc"][-1] == "#number"):
             hints = [suggestion(str(key), DISTRIBUTIONS) for key in given] if isinstance(given, dict) else []
             load = "; with_load is allowed only in vehicle_types" * (isinstance(given, dict) and "with_load" in given)
             return f"must be a number or a distribution, {_DISTRIBUTION}{load}" + "".join(f"; {h}" for h in hints if h)
-        if detail["type"] == "string_type" and detail["loc"][0] == "roles":
+        if kind == "string_type" and detail["loc"][0] == "roles":
             return "must be learner or the name of a script, such as full_brake, coast or constant:3"
         return ""
