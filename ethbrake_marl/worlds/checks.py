@@ -11,6 +11,7 @@ from ethbrake_marl.files.model import UNSHOWN, require
 from ethbrake_marl.files.yaml import YamlPath
 from ethbrake_marl.worlds.roles import HELD, LEARNER, check_vehicle, deceleration_of
 from ethbrake_marl.worlds.rules import ALTERNATIVES, OF_A_TYPE, RULES, USUAL
+from ethbrake_marl.worlds.vehicle_types import check_types
 
 if TYPE_CHECKING:
     from ethbrake_marl.worlds.scenario import Scenario
@@ -20,6 +21,8 @@ LEAST_WEIGHT = 1e-6  # least weight of harm that one vehicle of a line must have
 
 def check_whole(scenario: Scenario) -> None:
     """Refuse a scenario whose keys contradict each other. It is no mixture."""
+    if scenario.types is not None:
+        check_types(scenario.types, scenario.vehicle_types, scenario.vehicles)
     _check_declared_once(scenario)
     _check_speeds(scenario)
     _check_reactions(scenario)
@@ -32,7 +35,7 @@ def _check_declared_once(scenario: Scenario) -> None:
         value = getattr(scenario, key)
         kinds = scenario.vehicle_types or {} if key in OF_A_TYPE else {}
         silent = [name for name, kind in kinds.items() if getattr(kind, key) is None]
-        columns = [column.name for (of, _), column in scenario.columns.items() if of == key]
+        columns = [index for of, index in scenario.columns if of == key]
         by_types, by_table = bool(kinds) and not silent, len(columns) == rule.count(scenario.vehicles)
         by = "every vehicle type declares it" if by_types else "the table has columns of it for all"
         twice = key in scenario.model_fields_set and (by_types or by_table)

@@ -20,8 +20,6 @@ from ethbrake_marl.worlds.sampling import state_of
 from ethbrake_marl.worlds.scenario import Scenario
 from ethbrake_marl.worlds.table import CsvFile
 
-Naming = Callable[[Entry, int | None], str]  # (entry, row or None) -> how an error message names a value or a column
-
 
 def worlds_from_state(scenario: Scenario, initial_state: Mapping[str, Any]) -> State:
     """Return one world from ``{"gaps_m": [7, 7], "speeds_mps": [20, 18, 20], ...}``; one number is for all vehicles.
@@ -40,12 +38,7 @@ def worlds_from_state(scenario: Scenario, initial_state: Mapping[str, Any]) -> S
             right = "must be one number" if RULES[key].per == "world" else several
             raise InvalidInput(f"{where}: {key} has shape {list(numbers.shape)}; {right}")
         columns |= {(key, i): number for i, number in enumerate(np.broadcast_to(numbers, (count,))[:, np.newaxis])}
-
-    def name(entry: Entry, row: int | None) -> str:
-        key, index = entry
-        return f"{where}: {key}" if RULES[key].per == "world" else f"{where}: {key}[{index}]"
-
-    return _worlds(scenario, columns, where, name)
+    return _worlds(scenario, columns, where)
 
 
 def worlds_from_table(scenario: Scenario, columns: Any) -> State:
@@ -74,11 +67,7 @@ def worlds_from_table(scenario: Scenario, columns: Any) -> State:
     if len({array.shape for array in arrays}) != 1 or arrays[0].ndim != 1:
         shapes = ", ".join(f"{name} {list(array.shape)}" for name, array in zip(header, arrays, strict=True))
         raise InvalidInput(f"{where}: all columns must be lists of the same length; they have the shapes {shapes}")
-
-    def name(entry: Entry, row: int | None) -> str:
-        return f"{where}{'' if row is None else f', row {row}'}, column {RULES[entry[0]].column_of(entry[1])}"
-
-    return _worlds(scenario, dict(zip(entries, arrays, strict=True)), where, name)
+    return _worlds(scenario, dict(zip(entries, arrays, strict=True)), where, lambda row: f", row {row}")
 
 
 def read_worlds(scenario: Scenario, path: str | Path) -> State:
@@ -89,12 +78,8 @@ def read_worlds(scenario: Scenario, path: str | Path) -> State:
     file = CsvFile.read(Path(path).expanduser())
     entries = _entries(file.header, scenario, f"{file.path}, line 1")
     table = np.array(file.cells(file.header), np.float64)
-
-    def name(entry: Entry, row: int | None) -> str:
-        place = "" if row is None else f", line {file.lines[row]}"
-        return f"{file.path}{place}, column {RULES[entry[0]].column_of(entry[1])}"
-
-    return _worlds(scenario, dict(zip(entries, table.T, strict=True)), str(file.path), name)
+    columns = dict(zip(entries, table.T, strict=True))
+    return _worlds(scenario, columns, str(file.path), lambda row: f", line {file.lines[row]}")
 
 
 def given_keys(scenario: Scenario) -> tuple[str, ...]:
@@ -133,8 +118,13 @@ def _entries(header: Sequence[str], scenario: Scenario, where: str) -> list[Entr
     return [known[name] for name in header]
 
 
-def _worlds(scenario: Scenario, given: Mapping[Entry, Floats], where: str, name: Naming) -> State:
-    """Return worlds of the columns ``given``, each [n], filled in with what the scenario fixes, and checked."""
+def _worlds(
+    scenario: Scenario, given: Mapping[Entry, Floats], where: str, row_text: Callable[[int], str] | None = None
+) -> State:
+    """Return worlds of the columns ``given``, each [n], filled in with what the scenario fixes, and checked.
+
+    ``row_text`` names a row in error messages; None: there is one world, whose values are named by their keys.
+    """
     if scenario.members:
         raise InvalidInput(
             f"{where}: scenario {scenario.name!r} is a mixture, so it is unknown to which of its scenarios a"
@@ -142,10 +132,15 @@ def _worlds(scenario: Scenario, given: Mapping[Entry, Floats], where: str, name:
         )
     n, N = len(next(iter(given.values()))) if given else 1, scenario.vehicles
 
-    def require(good: Bools, entry: Entry, column: Floats, right: str) -> None:
+    def name(key: str, i: int) -> str:
+        by_key = f": {key}" if RULES[key].per == "world" else f": {key}[{i}]"
+        return by_key if row_text is None else f", column {RULES[key].column_of(i)}"
+
+    def require(good: Bools, key: str, i: int, column: Floats, right: str) -> None:
         if not good.all():
             row = int(np.argmin(good))
-            raise InvalidInput(f"{name(entry, row)} = {column[row]:.12g}: {right}")
+            place = f"{where}{row_text(row) if row_text else ''}{name(key, i)}"
+            raise InvalidInput(f"{place} = {column[row]:.12g}: {right}")
 
     def fixed(key: str) -> Floats:
         low, high = scenario.ends(key)
@@ -157,12 +152,10 @@ def _worlds(scenario: Scenario, given: Mapping[Entry, Floats], where: str, name:
         for i in range(whole.shape[1]):
             column = whole[:, i] = given.get((key, i), known[:, i])
             if (key, i) not in given and np.isnan(column).any():
-                missing = name((key, i), None).removeprefix(f"{where}, ").removeprefix(f"{where}: ")
-                raise InvalidInput(
-                    f"{where}: {missing} is missing; scenario {scenario.name!r} has no fixed value for it"
-                )
+                right = f"is missing; scenario {scenario.name!r} has no fixed value for it"
+                raise InvalidInput(f"{where}: {name(key, i)[2:]} {right}")
             good = (column > 0.0 if rule.positive else column >= 0.0) & (column <= rule.high)
-            require(good, (key, i), column, f"must be {rule.interval}")
+            require(good, key, i, column, f"must be {rule.interval}")
         return whole
 
     whole = world_values(scenario, fixed, settle)
@@ -171,12 +164,12 @@ def _worlds(scenario: Scenario, given: Mapping[Entry, Floats], where: str, name:
     for i in range(N):
         latency, speed, limit = (whole[key][:, i] for key in ("latency_s", "speeds_mps", "speed_limit_mps"))
         right = f"must be below horizon_s of the scenario ({scenario.horizon_s:g} s)"
-        require(latency < scenario.horizon_s, ("latency_s", i), latency, right)
+        require(latency < scenario.horizon_s, "latency_s", i, latency, right)
         right = f"must not be above speed_limit_mps of vehicle_{i + 1}, {limit[np.argmin(speed <= limit)]:g} m/s"
-        require(speed <= limit, ("speeds_mps", i), speed, right)
+        require(speed <= limit, "speeds_mps", i, speed, right)
     weights = whole.get("harm_weight", np.ones((n, 1)))
     right = f"the weight of at least one vehicle must be {LEAST_WEIGHT:g} or more"
-    require((weights >= LEAST_WEIGHT).any(axis=1), ("harm_weight", 0), weights[:, 0], right)
+    require(np.asarray((weights >= LEAST_WEIGHT).any(axis=1)), "harm_weight", 0, weights[:, 0], right)
     line = scenario.types_of_line
     equipment_drawn = line is not None and any(kind.v2x is not None for kind in line.kinds)
     if scenario.v2x.drawn or equipment_drawn:

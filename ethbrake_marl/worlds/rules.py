@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from ethbrake_marl.files.model import UNITS, UNSHOWN, require
+from ethbrake_marl.files.yaml import YamlPath
 from ethbrake_marl.motion.layout import BRAKE_RATE, BRAKING, DRIVING, LATENCY, LIMIT, MASS, RELEASE_RATE, WEIGHT
 from ethbrake_marl.worlds.quantity import DISTRIBUTIONS, support
 
@@ -45,20 +46,10 @@ class Rule(NamedTuple):
     stream: tuple[int, ...] = MAIN
 
     @property
-    def symbol(self) -> str:
-        """Symbol of the unit, such as ``m/s2``; empty for a plain number."""
-        return {"mps": "m/s", "mps2": "m/s2", "mps3": "m/s3"}.get(self.unit, self.unit)
-
-    @property
-    def label(self) -> str:
-        """Name in words and unit, for the axis of a figure: ``braking capacity (m/s²)``."""
-        words = self.key.removesuffix(f"_{self.unit}").replace("_", " ")
-        return f"{words} ({self.symbol.replace('s2', 's²').replace('s3', 's³')})" if self.unit else words
-
-    @property
     def interval(self) -> str:
         """Allowed range for error messages: ``finite and in (0, 1000] t (tonnes)``."""
-        unit = f" {self.symbol} ({UNITS[self.unit]})" if self.unit else ""
+        symbol = {"mps": "m/s", "mps2": "m/s2", "mps3": "m/s3"}.get(self.unit, self.unit)
+        unit = f" {symbol} ({UNITS[self.unit]})" if self.unit else ""
         return f"finite and in {'(' if self.positive else '['}{self.low:g}, {self.high:g}]{unit}"
 
     @property
@@ -73,7 +64,7 @@ class Rule(NamedTuple):
         """Return whether all values from ``low`` to ``high`` are allowed; False for NaN."""
         return (low > 0.0 if self.positive else low >= self.low) and high <= self.high
 
-    def check(self, quantity: Any, at: tuple[int, ...] = ()) -> None:
+    def check(self, quantity: Any, at: YamlPath = ()) -> None:
         """Raise, in a pydantic validator, the error for a number or distribution out of range."""
         low, high = support(quantity)
         overlap = "; a negative gap means overlapping vehicles" if self.per == "pair" and low < 0.0 else ""
@@ -209,11 +200,11 @@ def width_of(stream: tuple[int, ...], vehicles: int) -> int:
     return BLOCK * vehicles if stream in (MAIN, BRAKES) else OF_WORLD
 
 
-def check_count(value: Any, count: int, per: str) -> None:
+def check_count(value: Any, count: int, per: str, at: YamlPath = ()) -> None:
     """Raise, in a pydantic validator, the error for a list that does not have ``count`` entries."""
     right = f"must have {count}, one per {per}, or be a single entry for all"
     holds = not isinstance(value, tuple) or len(value) == count
-    require(holds, (), UNSHOWN, f"has {len(value) if isinstance(value, tuple) else 1} entries; {right}")
+    require(holds, at, UNSHOWN, f"has {len(value) if isinstance(value, tuple) else 1} entries; {right}")
 
 
 def table_columns(keys: tuple[str, ...], vehicles: int) -> dict[str, Entry]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.episode.state import NUMBER, State
+from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import at_alert, begin
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion import layout
@@ -173,6 +173,7 @@ def _merged(parts: Sequence[Drawn], place: Ints) -> Drawn:
             begins += len(array)
         return whole
 
-    worlds = State(*map(merged, zip(*(part.worlds[:5] for part in parts), strict=True)), memories={})
-    columns = map(merged, zip(*(part[1:5] for part in parts), strict=True))
-    return Drawn(worlds, *columns, rejected=sum(part.rejected for part in parts))
+    line, car, clock, know, wanted = map(merged, zip(*(part.worlds[:5] for part in parts), strict=True))
+    friction, types, scenarios, recordings = map(merged, zip(*(part[1:5] for part in parts), strict=True))
+    worlds, rejected = State(line, car, clock, know, wanted, {}), sum(part.rejected for part in parts)
+    return Drawn(worlds, friction, types, scenarios, recordings, rejected)

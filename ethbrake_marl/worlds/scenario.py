@@ -30,7 +30,7 @@ from ethbrake_marl.worlds.roles import LEARNER, Roles, check_role, check_vehicle
 from ethbrake_marl.worlds.rules import OF_A_TYPE, OPTIONAL, RECORDING, RULES, USUAL, Entry, check_count, table_columns
 from ethbrake_marl.worlds.sampling import Drawn, draw
 from ethbrake_marl.worlds.table import Table, TableColumn
-from ethbrake_marl.worlds.vehicle_types import Types, TypesOfLine, VehicleTypes, check_types
+from ethbrake_marl.worlds.vehicle_types import Types, TypesOfLine, VehicleTypes
 from ethbrake_marl.worlds.wording import ScenarioWording
 
 Listed = Annotated[tuple[str, ...], Field(strict=False)]
@@ -136,13 +136,6 @@ class Scenario(Part):
         scenario = cls.__new__(cls)
         _build(scenario, document)
         return scenario
-
-    @field_validator("types")
-    @classmethod
-    def _types(cls, value: Any, info: ValidationInfo) -> Any:
-        if {"vehicles", "vehicle_types"} <= info.data.keys():
-            check_types(value, info.data["vehicle_types"], info.data["vehicles"])
-        return value
 
     @field_validator("table")
     @classmethod
@@ -331,7 +324,7 @@ class Scenario(Part):
 
     def declared(self) -> dict[str, Any]:
         """Return what is declared as plain data: ``Scenario(**scenario.declared())`` equals the scenario."""
-        return plain(self)
+        return self.model_dump(mode="json", exclude_unset=True, exclude_none=True)
 
     def content(self, without: Sequence[str] = ()) -> dict[str, Any]:
         """Return every value, defaults too, as plain data, except the keys ``without``; of members without words."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass, field as data_field
+from dataclasses import dataclass
 from operator import not_
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -31,16 +31,12 @@ Cell = Annotated[
 Row = Annotated[tuple[Cell, ...], Field(strict=False)]
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class TableColumn:
     """A column of a table, which is drawn like a distribution."""
 
-    name: str
-    rows: NDArray[Any] = data_field(compare=False)  # value of each row; texts in the column ``recording``
-    weights: Floats = data_field(compare=False)  # of each row
-
-    def __repr__(self) -> str:
-        return f"column {self.name} of the table"
+    rows: NDArray[Any]  # value of each row; texts in the column ``recording``
+    weights: Floats  # of each row
 
     @property
     def support(self) -> tuple[float, float]:
@@ -111,7 +107,7 @@ class Table(Part):
         rows = self.rows or ()
         weights = np.asarray(self.weights if isinstance(self.weights, tuple) else (1.0,) * len(rows))
         columns = zip(self.columns, zip(*rows, strict=True), strict=True)
-        return {name: TableColumn(name, np.array(column), weights) for name, column in columns}
+        return {name: TableColumn(np.array(column), weights) for name, column in columns}
 
 
 class CsvFile(NamedTuple):

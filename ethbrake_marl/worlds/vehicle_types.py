@@ -106,13 +106,15 @@ Types = Annotated[
 
 def check_types(types: Any, kinds: Mapping[str, VehicleType] | None, vehicles: int) -> None:
     """Raise, in a pydantic validator, the error for an entry of the key ``types`` that names no declared type."""
-    require(kinds is not None, (), types, "can be used only with the key vehicle_types, which declares the types")
-    check_count(types, vehicles, "vehicle")
+    require(
+        kinds is not None, ("types",), types, "can be used only with the key vehicle_types, which declares the types"
+    )
+    check_count(types, vehicles, "vehicle", ("types",))
     known = [*(kinds or {}), ANY]
     for index, entry in enumerate(types if isinstance(types, tuple) else (types,)):
         for name in [entry] if isinstance(entry, str) else entry:
             hint = suggestion(name, known) or f"known: {', '.join(known)}"
-            at = (index,) if isinstance(types, tuple) else ()
+            at = ("types", index) if isinstance(types, tuple) else ("types",)
             good = name in known and (name != ANY or isinstance(entry, str))
             require(good, at, entry, f"unknown vehicle type {name}; {hint}")
 

@@ -102,14 +102,14 @@ QUANTITIES_AND_ROLES: dict[str, Callable[[], object]] = {
     "line 5: gaps_m.loguniform = [0, 1]: low must be above 0": lambda: given(gaps_m="{loguniform: [0, 1]}"),
     "line 9: mass_t[1] (vehicle_2) = -5.5: must be finite and in (0, 1000] t": lambda: given(mass_t="[4.5, -5.5, 5.9]"),
     "line 7: braking_capacity_mps2 = 0: must be finite and in (0, 100] m/s2": lambda: given(braking_capacity_mps2="0"),
-    "line 6: speeds_mps[2] (vehicle_3) = {choice: [3, 41]}: vehicle_3 has a speed of 3 to 41 m/s; its speed must be from 0 to": lambda: (
-        given(speeds_mps="[1, 2, {choice: [3, 41]}]")
+    "line 6: speeds_mps[2] (vehicle_3) = {choice: [3, 41]}: vehicle_3 has a speed of 3 to 41": lambda: given(
+        speeds_mps="[1, 2, {choice: [3, 41]}]"
     ),
     "vehicle_1 has a speed of 20 m/s; its speed must be from 0 to its speed_limit_mps, 19 m/s": lambda: given(
         speed_limit_mps="{uniform: [19, 40]}"
     ),
-    "line 10: latency_s[2] (vehicle_3) = 8: vehicle_3 may not be able to act until 8 s; this time must be below": lambda: (
-        given(latency_s="[0, 0.5, 8]")
+    "line 10: latency_s[2] (vehicle_3) = 8: vehicle_3 may not be able to act until 8 s; this": lambda: given(
+        latency_s="[0, 0.5, 8]"
     ),
     "line 12: restitution = 1.01: must be finite and in [0, 1]": lambda: given(restitution="1.01"),
     "line 3: time_step_s = 9: must not be above horizon_s (8 s)": lambda: given(time_step_s="9"),

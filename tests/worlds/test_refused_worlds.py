@@ -88,7 +88,7 @@ GIVEN: dict[str, Callable[[], object]] = {
     "initial states: gap_1_m = [True, 2, 3]: must be a number or a list of numbers; no booleans, texts": lambda: (
         worlds_from_table(PAPER, COLUMNS | {"gap_1_m": [True, 2, 3]})
     ),
-    "initial states: gap_1_m = [[1], [2, 3]]: must be a number or a list of numbers: setting an array element": lambda: (
+    "initial states: gap_1_m = [[1], [2, 3]]: must be a number or a list of numbers: setting an array": lambda: (
         worlds_from_table(PAPER, COLUMNS | {"gap_1_m": [[1], [2, 3]]})
     ),
     "initial states, row 1, column speed_2_mps = nan: must be finite and in [0, 200] m/s (metres": lambda: (
