@@ -51,19 +51,15 @@ def sentences(scenario: Scenario) -> Iterator[str]:
     yield f"{scenario.vehicles} vehicles in line, vehicle_1 in front, {obstacle}. Learners: {learners}."
     for script in dict.fromkeys(role for role in scenario.roles.values() if role != LEARNER):
         yield f"Script {script}: {', '.join(name for name, role in scenario.roles.items() if role == script)}."
-    about = {key.name: key.about for key in listed_keys()}
-    values = {key: value for key, value in scenario if key not in ("name", "title", "description", "roles", "vehicles")}
-    if scenario.mixture is not None:
-        values["mixture"] = {
-            each.name: entry.weight for each, entry in zip(scenario.members, scenario.mixture, strict=True)
-        }
-    if scenario.table is not None:
-        values["table"] = (
-            f"{len(scenario.table.rows or ()):,} rows with the columns {', '.join(scenario.table.columns)}"
-        )
-    for key, value in values.items():
-        if value is not None and (key not in RULES or not scenario.members):
-            yield f"{key}: {flow_text(value)} ({about[key]})."
+    for key in listed_keys():
+        value = getattr(scenario, key.name)
+        if key.name == "mixture" and value is not None:
+            value = {each.name: entry.weight for each, entry in zip(scenario.members, value, strict=True)}
+        if key.name == "table" and value is not None:
+            value = f"{len(value.rows):,} rows with the columns {', '.join(value.columns)}"
+        own = key.name in RULES and scenario.members  # a mixture itself has no quantities
+        if key.name not in ("name", "title", "description", "vehicles", "roles") and value is not None and not own:
+            yield f"{key.name}: {flow_text(value)} ({key.about})."
 
 
 # ---- a new file
@@ -122,4 +118,9 @@ def new_scenario_text(name: str, based_on: str = "paper-random", *, rows_file: s
 
 def scenario_json_schema() -> dict[str, Any]:
     """Return the JSON Schema of a scenario file, with which editors complete and check YAML."""
-    return FileSchema.publish(Scenario.model_json_schema(schema_generator=FileSchema))
+    schema = Scenario.model_json_schema(schema_generator=FileSchema)
+    for properties in (schema["properties"], schema["$defs"]["VehicleType"]["properties"]):
+        for key in properties.keys() & RULES.keys():
+            properties[key]["allOf"] = [{"$ref": f"#/$defs/range_{key}"}]
+    ranges = {f"range_{key}": rule.schema for key, rule in RULES.items()}
+    return FileSchema.publish({**schema, "$defs": {**schema["$defs"], **ranges}})

@@ -54,11 +54,10 @@ class Rule(NamedTuple):
 
     @property
     def schema(self) -> dict[str, Any]:
-        """JSON Schema of the range, in lists and distributions too, with which editors check a file."""
-        number = {"exclusiveMinimum" if self.positive else "minimum": self.low, "maximum": self.high}
-        shape = {**number, "items": number, "properties": {"low": number, "high": number}}
-        quantity = {**number, "properties": dict.fromkeys((*DISTRIBUTIONS, "with_load"), shape)}
-        return {"allOf": [{**quantity, "items": quantity}]}
+        """JSON Schema of the range, in lists and distributions too, as ``#/$defs/range_KEY`` of a file's schema."""
+        inside = {"$ref": f"#/$defs/range_{self.key}"}
+        limits = {"exclusiveMinimum" if self.positive else "minimum": self.low, "maximum": self.high, "items": inside}
+        return {**limits, "properties": dict.fromkeys(("low", "high", "with_load", *DISTRIBUTIONS), inside)}
 
     def allows(self, low: float, high: float) -> bool:
         """Return whether all values from ``low`` to ``high`` are allowed; False for NaN."""

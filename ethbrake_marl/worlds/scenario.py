@@ -38,7 +38,7 @@ Listed = Annotated[tuple[str, ...], Field(strict=False)]
 
 def _quantity(key: str, default: Any = None, **more: Any) -> Any:
     """Return the field of a quantity."""
-    return Field(default=default, description=RULES[key].meaning, json_schema_extra=RULES[key].schema, **more)
+    return Field(default=default, description=RULES[key].meaning, **more)
 
 
 class Scenario(Part):

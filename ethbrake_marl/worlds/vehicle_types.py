@@ -53,8 +53,7 @@ TypeQuantity = Annotated[Annotated[Quantity, Tag("#one")] | Annotated[WithLoad, 
 
 def _own(key: str) -> Any:
     """Return the field of a quantity that a type may declare."""
-    rule, hidden = RULES[key], None if key in USUAL else not_
-    return Field(default=None, exclude_if=hidden, description=rule.meaning, json_schema_extra=rule.schema)
+    return Field(default=None, exclude_if=None if key in USUAL else not_, description=RULES[key].meaning)
 
 
 class VehicleType(Part):

@@ -8,16 +8,19 @@ from collections import UserDict, UserList, deque
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import numpy as np
 import pytest
 
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.state import NUMBER
+from ethbrake_marl.errors import AlreadyExists
 from ethbrake_marl.files.yaml import read_yaml
 from ethbrake_marl.worlds import catalogue, explain
 from ethbrake_marl.worlds.catalogue import group_of_scenarios, list_scenarios, load_scenario
 from ethbrake_marl.worlds.counters import numbers_of
 from ethbrake_marl.worlds.describe import clusters_of, kinds_of
+from ethbrake_marl.worlds.rules import RULES
 from ethbrake_marl.worlds.scenario import Scenario
 from tests.refused import refused
 
@@ -288,7 +291,14 @@ def test_catalogue__has_groups_names_and_paths(empty_folder: Path, monkeypatch: 
         assert load_scenario(path).name == "mine"
     monkeypatch.setattr(catalogue, "FOLDERS", {})
     catalogue.register_scenarios("~")
+    catalogue.register_scenarios("~")
     assert [entry.name for entry in list_scenarios() if not entry.shipped] == ["mine"]
+    Path("sub").mkdir()
+    with refused("folder of scenarios 'sub': has no file that ends in .yaml"):
+        catalogue.register_scenarios("sub")
+    Path("sub/paper-random.yaml").touch()
+    with refused("already has the name 'paper-random'; rename the file", AlreadyExists):
+        catalogue.register_scenarios("sub")
 
 
 def test_keys__have_ranges_and_defaults() -> None:
@@ -296,3 +306,30 @@ def test_keys__have_ranges_and_defaults() -> None:
     assert keys["mass_t"][1:] == ("", "finite and in (0, 1000] t (tonnes)", "mass of each vehicle")
     assert keys["horizon_s"].default == "8"
     assert keys["early_impacts"].default == "keep"
+
+
+def test_sentences__say_what_each_key_means() -> None:
+    said = [*explain.sentences(line(v2x="congested", roles={"vehicle_3": "coast", "vehicle_2": "learner"}))]
+    assert said[1] == "3 vehicles in line, vehicle_1 in front, no obstacle ahead. Learners: vehicle_2."
+    assert said[2:4] == ["Script full_brake: vehicle_1.", "Script coast: vehicle_3."]
+    assert "mass_t: [4.5, 5.5, 5.9] (mass of each vehicle)." in said
+    assert any(each.startswith("v2x: {preset: congested} (what each vehicle knows") for each in said)
+    mixed = [*explain.sentences(load_scenario("mixture-delays"))]
+    assert any(each.startswith("mixture: {") for each in mixed)
+    assert not any(each.startswith("mass_t: ") for each in mixed)
+
+
+def test_json_schema__accepts_what_the_reader_accepts() -> None:
+    editor = jsonschema.Draft202012Validator(explain.scenario_json_schema())
+    for entry in list_scenarios():
+        assert not [*editor.iter_errors(read_yaml(entry.path).content)], entry.name
+    for key, rule in RULES.items():
+        inside, outside = rule.high, np.nextafter(rule.high, np.inf)
+        for content in ({key: inside}, {key: {"uniform": [inside, inside]}}):
+            assert editor.is_valid({"name": "x", **content}), key
+        low = {"normal": {"mean": inside, "sd": 1, "low": -201, "high": inside}}
+        for wrong in (outside, [inside, outside], {"choice": [inside, outside]}, low):
+            assert not editor.is_valid({"name": "x", key: wrong}), key
+    heavy = {"car": {"mass_t": {"with_load": [1, 1001]}}}
+    for wrong in ({"vehicle_types": heavy}, {"v2x": "nominl"}, {"zzz": 1}, {"name": "Bad Name"}):
+        assert not editor.is_valid({"name": "x", **wrong}), wrong
