@@ -40,15 +40,14 @@ def _check_declared_once(scenario: Scenario) -> None:
         by = "every vehicle type declares it" if by_types else "the table has columns of it for all"
         twice = key in scenario.model_fields_set and (by_types or by_table)
         require(not twice, (key,), value, f"must be left out, because {by}")
-        other = ALTERNATIVES.get(key, key)
-        either = (value is not None or by_types or bool(columns)) and getattr(scenario, other) is not None
-        require(
-            other == key or not either, (other,), getattr(scenario, other), f"give either {key} or {other}, not both"
-        )
+        if key in ALTERNATIVES and (value is not None or columns):
+            other, of_table = ALTERNATIVES[key], " (of which the table has columns)" if columns else ""
+            right = f"give either {key}{of_table} or {other}, not both"
+            require(getattr(scenario, other) is None, (other,), getattr(scenario, other), right)
         if value is None and not (by_types or by_table):
             right = f"vehicle type {''.join(silent[:1])} does not declare {key}; declare {key} in this type, or outside"
             require(len(silent) == len(kinds), (key,), UNSHOWN, f"{right} vehicle_types for all types without it")
-            if columns or (key in USUAL and getattr(scenario, other) is None):
+            if columns or (key in USUAL and getattr(scenario, ALTERNATIVES.get(key, key)) is None):
                 raise PydanticCustomError("missing", "missing", {"at": (key,)})
     alone = "speed_deviations_mps" in scenario.model_fields_set and scenario.line_speed_mps is None
     right = "can be used only with line_speed_mps, the speed to which the deviations are added"

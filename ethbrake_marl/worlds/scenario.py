@@ -347,13 +347,10 @@ class Scenario(Part):
         """
         if isinstance(learners, str) or not isinstance(learners, Iterable):
             raise InvalidInput(f"learners = {learners!r}: must be a list of vehicles, for instance ['vehicle_2']")
-        chosen: list[str] = []
-        for learner in learners:
-            by_number = not isinstance(learner, bool | str)
-            name = [name for i, name in enumerate(self.vehicle_names) if learner == (i if by_number else name)]
-            if not name:
-                raise unknown_name("vehicle", learner, self.vehicle_names)
-            chosen += name
+        numbered: dict[Any, str] = dict(enumerate(self.vehicle_names))
+        chosen = [str(each if isinstance(each, bool) else numbered.get(each, each)) for each in learners]
+        if unknown := [name for name in chosen if name not in self.vehicle_names]:
+            raise unknown_name("vehicle", unknown[0], self.vehicle_names)
         if twice := {name for name in chosen if chosen.count(name) > 1}:
             raise InvalidInput(f"learners: {', '.join(sorted(twice))} is listed twice")
         stay = {name: "full_brake" if role == LEARNER else role for name, role in self.roles.items()}
