@@ -54,7 +54,7 @@ def test_table__may_be_a_data_frame() -> None:
     assert bits(worlds_from_table(PAPER, {name: frame[name] for name in COLUMNS})) == expected
     assert bits(worlds_from_table(PAPER, pyarrow.table(COLUMNS))) == expected
     other = {**COLUMNS, "gap_1_m": frame["gap_1_m"], "gap_2_m": frame["gap_2_m"].sort_index()}
-    with refused("initial states: columns 'gap_1_m' and 'gap_2_m' have different pandas indexes; give them the same"):
+    with refused("initial states: columns have different pandas indexes; give them the same"):
         worlds_from_table(PAPER, other)
     with refused("initial states = 3: must be a mapping from columns to lists of numbers, a data frame or a"):
         worlds_from_table(PAPER, 3)
