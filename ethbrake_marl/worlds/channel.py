@@ -23,15 +23,21 @@ from operator import not_
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
-from pydantic import Field, GetJsonSchemaHandler, model_validator
+from pydantic import ConfigDict, Field, GetJsonSchemaHandler, model_validator
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.files.model import NAME_PATTERN, Wording, read_model, require
+from ethbrake_marl.files.model import NAME_PATTERN, UNSHOWN, Wording, read_model, require, suggestion
 from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.motion.layout import Bools, Floats, Ints
+from ethbrake_marl.registry import Registry
+from ethbrake_marl.worlds.counters import Numbers
 from ethbrake_marl.worlds.quantity import Part
+
+if TYPE_CHECKING:
+    from ethbrake_marl.episode.game import Game
+    from ethbrake_marl.worlds.scenario import Scenario
 
 PER_LINK = 4  # uniform numbers of a link: wait, burst, loss, hop
 
@@ -93,19 +99,23 @@ class Channel(NamedTuple):
         delay[u[..., 2] < self.lost] = np.inf
         return delay
 
-    def news(self, own_latency: Floats, u: Floats, equipped: Equipped) -> tuple[Floats, Floats]:
-        """Return when each vehicle can react, [n, N] s, and from when it acts on news of each other, [n, N, N] s.
+    def heard_and_seen(self, u: Floats, equipped: Equipped) -> tuple[Floats, Floats]:
+        """Return when i can use the first message of j, and the delay until i sees j, [n, N, N] s each.
 
-        ``u`` [n, PER_LINK N^2] are the uniform numbers of the links. Infinite: never.
+        ``u`` [n, PER_LINK N^2] are the uniform numbers of the links. Infinite: never. Minus infinite: at once.
         """
-        n, N = own_latency.shape
-        links, (receiver, sender) = u.reshape(n, N, N, PER_LINK), np.indices((N, N))
+        N = equipped.sends.shape[1]
+        links, (receiver, sender) = u.reshape(len(u), N, N, PER_LINK), np.indices((N, N))
         unheard = {"all": sender < 0, "front": sender >= receiver, "none": sender >= 0}[self.hears]
         heard = np.where(unheard | equipped.unheard, np.inf, self.first_message_s(links))
         ahead = sender == receiver - 1
         in_sight = {"both": ahead | (sender == receiver + 1), "front": ahead, "none": sender < 0}[self.senses]
         low, high = self.sensing_s
-        seen = np.where(in_sight, low + (high - low) * links[..., 3], np.inf)
+        return heard, np.where(in_sight, low + (high - low) * links[..., 3], np.inf)
+
+    def news(self, own_latency: Floats, u: Floats, equipped: Equipped) -> tuple[Floats, Floats]:
+        """Return when each vehicle can react, [n, N] s, and from when it acts on news of each other, [n, N, N] s."""
+        N, (heard, seen) = own_latency.shape[1], self.heard_and_seen(u, equipped)
         latency = own_latency.copy()
         for i in range(1, N if self.timing != "latency" else 0):
             first = np.minimum(heard[:, i, 0], latency[:, i - 1] + seen[:, i, i - 1])
@@ -187,7 +197,12 @@ OF_MESSAGES = ("message_period_s", "loss_begins", "loss_ends", "radio_s", "proce
 
 
 class V2X(Part):
-    """The key ``v2x`` of a scenario: the name of a preset, or a mapping with settings that differ from a preset."""
+    """The key ``v2x`` of a scenario: the name of a preset, or a mapping with settings that differ from a preset.
+
+    Other packages may add keys (``EXTENSIONS``).
+    """
+
+    model_config = ConfigDict(extra="allow")
 
     preset: str = Field(default="paper", description="preset whose values are used for keys that are left out")
     hears: Hears | None = Field(
@@ -230,18 +245,26 @@ class V2X(Part):
         name = value.get("preset", "paper") if isinstance(value, dict) else value
         right = f"must be a preset ({', '.join(CHANNELS)}), or a mapping such as {{preset: nominal, lost: 0.1}}"
         require(isinstance(value, V2X) or (isinstance(name, str) and name in CHANNELS), (), name, right)
-        return value
+        if not isinstance(value, dict):
+            return value
+        known = cls.model_fields
+        for key in value.keys() - known.keys():
+            close = suggestion(str(key), [*known, *EXTENSIONS]) or f"known: {', '.join((*known, *EXTENSIONS))}"
+            require(key in EXTENSIONS, (key,), UNSHOWN, f"unknown key; {close}")
+        return {key: each if key in known else EXTENSIONS[key].read(key, each) for key, each in value.items()}
 
     @model_validator(mode="after")
     def _possible(self) -> V2X:
         channel, timing = self.channel, self.channel.timing
+        used = [key for extension in self.extensions for key in extension.uses(self)]
         useless: dict[str, str] = {}  # key -> why it has no effect
         if channel.senses == "none":
             useless |= {"sensing_s": "senses: none means that no vehicle is in sight"}
         if timing == "latency":
             useless |= dict.fromkeys((*OF_MESSAGES, "vehicles"), f"preset {self.preset} generates no messages")
         if timing == "fixed":
-            useless |= dict.fromkeys(OF_MESSAGES, "link_latency_s fixes the delay of messages")
+            unused = [key for key in OF_MESSAGES if key not in used]
+            useless |= dict.fromkeys(unused, "link_latency_s fixes the delay of messages")
         if channel.hears == "none":
             unheard = ("link_latency_s", "lost", "vehicles", *OF_MESSAGES)
             useless |= dict.fromkeys(unheard, "hears: none means that no vehicle gets messages")
@@ -258,7 +281,10 @@ class V2X(Part):
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        return {"anyOf": [{"enum": list(CHANNELS), "type": "string"}, handler(core)]}
+        mapping = handler(core)
+        added = {key: extension.schemas[key] for key, extension in EXTENSIONS.usable().items()}
+        mapping = {**mapping, "properties": {**mapping["properties"], **added}, "additionalProperties": False}
+        return {"anyOf": [{"enum": list(CHANNELS), "type": "string"}, mapping]}
 
     @property
     def extensions(self) -> tuple[Extension, ...]:

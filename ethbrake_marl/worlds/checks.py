@@ -85,6 +85,8 @@ def _check_reactions(scenario: Scenario) -> None:
         key = "v2x" if latest > own[i] else "latency_s" if scenario.alert_s is None else "alert_s"
         right = f"vehicle_{i + 1} may not be able to act until {latest:g} s; this time must be below {horizon}"
         require(latest < scenario.horizon_s, *_entry(scenario, key, i), right)
+    for extension in v2x.extensions:
+        extension.check(scenario)
 
 
 def _check_roles(scenario: Scenario) -> None:

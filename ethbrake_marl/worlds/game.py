@@ -66,7 +66,10 @@ def game_of(
         reward, loaded.objective, loaded.vehicles, bodies, (loaded.time_step_s, loaded.horizon_s), reward_vector
     )
     views = (View(), *views_of(loaded))
-    return loaded, Game(Pool(loaded), loaded.name, rules, rewarding, views, bodies, scripts or {})
+    game = Game(Pool(loaded), loaded.name, rules, rewarding, views, bodies, scripts or {})
+    for extension in (loaded.members or (loaded,))[0].v2x.extensions:  # members of a mixture have the same
+        game = extension.game(game)
+    return loaded, game
 
 
 def views_of(scenario: Scenario) -> tuple[View, ...]:

@@ -177,8 +177,11 @@ def _worlds(
             " when; worlds of your own need a channel in which this is not random, for instance"
             " scenario.replace(v2x='paper')"
         )
-    links = np.zeros((n, PER_LINK * N * N)) if scenario.v2x.by_link else None
-    return state_of(scenario, whole, links, scenario.equipped(), np.full(n, -1))
+
+    def no_chance(width: int, stream: tuple[int, ...]) -> Floats:
+        return np.zeros((n, width))
+
+    return state_of(scenario, whole, no_chance, scenario.equipped(), np.full(n, -1))
 
 
 def _numbers(what: str, value: Any) -> Floats:

@@ -98,3 +98,13 @@ def _check_alike(where: str, members: Sequence[Scenario]) -> None:
                 f"{where}: mixture: {key} must be the same in all scenarios of the mixture, but {members[0].name} has"
                 f" {one} and {last.name} has {other}; to use one {key} for all, write it next to the key mixture"
             )
+    first = members[0]
+    for giver, silent in ((first, last), (last, first)):
+        for extension in giver.v2x.extensions:
+            if extension not in silent.v2x.extensions:
+                keys = " or ".join(f"v2x.{key}" for key in extension.keys)
+                raise InvalidInput(
+                    f"{where}: mixture: scenario {giver.name} has the key {keys}, but scenario {silent.name} does not;"
+                    " write one of them in every scenario of the mixture"
+                )
+            extension.check_alike(f"{where}: mixture", first, last)

@@ -67,9 +67,8 @@ def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> Drawn:
     whole = world_values(scenario, declared)
     if scenario.has_obstacle:
         whole["obstacle_gap_m"] = obstacle_gap(scenario, whole, declared)
-    links = numbers(PER_LINK * N * N, NEWS) if scenario.v2x.by_link else None
     return Drawn(
-        state_of(scenario, whole, links, scenario.equipped(kind), index),
+        state_of(scenario, whole, numbers, scenario.equipped(kind), index),
         whole["friction"][:, 0] if "friction" in whole else np.full(n, np.nan),
         np.full((n, N), "") if line is None else np.array(line.names)[kind],
         np.full(n, ""),
@@ -114,8 +113,8 @@ def state_of(scenario: Scenario, whole: Values, numbers: Numbers, equipped: Equi
     line, car = np.zeros((n, layout.LINE_ROWS, N + 1)), np.zeros((n, layout.CAR_ROWS, N + 1))
     know, wanted = np.zeros((n, N + 1, N + 1)), np.zeros((n, N + 1))
     latency, known = whole["latency_s"], whole["latency_s"][:, :, np.newaxis]
-    if links is not None:
-        latency, known = scenario.v2x.channel.news(latency, links, equipped)
+    if scenario.v2x.by_link:
+        latency, known = scenario.v2x.channel.news(latency, numbers(PER_LINK * N * N, NEWS), equipped)
     obstacle = whole.get("obstacle_gap_m", np.full((n, 1), FAR_M))
     of_car = [(row, whole[key]) for key, row in CAR_ROWS.items() if key in whole and row != LATENCY]
     of_car += [(LATENCY, latency), (layout.OWN_LATENCY, whole["latency_s"])]
@@ -130,7 +129,8 @@ def state_of(scenario: Scenario, whole: Values, numbers: Numbers, equipped: Equi
         know[rows, 1:, 1:] = known[rows]
     for i, name in enumerate(scenario.vehicle_names):
         wanted[:, i + 1] = first_command(scenario.roles[name], whole["braking_capacity_mps2"][:, i])
-    return at_alert(line, car, know, wanted, index)
+    memories = {each.name: each.at_alert(scenario, numbers, equipped, n) for each in scenario.v2x.extensions}
+    return at_alert(line, car, know, wanted, index)._replace(memories=memories)
 
 
 def _accepted(scenario: Scenario, seed: int, channel: str, index: Ints) -> Drawn:
@@ -144,7 +144,8 @@ def _accepted(scenario: Scenario, seed: int, channel: str, index: Ints) -> Drawn
         if not len(pending):
             return drawn._replace(rejected=rejected)
         again = draw_once(scenario, numbers_of(seed, channel, attempt, index[pending]), index[pending])
-        for whole, part in zip((*drawn.worlds[:5], *drawn[1:5]), (*again.worlds[:5], *again[1:5]), strict=True):
+        drawn.worlds.put(pending, again.worlds, donate=True)
+        for whole, part in zip(drawn[1:5], again[1:5], strict=True):
             whole[pending] = part
         pending = pending[has_early_impact(scenario, again.worlds)]
     learners = ", ".join(scenario.vehicle_names[i - 1] for i in scenario.learners)
@@ -173,7 +174,7 @@ def _merged(parts: Sequence[Drawn], place: Ints) -> Drawn:
             begins += len(array)
         return whole
 
-    line, car, clock, know, wanted = map(merged, zip(*(part.worlds[:5] for part in parts), strict=True))
+    worlds = State.join([part.worlds for part in parts], merged)
     friction, types, scenarios, recordings = map(merged, zip(*(part[1:5] for part in parts), strict=True))
-    worlds, rejected = State(line, car, clock, know, wanted, {}), sum(part.rejected for part in parts)
+    rejected = sum(part.rejected for part in parts)
     return Drawn(worlds, friction, types, scenarios, recordings, rejected)

@@ -27,7 +27,8 @@ from ethbrake_marl.motion.layout import (
 from ethbrake_marl.scenario.tables import worlds_from_table as first_from_table
 from ethbrake_marl.worlds.catalogue import list_scenarios, load_scenario
 from ethbrake_marl.worlds.given import worlds_from_table
-from tests.fixtures.scenarios import SHIPPED
+
+NAMES = [entry.name for entry in list_scenarios()]
 
 
 def as_state(worlds):
@@ -57,7 +58,7 @@ def as_state(worlds):
 
 
 @pytest.mark.parametrize("seed", [7, 2024])
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", NAMES)
 def test_worlds__have_the_bits_of_the_first_edition(name: str, seed: int) -> None:
     channel = "list" if seed == 7 else "training"
     old = first.load_scenario(name).sample(1500, seed, first=seed, channel=channel)
@@ -70,7 +71,7 @@ def test_worlds__have_the_bits_of_the_first_edition(name: str, seed: int) -> Non
         assert other.tolist() == (np.full(other.shape, "") if one is None else one).tolist()
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", NAMES)
 def test_content__is_that_of_the_first_edition(name: str) -> None:
     old, new = first.load_scenario(name), load_scenario(name)
     assert new.declared() == old.declared()
@@ -78,7 +79,7 @@ def test_content__is_that_of_the_first_edition(name: str) -> None:
     assert (new.has_obstacle, [i - 1 for i in new.learners]) == (old.has_obstacle, list(old.learners))
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", NAMES)
 def test_given_worlds__are_those_of_the_first_edition_or_refused_in_its_words(name: str) -> None:
     one, other = first.load_scenario(name), load_scenario(name)
     columns = first.QUANTITY.columns(one.sample(200, 7).worlds)

@@ -227,7 +227,7 @@ def test_mixture__is_world_by_world_that_of_its_members(empty_folder: Path) -> N
 # ---------------------------------------------------------------- the object
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", [entry.name for entry in list_scenarios()])
 def test_shipped_scenario__goes_round(name: str, empty_folder: Path) -> None:
     scenario = load_scenario(name)
     assert Scenario(**scenario.declared()) == scenario
