@@ -66,7 +66,7 @@ $(STAMP): pyproject.toml constraints.txt
 	  exit 1; \
 	fi
 	@echo "== Installing ethbrake_marl"
-	@$(INSTALL) -e .
+	@$(INSTALL) -e ".[report]"
 	@echo "== Compiling the physics in the background"
 	@PYTHONPATH="$(CURDIR)" $(BIN)/python -c "from ethbrake_marl.cli import doctor; raise SystemExit(not doctor.compile_ahead(training=False, run_alone=True)[0])" & \
 	compiling=$$!; \

@@ -59,7 +59,7 @@ autodoc_pydantic_field_show_constraints = False
 # Notebooks are committed with their outputs, and run again here, each in an empty folder. Outputs are kept from build
 # to build until a cell changes; `make clean` forgets them.
 nb_execution_mode = "cache"
-nb_execution_timeout = -1  # however busy the machine is
+nb_execution_timeout = 1200  # s for one cell, on a busy machine that compiles everything
 nb_execution_raise_on_error = True
 nb_execution_in_temp = True
 nb_merge_streams = True

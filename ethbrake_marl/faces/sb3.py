@@ -103,8 +103,8 @@ class EthBrakeVecEnv(VecEnv):
         rows = n * len(self.learners)
         self._return, self._steps, self._begun = np.zeros(rows), np.zeros(rows, np.int64), np.zeros(0)
         self._of_state = scenario.horizon_s, scenario.has_obstacle
-        self.renderer = make_renderer(self, render_mode)
         super().__init__(rows, FeatureBox(self._features()), action_space(actions))
+        self.renderer = make_renderer(self, render_mode)
 
     def _features(self) -> tuple[Feature, ...]:
         views = {self.game.views[i] for i in self.learners}
@@ -137,6 +137,8 @@ class EthBrakeVecEnv(VecEnv):
         self.episode = self.stream.draw(self.n) if worlds is None else self.game.begin(worlds)
         self._return[:], self._steps[:] = 0.0, 0
         self._begun = numbers(self.episode, self.learners)
+        if self.renderer is not None:
+            self.renderer.began(self.episode)
         return self._observe(self.episode)
 
     def step_async(self, actions: Any) -> None:
@@ -167,6 +169,8 @@ class EthBrakeVecEnv(VecEnv):
             new = self.stream.draw(len(ended))
             self.episode = self.episode.put(ended, new, donate=True)
             self._begun[ended] = numbers(new, self.learners)
+        if self.renderer is not None:
+            self.renderer.stepped(self.episode)
         return self._observe(self.episode), reward.astype(np.float32), over.repeat(L), infos
 
     def _close(self, ended: Any, step: Step, infos: list[dict[str, Any]]) -> None:

@@ -13,12 +13,10 @@ from unittest.mock import Mock
 import pytest
 import typer
 
-from ethbrake_marl import __version__, evaluation
+from ethbrake_marl import __version__
 from ethbrake_marl.cli import app as frame
 from ethbrake_marl.cli.app import run_command, whole_command
 from ethbrake_marl.cli.command import Out
-from ethbrake_marl.evaluation import evaluate, make_agents
-from ethbrake_marl.scenario import load_scenario
 from tests.fixtures.commands import Command, check_refused, told_json
 
 COMMANDS = [""]  # every one, groups too
@@ -129,26 +127,6 @@ def test_program__prints_a_table_on_a_narrow_stdout_and_needs_no_torch(encoding:
     assert out.endswith("loaded:\n"), out
 
 
-def test_progress__without_a_terminal_is_lines_and_every_ten_seconds_the_time_that_is_left(capsys, monkeypatch) -> None:
-    out = Out()
-    out.progress("training", 0, 1000, "total harm 9.00")
-    out.progress("training", 500, 1000, "total harm 8.00")
-    out.progress("training", 1000, 1000, "total harm 8.00", note="stopped")
-    times, out = iter((100.0, 105.0, 110.5, 111.0, 121.0, 140.0)), Out()
-    monkeypatch.setattr("ethbrake_marl.cli.command.time.monotonic", lambda: next(times))
-    for done in (0, 100, 210, 220, 420):
-        out.progress("ppo", done, 1000)
-    out.progress("report: figures", 1, 5)
-    assert capsys.readouterr().err.splitlines() == [
-        "training, total harm 9.00: 0 of 1,000",
-        "stopped",
-        "ppo: 0 of 1,000",
-        "ppo: 210 of 1,000, about 40 s left",
-        "ppo: 420 of 1,000, about 29 s left",
-        "report: figures: 1 of 5",
-    ]
-
-
 def test_command__ctrl_c_is_one_line_and_the_status_of_an_interruption(capsys) -> None:
     with pytest.raises(typer.Exit) as raised, Out(remains="what was found is kept"):
         raise KeyboardInterrupt
@@ -196,17 +174,3 @@ def test_stdout__has_results_alone_whatever_writes_past_python(capfd, monkeypatc
         os.dup2(before, 1)
         os.close(before)
     assert capfd.readouterr() == ("result\n", "raw")
-
-
-def test_evaluate__shows_whose_harm_an_objective_counts_in_lists_of_any_length(ethbrake: Command, monkeypatch) -> None:
-    words = ["evaluate", "--agents", "full_brake,coast", "--episodes", "60", "--set"]
-    scenario = load_scenario("paper-random").replace(objective=("own", "total", "social:45"))
-    found = evaluate(agents=make_agents(["full_brake", "coast"], scenario), scenario=scenario, episodes=60)
-    expected = [each.to_json() for each in found.rescore(["own", "social:45", "total"])]
-    for held in (evaluation.HELD, 59):
-        monkeypatch.setattr(evaluation, "HELD", held)
-        rows = told_json(ethbrake(*words, "objective=[own, total, 'social:45']", "--json"))
-        assert [each for row in rows for each in row["objectives"]] == expected
-        assert "objectives" not in told_json(ethbrake(*words, "objective=total", "--json"))[0]
-    shown = ethbrake(*words, "objective=own").out
-    assert [shown.count(f"Objectives, {count} harm") for count in ("first-impact", "total")] == [1, 1]

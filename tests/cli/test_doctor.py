@@ -1,7 +1,6 @@
 """``ethbrake doctor``: what it finds wrong, what it compiles."""
 
 import dataclasses
-import re
 from unittest.mock import Mock
 
 import pytest
@@ -69,17 +68,3 @@ def test_checks__other_physics_another_optimum_and_a_damaged_folder_are_findings
     assert not ok and "harm 40 (exact: 20)" in told
     monkeypatch.setattr(catalogue, "list_scenarios", Mock(side_effect=OSError("gone")))
     assert found("scenarios") == (False, "OSError: gone")
-
-
-def test_compile__only_when_asked_and_says_how_far_it_is_and_what_failed(ethbrake: Command, monkeypatch) -> None:
-    assert "compile" not in ethbrake("doctor").out
-    monkeypatch.setattr(doctor, "_call", lambda door, folder: "no luck" if "shield" in door else "")
-    answer = ethbrake("doctor", "--compile")
-    assert answer.status == 1 and re.search("FAIL +compile +shield failed: no luck", answer.out)
-    *far, failed = [line for line in answer.err.splitlines() if line.startswith("compile: ")]
-    assert re.fullmatch(r"compile: (\d+) of \1 commands done, \d+ files in the kernel cache", far[-1])
-    assert failed == "compile: shield failed: no luck"
-    monkeypatch.setattr(doctor, "is_temporary", lambda folder: True)
-    monkeypatch.setattr(doctor, "_call", None)  # where nothing can be kept it does not begin
-    answer = ethbrake("doctor", "--compile")
-    assert answer.status == 1 and re.search("FAIL +compile +no folder .* NUMBA_CACHE_DIR", answer.out)

@@ -4,13 +4,11 @@ import inspect
 import json
 import shlex
 import signal
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
-import onnx
 import pytest
 
 from ethbrake_marl.cli.command import Out
@@ -90,15 +88,6 @@ def test_evaluate__interrupted_writes_nothing(ethbrake: Command, tmp_path: Path,
 # A training
 
 
-def test_train__names_its_folder_and_ends_at_the_number_that_it_announces(ethbrake, tiny_recipe, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    answer = ethbrake("train", "--recipe", tiny_recipe, "--seed", "5", "--steps", "200", "--json")
-    folder, figures = Path("runs/paper-random-tiny-seed5"), told_json(answer)
-    assert (figures["directory"], figures["status"], figures["steps"]) == (str(folder), "finished", 256)
-    assert figures["evaluation"]["steps"] == 256 and (folder / "policy" / "manifest.json").is_file()
-    assert ": 0 of 256\n" in answer.err and "after 256 training steps" in answer.err and "of 200" not in answer.err
-
-
 def test_train__ends_with_harm_beside_full_braking_and_a_command_that_measures_the_same(
     ethbrake, tiny_recipe, tmp_path, monkeypatch
 ) -> None:
@@ -170,15 +159,6 @@ def test_resume__deletes_the_results_of_the_policy_before_and_nothing_else(
 
 
 # Learning curves
-
-
-def test_export__writes_onnx(ethbrake: Command, finished_run: Path, tmp_path: Path, monkeypatch) -> None:
-    line = ("agent", "export", finished_run, "--onnx", tmp_path / "policy.onnx")
-    assert ethbrake(*line).status == 0
-    graph = onnx.load(str(tmp_path / "policy.onnx")).graph
-    assert [output.name for output in graph.output] == ["action", "acceleration_mps2"]
-    monkeypatch.setitem(sys.modules, "onnx", None)  # not installed: the output is looked at before that is
-    check_refused(ethbrake(*line), "already exists")
 
 
 # ---------------------------------------------------------------- parts of a report

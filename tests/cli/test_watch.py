@@ -4,7 +4,6 @@ import hashlib
 import json
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +20,6 @@ from ethbrake_marl.evaluation.comparison import compare_results
 from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.evaluation.per_world import read_result, write_per_world
 from ethbrake_marl.evaluation.statistics import mean, paired_difference, unpaired_difference
-from ethbrake_marl.files import python_file
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.tables import read_worlds
@@ -152,23 +150,6 @@ def test_compare__unpaired_interval_is_welchs() -> None:
     assert found.interval == pytest.approx(tuple(expected), rel=1e-12)
 
 
-def test_versions__tell_a_file_behind_the_at_by_its_hash(ethbrake: Command, tmp_path: Path) -> None:
-    (tmp_path / "mine.py").write_text(
-        "import numpy as np, ethbrake_marl as eb\n"
-        "def make(argument, settings):\n"
-        "    share = np.load(settings.policy)[0]\n"
-        "    return eb.policy_agent(lambda seen: np.full((len(seen), 1), share), scenario=settings.scenario)\n"
-    )
-    line = ["evaluate", "--episodes", "5", "--json", "--agents", f"{tmp_path}/mine.py:make@{tmp_path}/w.npy"]
-    rows: list[dict[str, Any]] = []
-    for share in (-1.0, -0.2):
-        np.save(tmp_path / "w.npy", [share])
-        python_file._READ.clear()
-        rows += told_json(ethbrake(*line))
-    one, other = (row["versions"]["w.npy"] for row in rows)
-    assert one.startswith("SHA-256 ") and one != other
-
-
 # ---------------------------------------------------------------- files, shields
 
 
@@ -201,19 +182,6 @@ def check_extra(ethbrake: Command, package: str, extra: str, line: str, monkeypa
 
 
 # Shields
-
-
-def test_shield__of_several_learners_tells_its_policies_and_can_be_compared(ethbrake: Command) -> None:
-    words = ("--scenario", "cooperation-3-pair", "--agents", "full_brake,vine-pair", "--episodes", "12", "--json")
-    answer = ethbrake("shield", *words)
-    rows = told_json(answer)
-    assert [row["mode"] for row in rows] == ["none", "step", "step-alert", "step-cap"] * 2
-    assert rows[1]["harm"] <= rows[1]["bound"] and rows[1]["against_episode"] is None
-    assert {row["above_bound"] for row in rows if row["mode"] != "none"} == {0}
-    assert set(rows[5]["policy_sha256"]) == {"vehicle_2", "vehicle_3"} and rows[0]["policy_sha256"] == {}
-    Path("shield.json").write_text(answer.out)
-    compared = ethbrake("compare", "shield.json", "shield.json")
-    assert compared.status == 0 and "step-cap" in compared.out
 
 
 def test_evaluate__deletes_the_files_of_earlier_results_and_nothing_else(ethbrake: Command, tmp_path: Path) -> None:

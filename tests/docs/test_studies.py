@@ -1,37 +1,27 @@
 """The scripts of docs/studies, and pages that tell what the code does or what was measured: paper, cooperation, ..."""
 
 import json
-import os
 import re
-import subprocess
-import sys
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
-from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.evaluation.lineup import make_lineup
-from ethbrake_marl.extensions.report.paper_rows import PAPER_NOTE, PAPER_ROWS
+from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS
 from ethbrake_marl.extensions.report.style import picture_bytes
 from ethbrake_marl.extensions.reproduction import strategies, tables as tables_module, verdicts
 from ethbrake_marl.extensions.reproduction.folder import Reproduction
-from ethbrake_marl.extensions.reproduction.items import ITEMS
 from ethbrake_marl.extensions.reproduction.making import choose_items
-from ethbrake_marl.extensions.reproduction.open_quantities import GAPS
 from ethbrake_marl.extensions.reproduction.strategies import FULL_BRAKE, NAMES
-from ethbrake_marl.extensions.search.shipped import best_known
 from ethbrake_marl.game.harm import HARM_COUNTS
-from ethbrake_marl.game.objectives import OBJECTIVES, scored
+from ethbrake_marl.game.objectives import scored
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.tables import worlds_from_table
-from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.training.recipe import Scheme
 from tests.docs.printed import rows as table_of
 from tests.docs.site import DOCS, load
 
@@ -45,9 +35,6 @@ PAPER = load_scenario("paper-random")
 
 
 BASE = load_scenario("cooperation-2-paper")
-
-
-SHORT = load("../studies/speed").Effort(1, 1e-6)
 
 
 PNG = b"\x89PNG"
@@ -70,23 +57,6 @@ def test_price__is_nothing_where_everything_is_known():
     assert price.above(found, f"{price.POLICY}+step:estimated").value == 0.0
 
 
-def test_price__is_paired_by_world_and_told_of_both_counts():
-    found = price.drive(BASE, 30, {"sensors-only": {"preset": "sensors-only"}})
-    over = BASE.replace(v2x="sensors-only")
-    harm = {
-        spec: drive(over.sample(30, 7).worlds, make_agent(spec, scenario=over), over, 1).ledger
-        for spec in ("e_v2x_bm", "e_v2x_bm:estimated")
-    }
-    for count in price.COUNTS:
-        told = price.price(found["sensors-only"], "e_v2x_bm:estimated", count)
-        difference = harm["e_v2x_bm:estimated"].world_harm(count) - harm["e_v2x_bm"].world_harm(count)
-        assert told.value == pytest.approx(difference.mean(), abs=1e-9)
-    told = table_of("results/baselines", "## The price of not knowing, E-V2X-BM")
-    assert f"| {' | '.join(told[0])} |" in price.tables(found)
-    assert [row[0] for row in told[1:]] == list(price.channels())
-    assert picture_bytes(price.draw(found), "price.png").startswith(PNG)
-
-
 drawings = load("../drawings")
 
 
@@ -95,20 +65,6 @@ def test_drawing__is_the_one_that_is_shown(name: str) -> None:
     assert f"](../figures/model-{name}.svg)" in (DOCS / "internals" / "model.md").read_text("utf-8").replace("\n", " ")
     made = picture_bytes(drawings.DRAWINGS[name](), "made.svg")
     assert made == (DOCS / "figures" / f"model-{name}.svg").read_bytes()
-
-
-def test_equal_time__tells_the_harm_of_an_evaluation_in_the_columns_of_the_page() -> None:
-    driven = equal_time.drive(
-        PAPER.sample(20, 8), make_lineup(["coast", "full_brake", "e_v2x_bm"], PAPER), PAPER, repeats=2
-    )
-    rows = {row[0]: row for row in equal_time.rows_of(driven, "full_brake")}
-    full, coast = (driven[name][1].first_impact_harm for name in ("full_brake", "coast"))
-    assert rows["`e_v2x_bm`"][1] == "true model" and rows["`full_brake`"][5] == ""
-    assert rows["`coast`"][3] == f"{coast.mean():.3f}"
-    assert rows["`coast`"][5].startswith(f"{(coast - full).mean():+.3f} [")
-    assert list(equal_time.HEAD) == table_of("results/baselines", "## Harm at equal processor time")[0]
-    worlds = PAPER.sample(equal_time.WORLDS, equal_time.SEED).worlds  # which no table holds
-    assert not np.isfinite(best_known(worlds, Task(PAPER, PAPER.learners))["first"]).any()
 
 
 def test_equilibria__have_a_row_for_each_objective() -> None:
@@ -193,20 +149,6 @@ def test_morl_front__its_numbers_agree_with_each_other_and_with_full_braking() -
             assert measured["hypervolume_below_roof"] == pytest.approx(volume_below(np.full(3, found["roof"]), points))
 
 
-def test_message_contents__trains_each_content_once_and_compares_it_with_the_usual_pieces(
-    tmp_path, monkeypatch
-) -> None:
-    few = {name: message_contents.CONTENTS[name] for name in (message_contents.ALL, "with intent", "the alert alone")}
-    monkeypatch.setattr(message_contents, "CONTENTS", few)
-    effort = message_contents.Effort(seeds=1, steps=2_048, worlds=6)
-    rows = message_contents.table(tmp_path, effort)
-    assert [row[0] for row in rows] == [*few] and {len(row) for row in rows} == {len(message_contents.HEAD)}
-    assert rows[0][2::2] == ["–"] * 3 and all(cell[0] in "+-" for row in rows[1:] for cell in row[2::2])
-    assert len(list(tmp_path.iterdir())) == 9  # a training each, which are not made again
-    monkeypatch.setattr(eb, "train", None)
-    assert message_contents.table(tmp_path, effort) == rows
-
-
 # ---------------------------------------------------------------- pages
 
 
@@ -216,50 +158,6 @@ def text_of(*names: str) -> list[str]:
 
 (MADE_AGAIN,) = text_of("extensions/reproduction")
 (COOPERATION,), (TRAIN,) = text_of("cooperation"), text_of("train")
-ABLATION = text_of("extensions/cooperation")[0].partition("\n## Ablate")[2].partition("\n## ")[0]
-PAPER_PAGES = text_of("internals/model", "internals/paper", "extensions/reproduction")
-PAPER_TEXT = "".join(PAPER_PAGES)
-
-# Every \label of an equation, algorithm, figure or table in the paper's source, by the heading of the pages.
-LABELS = {
-    "Equations": (
-        "dynamics", "eq:olle1", "eq:olle2", "eq:4", "eq:5", "eq:52", "eq:rel_distance", "gamma", "eq:rel_velocity",
-        "eq:harm", "eq:harm_i+1", "eq:11", "eq:12", "eq:13", "dynamics2", "eq:total_objective", "eq:Jharmn", "Jfunc",
-        "eq:ratio", "eq:ppo_clip", "eq:alpha_loss", "Eq:BaselineHarm",
-    ),
-    "Algorithm": ("alg:hybrid",),
-    "Figures": (
-        "fig:fig1", "fig:ppo_sac_high_latency", "fig:ppo_sac_low_latency", "Fig:Harm-ivds", "Fig:harm-delay",
-        "Fig:pic5sim", "Fig:pic5act", "Fig:hybrid illu",
-    ),
-    "Tables": ("table:params", "tab:ppo-sac", "Table:hybrid", "Table:Random"),
-}  # fmt: skip
-NUMBERED = {"Equations": range(1, 36), "Figures": range(1, 9), "Tables": ("I", "II", "III")}
-
-
-def rows(page: str, heading: str, level: str = "\n## ") -> list[list[str]]:
-    """The cells of every line of a table below a heading."""
-    text = page.partition(heading)[2].partition(level)[0]
-    return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in text.splitlines() if line[:1] == "|"]
-
-
-@pytest.mark.parametrize("title", LABELS)
-def test_paper__treats_every_label_and_everything_that_has_a_number_once(title: str) -> None:
-    told = [row for page in PAPER_PAGES for row in rows(page, f"\n## {title}") if len(row) == 5]
-    second = " ".join(row[1] for row in told)
-    assert [label for label in LABELS[title] if f"`{label}`" not in second] == []
-    numbers = [number for row in told for number in row[0].split(", ") if number.isalnum()]
-    assert title not in NUMBERED or numbers == [str(number) for number in NUMBERED[title]]
-
-
-def test_paper__says_how_the_report_and_the_code_differ_from_it() -> None:
-    sentences = (
-        "one `k_energy` for all pairs",
-        "but neither masses nor the restitution e",
-        "predicts a harm of 3.07",
-        "above v_max when pushed",
-    )
-    assert "docs/internals/paper.md" in PAPER_NOTE and [each for each in sentences if each not in PAPER_TEXT] == []
 
 
 # docs/results/reproduction.md says what the worlds give.
@@ -304,19 +202,6 @@ def test_paper__full_braking_over_the_total_distance_is_as_committed() -> None:
     assert told == [f"{harm[groups == group].mean():.2f}" for group in range(5)]
 
 
-def test_reproduction__has_a_section_for_every_item_and_a_row_for_every_gap() -> None:
-    page = (DOCS / "results" / "reproduction.md").read_text("utf-8")
-    outcomes = dict(re.findall(r"(?ms)^## (.*?)$.*?^\*\*(.*?)\*\*: ", page))
-    assert [*outcomes] == [item.title for item in ITEMS]
-    text = " ".join(MADE_AGAIN.split())
-    assert [title for title, outcome in outcomes.items() if f"- **{title}: {outcome}" not in text] == []
-    moved = {row[0].replace("\\", "") for row in table_of("results/reproduction", "### How far the headline moves")[1:]}
-    assert moved <= {gap.name for gap in GAPS}
-    assert [label for item in ITEMS for label in item.labels if f"`{label}`" not in PAPER_TEXT] == []
-    shown = set(re.findall(r"figures/(reproduction-[a-z0-9-]+\.svg)", page))
-    assert shown == {path.name for path in (DOCS / "figures").glob("reproduction-*")}
-
-
 def test_reproduction__trajectories_and_full_braking_are_as_committed(tmp_path: Path) -> None:
     (item,) = choose_items(["trajectories"])
     (table,) = item.make(Reproduction("quick", tmp_path)).tables
@@ -333,18 +218,6 @@ def test_reproduction__trajectories_and_full_braking_are_as_committed(tmp_path: 
 # docs/cooperation.md, and the methods for several learners in docs/train.md
 
 
-def first_cells(page: str, heading: str) -> dict[str, list[str]]:
-    """The first table of the page below a header line: first cell -> other cells."""
-    found = rows(page, heading, "\n\n")
-    return {row[0]: row[1:] for row in found if row[0].startswith("`")}
-
-
-def test_cooperation__its_objectives_and_schemes_are_those_of_the_code() -> None:
-    schemes = {re.findall("`(.*?)`", cell)[0] for cell in first_cells(TRAIN, "| `scheme` | networks |")}
-    objectives = [re.findall("`(.*?)[:`]", cell)[0] for cell in first_cells(COOPERATION, "| `objective` | for")]
-    assert (schemes, objectives) == (set(get_args(Scheme)), list(OBJECTIVES))
-
-
 def test_cooperation__its_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
@@ -358,19 +231,3 @@ def test_cooperation__its_examples_run(tmp_path: Path, monkeypatch: pytest.Monke
     names = {"eb": eb}
     exec(block.replace('("cooperation-ppo")', quick).replace("1000", "20"), names)
     assert names["team_harm"].shape == (20,) and (tmp_path / "runs" / "team" / "team.json").is_file()
-
-
-@pytest.mark.slow
-def test_ablate_cooperation__its_file_and_commands_make_what_it_says(tmp_path: Path) -> None:
-    (level,) = re.findall("```yaml\n(.*?)```", ABLATION, re.DOTALL)
-    (tmp_path / "my-level.yaml").write_text(level, "utf-8")
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    small = "--seeds 1 --steps 512 --episodes 20 --search-episodes 3"
-    for command in re.findall(r"^\$ (.*)", ABLATION, re.MULTILINE):
-        words = command.replace("--seeds 3", small).split()[1:]
-        done = subprocess.run(
-            [sys.executable, "-m", "ethbrake_marl", *words], cwd=tmp_path, env=environment, check=False
-        )
-        assert done.returncode == 0, command
-    made = {path.name for path in (tmp_path / "runs" / "mine").iterdir()}
-    assert {"ablation.json", "ablation.csv", "ablation.png", "settings.json", "trainings", "optimum"} <= made

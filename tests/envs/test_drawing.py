@@ -1,6 +1,5 @@
 """What the environments draw: pictures, words and windows of the running worlds."""
 
-import sys
 from hashlib import sha256
 from importlib.metadata import version
 from typing import Any
@@ -10,9 +9,8 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.envs.rendering import BODY_M, HEIGHT, WIDTH
+from ethbrake_marl.envs.rendering import BODY_M
 from ethbrake_marl.envs.trace import Trace
-from ethbrake_marl.errors import InvalidInput
 from tests.contract.interfaces import CRASH
 
 near = pytest.approx
@@ -128,37 +126,3 @@ def test_vector__gives_the_frame_of_each_world() -> None:
         single.reset(seed=5 if k == 0 else None)
         single.step(-1.0 + COAST)
         assert np.array_equal(frames[k], single.render())
-
-
-def test_human__shows_each_step_in_real_time_and_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
-    pygame = pytest.importorskip("pygame", reason="needs the extra: pip install 'ethbrake-marl[render]'")
-    environment = gymnasium.make("EthBrake-v1", scenario=CRASH, render_mode="human")
-    assert pygame.display.get_surface() is None  # no window before there is something to show
-    environment.reset(seed=0)
-    before = pygame.time.get_ticks()
-    environment.step(COAST)
-    assert pygame.time.get_ticks() - before >= 80  # it waits for a step of 0.1 s
-    assert pygame.display.get_surface().get_size() == (WIDTH, HEIGHT) and environment.render() is None
-    environment.close()
-    assert pygame.display.get_surface() is None
-    monkeypatch.setenv("SDL_VIDEODRIVER", "nothing")
-    with pytest.raises(InvalidInput, match=r"cannot open a window .*; use 'rgb_array', which needs no display"):
-        eb.parallel_env(render_mode="human").reset(seed=0)
-    monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(eb.MissingExtra, match=r"^[^\n]*pip install 'ethbrake-marl\[render\]'[^\n]*$"):
-        eb.parallel_env(render_mode="human")
-
-
-def test_shields__are_looked_through_and_their_interventions_shown() -> None:
-    scenario = eb.load_scenario("paper-random")
-    single = eb.ShieldedEnv(eb.EthBrakeEnv(scenario, render_mode="ansi"))
-    rows = eb.ShieldedVectorEnv(eb.EthBrakeVectorEnv(2, scenario, render_mode="ansi"))
-    parallel = eb.HybridShield(eb.parallel_env(scenario, render_mode="ansi"))
-    hybrid = eb.HybridShield(eb.parallel_env(scenario, render_mode="ansi"), eb.make_agent("coast"), mode="episode")
-    given = ((single, [1.0]), (rows, np.full((2, 1), 1.0)), (parallel, {"vehicle_2": [1.0]}), (hybrid, {}))
-    for environment, action in given:
-        environment.reset(seed=7)
-        assert environment is not single or "shield" not in single.render()
-        environment.step(action)
-    assert [each.render().splitlines()[-1] for each in (single, parallel)] == ["shield: stepped in"] * 2
-    assert rows.render()[0] == single.render() and "shield: stepped in" in hybrid.render()

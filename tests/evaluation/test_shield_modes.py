@@ -6,7 +6,7 @@ from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.evaluation.shield_modes import ShieldModes, compare_modes
-from ethbrake_marl.evaluation.statistics import mean, paired_difference
+from ethbrake_marl.evaluation.statistics import paired_difference
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.shields.drivers import ShieldedDriver
@@ -45,40 +45,6 @@ def test_rows__do_not_depend_on_the_size_of_a_chunk(rows: ShieldModes, monkeypat
     done: list[tuple[str, int]] = []
     assert compare_modes(BRAKE, WORLDS, Task(PAPER, (1,)), on_progress=lambda *a: done.append(a)) == rows
     assert done == [("full_brake", 25), ("full_brake", 50), ("full_brake", 60)]
-
-
-@pytest.fixture(scope="module")
-def team_rows() -> ShieldModes:
-    return pair_modes()
-
-
-def pair_modes() -> ShieldModes:
-    agents = {name: make_agent(name) for name in ("full_brake", "coast")}
-    return compare_modes(agents, PAIR.sample(30, 3).worlds, Task(PAIR, (1, 2), "total"))
-
-
-@pytest.mark.slow
-def test_team__rows_are_what_driving_behind_each_shield_gives(team_rows: ShieldModes) -> None:
-    worlds = PAIR.sample(30, 3).worlds
-    assert [row.mode for row in team_rows] == ["none", "step", "step-alert", "step-cap"] * 2
-    alone = drive(worlds, Team.of(make_agent("coast"), (1, 2)), PAIR).ledger.world_harm("total")
-    for row, cap in ((team_rows[5], None), (team_rows[7], "baseline")):
-        coasting = Team.of(make_agent("coast"), (1, 2))
-        team = ShieldedDriver(coasting, PAIR, harm_count="total", cap=cap, logging=True).on((1, 2))
-        episodes = drive(worlds, team, PAIR)
-        ledger, shield = episodes.ledger, episodes.guarded.shield
-        harm, borne = ledger.world_harm("total"), ledger.vehicle_harm("total")
-        assert row.harm == mean(harm) and row.against_none == paired_difference(harm, alone)
-        assert row.bound is not None and row.bound.value == shield.predicted_harm.mean() and row.above_bound == 0
-        decisions = shield.memory.running.steps.sum()
-        own = [sum(entry.vehicle == i for entry in shield.log) / decisions for i in (1, 2)]
-        assert [each.replaced for each in row.vehicles] == [None, *own]
-        assert row.replaced == pytest.approx(sum(own) / 2) and min(own) > 0.1
-        assert [each.harm for each in row.vehicles] == pytest.approx(borne.mean(axis=0))
-        more = (borne > shield.memory.baseline_shares).mean(axis=0)
-        assert [each.above_baseline for each in row.vehicles] == pytest.approx(more, abs=0.02)
-        assert (max(more) > 0.0) == (cap is None)
-    assert all(row.against_episode is None for row in team_rows)
 
 
 def test_team__an_intervention_is_simulated_again_without_it_for_the_whole_team() -> None:

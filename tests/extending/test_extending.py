@@ -277,8 +277,6 @@ def test_measure__of_each_vehicle_stands_in_rows_frame_and_markdown() -> None:
     assert told["metrics"]["injured_3"] == "injured, vehicle 3 (1)"
     frame = found.arrays()
     assert frame["metric_squared"] == near(frame["total_harm"])
-    text = rows.markdown()
-    assert "squared (m2/s2)" in text and "injured, vehicle 2 (1)" in text
 
 
 def measured_by_vehicle() -> Any:
@@ -313,9 +311,6 @@ def test_folder__makes_its_scenarios_known_by_name_and_to_the_command_line(
     rows = list(csv.DictReader((tmp_path / "out" / "worlds.csv").read_text().splitlines()))
     assert entry["parameters"]["scenario"] == "hills"
     assert entry["metric_worst"] == near(np.mean([float(row["metric_worst"]) for row in rows]))
-    assert "worst (m/s)" in told(*words) and "worst" in told("scenario", "parts")
-    (line,) = [line for line in told("scenario", "list").splitlines() if line.startswith("hills ")]
-    assert line.endswith(f"(from {folder})")
     origins = {entry["name"]: entry["origin"] for entry in json.loads(told("scenario", "list", "--json"))}
     assert (origins["hills"], origins["paper-random"]) == (str(folder), "shipped")
     eb.register_scenarios(str(folder))  # twice is once

@@ -1,57 +1,19 @@
 """Packages that are installed: what they name is loaded when it is used, stands in every output, and breaks nothing."""
 
 import json
-import os
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import yaml
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName
 from ethbrake_marl.registry import versions_used
-from tests.learning.tiny import TINY_PPO
 
 Install = Callable[..., None]
 
-PROJECT = """
-[build-system]
-requires = ["setuptools"]
-build-backend = "setuptools.build_meta"
-
-[project]
-name = "hills"
-version = "0.3"
-
-[tool.setuptools]
-py-modules = ["hills"]
-
-[project.entry-points."ethbrake_marl.agents"]
-gentle = "hills:make_gentle"
-
-[project.entry-points."ethbrake_marl.shields"]
-softer = "hills:softer"
-
-[project.entry-points."ethbrake_marl.measures"]
-worst = "hills:WORST"
-calm = "hills:CALM"
-
-[project.entry-points."ethbrake_marl.features"]
-urgency = "hills:URGENCY"
-
-[project.entry-points."ethbrake_marl.objectives"]
-front-first = "hills:front_first"
-
-[project.entry-points."ethbrake_marl.algorithms"]
-patient = "hills:PATIENT"
-
-[project.entry-points."ethbrake_marl.commands"]
-hello = "hills:hello"
-"""
 HILLS = '''
 import numpy as np
 import typer
@@ -112,47 +74,6 @@ def hello(name: str, loud: bool = False) -> None:
     """Say hello."""
     typer.echo(f"hello {name}{'!' * loud}")
 '''
-
-
-@pytest.mark.slow
-def test_package__that_pip_installs_drives_measures_pays_and_commands(tmp_path: Path) -> None:
-    source, target = tmp_path / "hills", tmp_path / "target"
-    source.mkdir()
-    (source / "pyproject.toml").write_text(PROJECT)
-    (source / "hills.py").write_text(HILLS)
-    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
-    subprocess.run([*pip, "--target", target, source], check=True, cwd=tmp_path)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([os.environ["PYTHONPATH"], str(target)])}
-
-    def told(*words: str | Path) -> str:
-        line = [sys.executable, "-m", "ethbrake_marl", *words]
-        done = subprocess.run(line, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-        return done.stdout
-
-    assert (
-        "hello      Command of the installed package hills." in told("--help")
-        and told("hello", "you", "--loud") == "hello you!\n"
-    )
-    assert "gentle[:ARGUMENT]" in told("agent", "list") and "+softer[:ARGUMENT]" in told("agent", "list")
-
-    agents, out = "full_brake,gentle,gentle:0.8+softer,gentle+step", tmp_path / "out"
-    words = ("--agents", agents, "--episodes", "20", "--set", "measures=worst", "--jobs", "2")
-    table = told("evaluate", *words, "--output", out, "--report")
-    assert "worst (m/s)" in " ".join(table.split()) and "gentle:0.8+softer" in table
-    rows = json.loads((out / "results.json").read_text())
-    rows = rows["agents"] if isinstance(rows, dict) else rows
-    assert [row["agent"] for row in rows] == agents.split(",") and rows[0]["versions"]["hills"] == "0.3"
-    assert all(row["metric_worst"] >= 0.0 for row in rows)
-    page = (out / "report.html").read_text()
-    assert "worst (m/s)" in page and "Largest change of speed in the line." in page
-
-    recipe = {**TINY_PPO.model_dump(mode="json"), "name": "mine", "algorithm": "patient", "total_steps": 512}
-    recipe |= {"reward": {"harm": 1.0, "calm": 0.01}, "observation": ["own", "urgency"]}
-    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(recipe))
-    told("train", "--recipe", "mine.yaml", "--set", "objective=front-first", "--output", "run")
-    config = json.loads((tmp_path / "run" / "config.json").read_text())
-    assert config["recipe"]["reward"]["terms"] == {"calm": 0.01} and config["versions"]["hills"] == "0.3"
 
 
 AGENTS = {"gentle": "hills:make_gentle"}

@@ -63,9 +63,11 @@ def front_command(
         from ethbrake_marl.extensions.fronts.figures import front_figure
         from ethbrake_marl.extensions.fronts.front import least_largest, search_front
         from ethbrake_marl.extensions.fronts.results import front_results, front_sheet, full_braking, hypervolume_sheet
-        from ethbrake_marl.extensions.fronts.weights import corners, parsed_weights, weight_grid
+        from ethbrake_marl.extensions.fronts.weights import corners, weight_grid
         from ethbrake_marl.extensions.report.style import picture_bytes
         from ethbrake_marl.files.store import check_folder
+        from ethbrake_marl.files.yaml import parse_yaml
+        from ethbrake_marl.physics.state import checked_numbers
 
         task = read_task(scenario, settings)
         chosen = task.scenario
@@ -73,7 +75,7 @@ def front_command(
             N = chosen.vehicles
             rows = np.concatenate([weight_grid(N, steps), np.ones((1, N)), corners(N)])
         else:
-            rows = parsed_weights(weights, chosen.vehicles)
+            rows = checked_numbers("weights", [parse_yaml(f"[{text}]", "--weights").content for text in weights])
         check_folder(output, ("front.json", "front.png"), force=force)
         sample = chosen.sample(episodes, seed)
         beside_it = DEFAULT_AGENTS if agents is None and len(chosen.learners) == 1 else agents or ""

@@ -21,7 +21,6 @@ from ethbrake_marl.engine.profiles import ProfileProblem, Profiles
 from ethbrake_marl.errors import InvalidInput, check_one_learner
 from ethbrake_marl.evaluation.lineup import make_agents
 from ethbrake_marl.extensions.fronts.hypervolume import nondominated
-from ethbrake_marl.extensions.fronts.weights import checked_weights
 from ethbrake_marl.extensions.search.best_harm import (
     best_harm,
     driven_profiles,
@@ -35,7 +34,7 @@ from ethbrake_marl.extensions.search.problem import search_profiles
 from ethbrake_marl.extensions.search.shipped import shipped_profiles
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.game.objectives import weighted_harm
-from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds, checked_numbers
 from ethbrake_marl.policies.shipped import shipped_policies
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task
@@ -115,8 +114,9 @@ def search_front(
     ``CONSTANTS`` constant commands, and of the results for all other choices of weights. With one learner, this also
     holds for the shipped profile of this world, each of ``agents``, and every shipped policy that can drive the
     learner. The result for a world depends neither on ``threads`` nor on the other worlds. Raises the exceptions of
-    ``checked_weights``, ``best_harm`` and ``make_agents``, and ``InvalidInput`` if ``agents`` are given but the
-    scenario has several learners.
+    ``best_harm`` and ``make_agents``, and ``InvalidInput`` if ``agents`` are given but the scenario has several
+    learners, if ``weights`` is not a table of numbers with a column for each vehicle, or if a row of it cannot be the
+    scenario's ``harm_weight``.
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.extensions.fronts.front import search_front
@@ -139,7 +139,12 @@ def search_front(
             weights.
 
     """
-    weights = checked_weights(weights, scenario.vehicles)
+    weights = checked_numbers("weights", weights)
+    if weights.ndim != 2 or weights.shape[1] != scenario.vehicles:
+        raise InvalidInput(
+            f"weights has shape {weights.shape}: give one or more choices of weights, each with one number for each of"
+            f" the {scenario.vehicles} vehicles, for instance {','.join(['1', '4', *'1' * (scenario.vehicles - 2)])}"
+        )
     task = Task(scenario, scenario.learners, harm_count)
     effort = {"budget": budget, "seed": seed, "threads": threads}
     if agents:

@@ -9,20 +9,21 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.identity import result_versions, scenario_sha256, worlds_sha256
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.statistics import Texts, mean, paired_difference
 from ethbrake_marl.extensions.fronts.front import Borne, Front, amounts_of
 from ethbrake_marl.extensions.fronts.hypervolume import MOST_DIMENSIONS, hypervolume
-from ethbrake_marl.files.sheet import Column, Estimate, Row, Sheet
+from ethbrake_marl.files.sheet import Column, Estimate, Sheet
 from ethbrake_marl.game.harm import HARM_COUNTS
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import Scenario
 
 RESAMPLES = 200  # bootstrap samples of the worlds, for intervals of hypervolumes
+
+FRONT = "Pareto front"  # name of the front beside the agents in the entry "hypervolume"; no agent can have this name
 
 Json = dict[str, Any]
 
@@ -33,8 +34,8 @@ def front_results(
     """Return the content of ``front.json``: the front, full braking, maximin, and the agents.
 
     All means have 95 % intervals over worlds or, if the worlds come from recordings, over recordings. For each choice
-    of weights, ``ratio`` is an agent's mean weighted harm divided by the front's (null if the front's is 0), and
-    ``above`` is the agent's mean weighted harm minus the front's.
+    of weights, ``ratio`` is the mean weighted harm divided by the front's (null if the front's is 0), and ``above`` is
+    the mean weighted harm minus the front's.
 
     Args:
         front: the front.
@@ -45,27 +46,18 @@ def front_results(
         seed: seed with which the worlds were drawn, if known.
 
     """
-    least, by = front.amounts, sample.clusters
-    recordings = {} if by is None else {"recordings": len(np.unique(by))}
-    agents = {}
-    for name, borne in front.agents.items():
-        points = _points(front, borne, by)
-        for k, (point, row) in enumerate(zip(points, front.weights, strict=True)):
-            amounts, best = amounts_of(borne[front.harm_count][k], row), float(least[k].mean())
-            point["above"] = paired_difference(amounts, least[k], by).to_json()
-            point["ratio"] = float(amounts.mean()) / best if best > 0.0 else None
-        agents[name] = points
+    by = sample.clusters
     return {
         "kind": "front",
         "scenario": scenario.name,
         "seed": seed,
         "episodes": len(sample.index),
-        **recordings,
+        **({} if by is None else {"recordings": len(np.unique(by))}),
         "harm_count": front.harm_count,
         "vehicles": list(scenario.vehicle_names),
         "beside": {name: _vehicles(borne, by) for name, borne in beside.items()},
         "points": _points(front, front.borne, by),
-        "agents": agents,
+        "agents": {name: _points(front, borne, by) for name, borne in front.agents.items()},
         "hypervolume": hypervolumes(front, beside["full_brake"][front.harm_count], by),
         "scenario_sha256": scenario_sha256(scenario),
         "worlds_sha256": worlds_sha256(sample.worlds, sample.index),
@@ -74,15 +66,19 @@ def front_results(
 
 
 def _points(front: Front, borne: Borne, by: Texts | None) -> list[Json]:
-    return [
-        {
-            "weights": row.tolist(),
+    points = []
+    for k, (weights, least) in enumerate(zip(front.weights, front.amounts, strict=True)):
+        harm = borne[front.harm_count][k]
+        amounts = amounts_of(harm, weights)
+        points.append({
+            "weights": weights.tolist(),
             "vehicles": _vehicles({count: borne[count][k] for count in HARM_COUNTS}, by),
-            "amount": mean(amounts_of(borne[front.harm_count][k], row), by).to_json(),
-            "sum": mean(borne[front.harm_count][k].sum(axis=1), by).to_json(),
-        }
-        for k, row in enumerate(front.weights)
-    ]
+            "amount": mean(amounts, by).to_json(),
+            "sum": mean(harm.sum(axis=1), by).to_json(),
+            "above": paired_difference(amounts, least, by).to_json(),
+            "ratio": float(amounts.mean()) / float(least.mean()) if least.any() else None,
+        })  # fmt: skip
+    return points
 
 
 def _vehicles(borne: Borne, by: Texts | None) -> Mapping[str, list[Json]]:
@@ -100,36 +96,29 @@ def hypervolumes(front: Front, full_brake: Floats, clusters: Texts | None = None
     ``share`` is an agent's hypervolume divided by the front's hypervolume. The 95 % intervals are percentiles over
     ``RESAMPLES`` bootstrap samples of the worlds, or of the clusters (recordings), whose names for each world are
     ``clusters`` [n]. ``full_brake`` is the harm of each vehicle if the learners brake fully, [n, N] m2/s2, in the harm
-    count of ``front``. The result is empty for more than ``MOST_DIMENSIONS`` vehicles. Raises ``InvalidInput`` if an
-    agent has the name ``front``.
+    count of ``front``. The result is empty for more than ``MOST_DIMENSIONS`` vehicles.
     """
     if len(full_brake.T) > MOST_DIMENSIONS:
         return []
-    sets = {"front": front.borne[front.harm_count], **{k: each[front.harm_count] for k, each in front.agents.items()}}
-    if "front" in front.agents:
-        raise InvalidInput("agent 'front': this name is reserved for the Pareto front; give the agent another name")
-    n = len(full_brake)
-    names = np.arange(n) if clusters is None else np.unique(clusters, return_inverse=True)[1]
-    members = [np.flatnonzero(names == k) for k in range(names.max() + 1)]  # rows of each cluster
+    worlds = np.arange(len(full_brake))
+    names = worlds if clusters is None else np.unique(clusters, return_inverse=True)[1]
+    members = [np.flatnonzero(names == k) for k in range(names.max() + 1)]  # worlds of each cluster
     drawn = np.random.default_rng(0).integers(len(members), size=(RESAMPLES, len(members)))
-    draws = [np.arange(n), *(np.concatenate([members[k] for k in row]) for row in drawn)]  # first: each world once
-    points = {name: np.stack([borne[:, rows].mean(axis=1) for rows in draws]) for name, borne in sets.items()}
+    draws = [worlds, *(np.concatenate([members[k] for k in row]) for row in drawn)]  # first: each world once
+    harms = {FRONT: front.borne, **front.agents}
+    points = {
+        name: np.stack([borne[front.harm_count][:, rows].mean(axis=1) for rows in draws])
+        for name, borne in harms.items()
+    }
     braking = np.stack([full_brake[rows].mean(axis=0) for rows in draws])
+    largest = np.maximum(braking, points[FRONT].max(axis=1))
     entries = []
-    for words, reference in (
-        ("full braking", braking),
-        ("largest harm of each vehicle", np.maximum(braking, points["front"].max(axis=1))),
-    ):
-        volumes = {
-            name: np.array([hypervolume(each, at) for each, at in zip(rows, reference, strict=True)])
-            for name, rows in points.items()
-        }
-        entry: Json = {"reference": words, "at": reference[0].tolist(), "of": {}}
-        for name, volume in volumes.items():
-            with np.errstate(divide="ignore", invalid="ignore"):
-                share = volume / volumes["front"]
-            entry["of"][name] = {"volume": _interval(volume), "share": _interval(share)}
-        entries.append(entry)
+    for words, reference in (("full braking", braking), ("largest harm of each vehicle", largest)):
+        volumes = {name: np.array(list(map(hypervolume, rows, reference))) for name, rows in points.items()}
+        with np.errstate(divide="ignore", invalid="ignore"):
+            shares = {name: volume / volumes[FRONT] for name, volume in volumes.items()}
+        each = {name: {"volume": _interval(volumes[name]), "share": _interval(shares[name])} for name in volumes}
+        entries.append({"reference": words, "at": reference[0].tolist(), "of": each})
     return entries
 
 
@@ -146,12 +135,10 @@ def _interval(values: Floats) -> Json | None:
 
 def full_braking(scenario: Scenario, sample: Sample) -> Borne:
     """Return the harm of each vehicle if all learners brake fully, [n, N] m2/s2 by harm count."""
-    brakes = scenario.replace(
-        roles={**scenario.roles, **{scenario.vehicle_names[i]: "full_brake" for i in scenario.learners}}
-    )
+    learners = [scenario.vehicle_names[i] for i in scenario.learners]
+    brakes = scenario.replace(roles={**scenario.roles, **dict.fromkeys(learners, "full_brake")})
     outcome = evaluate(sample, {"full_brake": Team({}, "full_brake")}, scenario=brakes, aftermath=False).complete()
-    ledger = outcome.outcome("full_brake").ledger
-    return {count: ledger.vehicle_harm(count) for count in HARM_COUNTS}
+    return {count: outcome.outcome("full_brake").vehicle_harm(count) for count in HARM_COUNTS}
 
 
 def front_sheet(results: Json) -> Sheet:
@@ -160,44 +147,41 @@ def front_sheet(results: Json) -> Sheet:
     A row contains the mean harm of each vehicle. The row of a choice of weights also contains the ``ratio`` of each
     agent (see ``front_results``). ``results`` is the content of ``front.json``.
     """
-    count = results["harm_count"]
-    short = [re.sub("@[^+]*", "", name)[:14] for name in results["agents"]]
-    columns: list[Column | str] = [
+    count, agents = results["harm_count"], results["agents"]
+
+    def row(name: str, vehicles: Mapping[str, list[Json]], *ratios: float | None) -> tuple[str | float | None, ...]:
+        means = {each: [harm["value"] for harm in vehicles[each]] for each in HARM_COUNTS}
+        return (name, *means[count], *map(sum, means.values()), *ratios)
+
+    rows = [
+        row(",".join(f"{weight:g}" for weight in point["weights"]), point["vehicles"], *ratios)
+        for point, *ratios in zip(
+            results["points"], *([each["ratio"] for each in points] for points in agents.values()), strict=True
+        )
+    ]
+    rows += [row(name, vehicles) for name, vehicles in results["beside"].items()]
+    columns = [
         Column("Weights"), *(Column(f"Vehicle {k + 1}", short=f"V{k + 1}") for k in range(len(results["vehicles"]))),
         Column("Sum, first impacts", short="First"), Column("Sum, all impacts", short="All"),
-        # two agents with the same short name have their whole names
-        *(Column(name, digits=3, short=each if short.count(each) == 1 else name.replace("/", "/\n"))
-          for name, each in zip(results["agents"], short, strict=True)),
+        *(Column(name, digits=3, short=re.sub("(?<=[/+])", "\n", name)) for name in agents),
     ]  # fmt: skip
-    rows: list[Row] = []
-    for k, point in enumerate(results["points"]):
-        weights = ",".join(f"{weight:g}" for weight in point["weights"])
-        borne = [each["value"] for each in point["vehicles"][count]]
-        sums = [sum(each["value"] for each in point["vehicles"][also]) for also in HARM_COUNTS]
-        rows.append((weights, *borne, *sums, *(points[k]["ratio"] for points in results["agents"].values())))
-    for name, braking in results["beside"].items():
-        sums = [sum(each["value"] for each in braking[also]) for also in HARM_COUNTS]
-        rows.append((name, *(each["value"] for each in braking[count]), *sums))
-    words = {"first": "first-impact", "total": "total"}[count]
+    by_recording = Conditions(recordings=results.get("recordings", 0)).by_recording
     note = (
-        f"Mean {words} harm of each vehicle, and mean first-impact and total harm of the line, m2/s2. Agents:"
-        " weighted harm of the agent divided by the weighted harm of the front"
+        f"Mean {'first-impact' if count == 'first' else 'total'} harm of each vehicle, and mean first-impact and total"
+        " harm of the line, m2/s2. Agents: weighted harm of the agent divided by the weighted harm of the front"
+        f"{by_recording}."
     )
-    note += f"{Conditions(recordings=results.get('recordings', 0)).by_recording}."
     return Sheet(f"Front of {results['scenario']}, {results['episodes']:,} worlds", columns, rows, note, gap=2)
 
 
 def hypervolume_sheet(results: Json) -> Sheet:
     """Return a table of the hypervolumes in ``results``, the content of ``front.json``."""
-    columns: list[Column | str] = [
-        "Reference",
-        "Of",
-        Column("Hypervolume"),
-        Column("Share of the front", digits=1, scale=100.0, unit=" %"),
-    ]
+    share = Column("Share of the front", digits=1, scale=100.0, unit=" %")
     rows = [
         (each["reference"], name, *(None if value is None else Estimate(**value) for value in volume.values()))
         for each in results["hypervolume"]
         for name, volume in each["of"].items()
     ]
-    return Sheet("Hypervolume of the mean harm (m2/s2)^N", columns, rows, gap=2)
+    return Sheet(
+        "Hypervolume of the mean harm (m2/s2)^N", ["Reference", "Of", Column("Hypervolume"), share], rows, gap=2
+    )

@@ -7,194 +7,160 @@ queue is cut into *chains* of a fixed number of vehicles. Each chain is one row 
 from __future__ import annotations
 
 import math
-from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
-from itertools import pairwise
-from pathlib import Path
+from collections import Counter
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.recorded.formats import Format
-from ethbrake_marl.extensions.recorded.reading import place_of
+from ethbrake_marl.extensions.recorded.states import FARTHEST_M, Recording
 from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.scenario.fields import QUANTITY
 
 # Allowed ratio: recorded change of gaps or positions / change that follows from the speeds. It is 3.28 if a file mixes
 # feet and metres. Gaps are checked only if the two changes have at least the correlation CORRELATED.
 SLOPE, CORRELATED = (0.5, 2.0), 0.7
 
-FARTHEST_M = QUANTITY.usual["gaps_m"].high  # longest gap that a scenario may have
-
 LEAST_M2 = 100.0  # positions are checked if the squared distances driven in a lane sum up to this: one drive of 10 m
 
 
-class Link(NamedTuple):
-    """A vehicle that follows another vehicle, and the gap to the vehicle ahead."""
+class Chains(NamedTuple):
+    """The chains of a recording."""
 
-    gap_m: float  # length of the gap (m)
-    opens_mps: float  # speed at which the gap opens (m/s)
-    follower: Any  # ``State`` of the vehicle
+    numbers: Floats  # [chains, 2 N - 1] gaps (m) and speeds (m/s) from front to rear
+    vehicles: list[str]  # the vehicles of each chain, such as ``2-3-4``
+    longest: int  # number of vehicles in the longest queue
+    left_out: Counter[str]  # description of data that were left out -> their number
 
 
-class Chains:
-    """Cuts the queues of vehicles in a recording into chains, and checks that gaps and positions agree with speeds.
+def cut_chains(recording: Recording, vehicles: int) -> Chains:
+    """Return the chains of a recording, in order of time and of the vehicle at the front of the queue.
 
-    Args:
-        file: path of the file, for error messages.
-        entry: format of the file.
-        every_s: time between two moments at which chains are formed, s.
-        vehicles: number of vehicles in a chain.
-        names: names of vehicles and lanes for error messages, by number; a number without a name is shown itself.
+    The first chain of a queue begins with its front vehicle, the next chain directly behind the first, and so on. At
+    one moment, a vehicle belongs to at most one chain.
 
+    Raises ``InvalidInput`` if too many vehicles have faulty data, or if the recorded gaps or positions do not change
+    as the recorded speeds require.
     """
+    left_out = Counter[str]()
+    states = recording.states[~recording.states.duplicated(["tick", "vehicle"])].reset_index(drop=True)
+    links = _links(recording, states, left_out)
+    _check_units(recording, states, links)
+    links = links[links["tick"] % recording.stride == 0]
+    behind = np.full(len(states) + 1, -1)  # index of the follower of each state; -1 if there is none, and of -1
+    behind[links["front_car"]] = links.index
+    gaps = np.zeros(len(states))
+    gaps[links.index] = links["gap"]
+    at_front = states["tick"] % recording.stride == 0
+    at_front[links.index] = False
+    fronts = starts = np.flatnonzero(at_front)
+    longest, chains, queues = 0, [np.empty((0, vehicles), int)], [starts[:0]]
+    while len(starts):
+        chain = [starts]
+        for _ in range(vehicles - 1):
+            chain.append(behind[chain[-1]])
+        members = np.column_stack(chain)
+        counts = (members >= 0).sum(axis=1)
+        longest = max(longest, (len(chains) - 1) * vehicles + int(counts.max()))
+        whole = counts == vehicles
+        left_out["vehicles that were too few, or left over, at the end of a queue"] += int(counts[~whole].sum())
+        chains.append(members[whole])
+        queues.append(fronts[whole])
+        starts, more = behind[members[:, -1]], behind[members[:, -1]] >= 0
+        starts, fronts = starts[more], fronts[more]
+    members = np.concatenate(chains)[np.argsort(np.concatenate(queues), kind="stable")]
+    numbers = np.column_stack([gaps[members[:, 1:]], states["speed"].to_numpy()[members]])
+    name_of = {number: recording.name(number) for number in states["vehicle"].unique()}
+    names = states["vehicle"].map(name_of).to_numpy()[members]
+    return Chains(numbers, ["-".join(each) for each in names], longest, left_out)
 
-    def __init__(self, file: Path, entry: Format, every_s: float, vehicles: int, names: dict[float, str]) -> None:
-        self.file, self.entry, self.every_s, self.vehicles, self.names = file, entry, every_s, vehicles, names
-        self.left_out = Counter[str]()
-        self.longest = 0  # number of vehicles in the longest queue
-        self._first_fault, self._faults, self._states = "", 0, 0
-        # sums over all gaps of a^2, b^2 and a b, for a recorded change a of a gap and the change b by the speeds
-        self._gaps = np.zeros(3)
-        # the same sums over changes of position, and the sum of b; by lane
-        self._ways: dict[float, Floats] = defaultdict(lambda: np.zeros(4))
 
-    def cut(self, moments: Iterator[tuple[float, list[Any]]]) -> Iterator[tuple[list[float], str]]:
-        """Yield each chain: its gaps (m) and speeds (m/s) from front to rear, and the ids of its vehicles (``2-3-4``).
+def _links(recording: Recording, states: Any, left_out: Counter[str]) -> Any:
+    """Return the states of vehicles that follow another one, with ``gap`` (m) and ``opens`` (its rate of change, m/s).
 
-        ``moments`` are pairs of a time (in units of ``every_s``) and the states of all vehicles. The first chain of a
-        queue begins with its front vehicle, the next chain directly behind the first, and so on. At one moment, a
-        vehicle belongs to at most one chain.
+    ``front_car`` is the index of the vehicle ahead in ``states``, which has each vehicle once per moment. Data that are
+    left out are added to ``left_out``. Raises ``InvalidInput`` if too many vehicles have faulty data.
+    """
+    entry = recording.entry
+    if entry.by_lane:
+        ordered = states.sort_values(["tick", "lane", "front"], ascending=[True, True, False], kind="stable")
+        states["ahead"] = ordered.groupby(["tick", "lane"])["vehicle"].shift(1).fillna(-1.0)
+    others = states[["tick", "vehicle", "lane", "front", "side", "dx", "dy", "length", "speed"]]
+    others = others.add_suffix("_ahead").assign(front_car=states.index)
+    pairs = states.merge(others, "left", left_on=["tick", "ahead"], right_on=["tick_ahead", "vehicle_ahead"])
+    along = pairs["front_ahead"] - pairs["length_ahead"] * pairs["dx_ahead"] - pairs["front"]
+    across = pairs["side_ahead"] - pairs["length_ahead"] * pairs["dy_ahead"] - pairs["side"]
+    gap = pairs["gap"] = along * pairs["dx"] + across * pairs["dy"]
+    slowest = np.minimum(pairs["speed_ahead"], pairs["speed"])
+    noise = (gap <= 0.0) & (slowest < entry.standing_mps)
+    same_lane = pairs["lane_ahead"] == pairs["lane"]
+    missing, overlap = (pairs["ahead"] >= 0.0) & gap.isna(), (gap <= 0.0) & same_lane & ~noise
+    is_row = pairs["tick"] % recording.stride == 0
+    _check_faults(recording, pairs[(missing | overlap) & is_row], left_out)
+    used = gap.notna() & ~overlap
+    for what, odd in (
+        ("links of standing cars whose gap was recorded as 0 or less", noise),
+        ("links to another lane, or of a vehicle that rolls backwards", ~same_lane | (slowest < 0.0)),
+        (f"links of more than {FARTHEST_M:,.0f} m", gap > FARTHEST_M),
+    ):
+        left_out[what] += int((used & odd & is_row).sum())
+        used &= ~odd
+    links = pairs.assign(opens=pairs["speed_ahead"] - pairs["speed"])[used]
+    return links.sort_values("gap", kind="stable").drop_duplicates("front_car").astype({"front_car": int})
 
-        After the last chain, ``InvalidInput`` is raised if too many vehicles have faulty data, or if the recorded gaps
-        or positions do not change as the recorded speeds require.
-        """
-        last, before, before_by_id = math.nan, dict[float, Link](), dict[float, Any]()
-        for tick, there in moments:
-            by_id = {state.id: state for state in reversed(there)}
-            row = tick == round(tick)  # else the moment is used for the checks only
-            behind = self._links(there, by_id, row)
-            if tick - last == 1.0 or (not row and tick - last < 1.0):
-                self._compare(behind, before, by_id, before_by_id, (tick - last) * self.every_s)
-            followers = {link.follower.id for link in behind.values()}
-            for state in reversed(by_id.values()):
-                if state.id in followers or not row:
-                    continue
-                queue = [Link(0.0, 0.0, state)]
-                while queue[-1].follower.id in behind:
-                    queue.append(behind[queue[-1].follower.id])
-                self.longest = max(self.longest, len(queue))
-                yield from self._rows(queue)
-            last, before, before_by_id = tick, behind, by_id
-        self._check()
 
-    def _rows(self, queue: Sequence[Link]) -> Iterator[tuple[list[float], str]]:
-        n = self.vehicles
-        for k in range(0, len(queue) - n + 1, n):
-            chain = queue[k : k + n]
-            row = [link.gap_m for link in chain[1:]] + [link.follower.speed for link in chain]
-            yield ([round(number, 3) + 0.0 for number in row], "-".join(self._name(link.follower.id) for link in chain))
-        self.left_out["vehicles that were too few, or left over, at the end of a queue"] += len(queue) % n
+def _check_faults(recording: Recording, faulty: Any, left_out: Counter[str]) -> None:
+    """Count the ``faulty`` vehicles and those that are recorded twice; raise ``InvalidInput`` if they are too many."""
+    states = recording.states[recording.states["tick"] % recording.stride == 0]
+    twice = states[states.duplicated(["tick", "vehicle"])]
+    number = len(faulty) + len(twice)
+    if number > recording.entry.impossible * len(states):
+        both = pd.concat([faulty, twice.assign(gap=math.inf)])
+        first = both.sort_values(["tick", "vehicle"], kind="stable").iloc[0]
+        ahead = f"vehicle {recording.name(first['ahead'])}"
+        fault = f"follows {ahead}, which is not recorded at this time"
+        if first["gap"] == math.inf:
+            fault = "is recorded twice for this time"
+        elif first["gap"] <= 0.0:
+            fault = f"overlaps {ahead} ahead by {-first['gap']:.2f} m"
+        raise InvalidInput(
+            f"{recording.source.place(int(first['row']))}: vehicle {recording.name(first['vehicle'])} {fault};"
+            f" {number:,} of {len(states):,} positions of vehicles are faulty (recorded twice, overlapping, or behind a"
+            f" vehicle that is not recorded), but at most {recording.entry.impossible:.0%} may be faulty"
+        )
+    left_out["vehicles that overlap, are recorded twice, or follow one that is not recorded"] += number
 
-    def _name(self, number: float) -> str:
-        return self.names.get(number) or f"{number:.0f}"
 
-    def _links(self, there: list[Any], by_id: dict[float, Any], row: bool) -> dict[float, Link]:
-        """Return the follower of each vehicle at one moment, by the id of the vehicle ahead; count faulty data.
+def _check_units(recording: Recording, states: Any, links: Any) -> None:
+    """Raise ``InvalidInput`` if gaps or positions change otherwise than the speeds say."""
+    file, entry = recording.source.file, recording.entry
+    passed_s = recording.near / entry.hertz
 
-        ``there`` are the states of all vehicles. ``by_id`` are the same states by id; of a vehicle that is recorded
-        twice, it has the first state. Without ``row`` (no chains are formed at this moment), neither omitted nor faulty
-        data are counted.
-        """
-        behind, in_lane = dict[float, Link](), dict[float, float]()  # in_lane: vehicle -> vehicle ahead in the lane
-        if self.entry.by_lane:
-            for first, second in pairwise(sorted(there, key=lambda state: (state.lane, -state.front))):
-                if first.lane == second.lane and first.id != second.id:
-                    in_lane[second.id] = first.id
-        for state in there:
-            number = in_lane.get(state.id, state.preceding)
-            ahead: Any = by_id.get(number) if number >= 0.0 else None
-            gap, slowest = _gap(ahead, state) if ahead else math.nan, min(ahead.speed, state.speed) if ahead else 0.0
-            noise = gap <= 0.0 and slowest < self.entry.standing_mps
-            fault = (
-                f"is recorded twice for this time (see {self._line(by_id[state.id])})" if by_id[state.id] is not state
-                else f"follows vehicle {self._name(number)}, which is not recorded at this time"
-                if number >= 0.0 and not ahead
-                else f"overlaps vehicle {self._name(ahead.id)} ahead by {-gap:.2f} m"
-                if gap <= 0.0 and ahead.lane == state.lane and not noise
-                else ""
-            )  # fmt: skip
-            if fault:
-                place = place_of(self.file, state.line)
-                self._first_fault = self._first_fault or f"{place}: vehicle {self._name(state.id)} {fault}"
-                self._faults += row
-            elif noise:
-                self.left_out["links of standing cars whose gap was recorded as 0 or less"] += row
-            elif ahead and (ahead.lane != state.lane or slowest < 0.0):
-                self.left_out["links to another lane, or of a vehicle that rolls backwards"] += row
-            elif ahead and gap > FARTHEST_M:
-                self.left_out[f"links of more than {FARTHEST_M:,.0f} m"] += row
-            elif ahead and gap < (behind[ahead.id].gap_m if ahead.id in behind else math.inf):
-                behind[ahead.id] = Link(gap, ahead.speed - state.speed, state)
-        self._states += len(there) * row
-        return behind
+    def changes(now: Any, same: list[str], place: str, speed: str) -> Any:
+        """Return the squares and the product of the recorded change and of that by the speeds; and the latter."""
+        then = now[["tick", *same, place, speed]].assign(tick=now["tick"] + recording.near)
+        both = now.merge(then, on=["tick", *same], suffixes=("", "_then"))
+        moved = both[place] - both[f"{place}_then"]
+        said = (both[speed] + both[f"{speed}_then"]) / 2.0 * passed_s
+        return both.assign(moved2=moved * moved, said2=said * said, product=moved * said, said=said)
 
-    def _line(self, state: Any) -> str:
-        return place_of(self.file, state.line).removeprefix(f"{self.file}, ")
-
-    def _compare(
-        self,
-        behind: dict[float, Link],
-        before: dict[float, Link],
-        by_id: dict[float, Any],
-        by_id_before: dict[float, Any],
-        passed_s: float,
-    ) -> None:
-        """Add the changes of gaps and positions between two moments to sums that ``cut`` checks after the last chain.
-
-        ``behind`` and ``before`` are results of ``_links`` at the later and the earlier moment; ``passed_s`` is the
-        time between them, s.
-        """
-        for each in behind.keys() & before.keys():
-            now, then = behind[each], before[each]
-            if now.follower.id == then.follower.id:
-                opened, said = now.gap_m - then.gap_m, (now.opens_mps + then.opens_mps) / 2.0 * passed_s
-                self._gaps += opened * opened, said * said, opened * said
-        for each in by_id.keys() & by_id_before.keys() if self.entry.by_lane else ():
-            now, then = by_id[each], by_id_before[each]
-            if now.lane == then.lane:
-                moved, said = now.front - then.front, (now.speed + then.speed) / 2.0 * passed_s
-                self._ways[now.lane] += moved * moved, said * said, moved * said, said
-
-    def _check(self) -> None:
-        file, entry = self.file, self.entry
-        for lane, (_, said, product, way) in sorted(self._ways.items()):
-            if said >= LEAST_M2 and not (SLOPE[0] < product / said < SLOPE[1] and way > 0.0):
+    if entry.by_lane:
+        ways = (
+            changes(states, ["vehicle", "lane"], "front", "speed").groupby("lane")[["said2", "product", "said"]].sum()
+        )
+        for lane, said2, product, way in ways[ways["said2"] >= LEAST_M2].itertuples():
+            if not (SLOPE[0] < product / said2 < SLOPE[1] and way > 0.0):
                 raise InvalidInput(
-                    f"{file}: in lane {self._name(lane)}, positions (column front) change by {product / said:.2f} times"
-                    f" the distance that the speeds imply{'' if way > 0.0 else ', and the speeds are negative'}; front"
-                    " must increase in the direction of travel, speeds must be above 0, and both columns must be in"
-                    f" {entry.units}"
+                    f"{file}: in lane {recording.name(lane)}, positions (column front) change by {product / said2:.2f}"
+                    f" times the distance that the speeds imply{'' if way > 0.0 else ', and the speeds are negative'};"
+                    " front must increase in the direction of travel, speeds must be above 0, and both columns must be"
+                    f" in {entry.units}"
                 )
-        if self._faults > entry.impossible * self._states:
-            raise InvalidInput(
-                f"{self._first_fault}; {self._faults:,} of {self._states:,} positions of vehicles are faulty (recorded"
-                " twice, overlapping, or behind a vehicle that is not recorded), but at most"
-                f" {entry.impossible:.0%} may be faulty"
-            )
-        self.left_out["vehicles that overlap, are recorded twice, or follow one that is not recorded"] += self._faults
-        opened, said, product = self._gaps.tolist()
-        if product > CORRELATED * math.sqrt(opened * said) > 0.0 and not SLOPE[0] < product / said < SLOPE[1]:
-            raise InvalidInput(
-                f"{file}: the recorded gaps change by {product / said:.2f} times the amount that the speeds imply (3.28"
-                " means gaps in feet and speeds in m/s; 0.28 means gaps in m and speeds in km/h); the file must be in"
-                f" {entry.units}"
-            )
-
-
-def _gap(ahead: Any, state: Any) -> float:
-    """Return the gap (m) from the rear of ``ahead`` to the front of ``state``, in ``state``'s direction of travel."""
-    along = ahead.front - ahead.length * ahead.dx - state.front
-    across = ahead.side - ahead.length * ahead.dy - state.side
-    return float(along * state.dx + across * state.dy)
+    gaps = changes(links, ["vehicle", "ahead"], "gap", "opens")
+    moved2, said2, product = gaps[["moved2", "said2", "product"]].sum()
+    if product > CORRELATED * math.sqrt(moved2 * said2) > 0.0 and not SLOPE[0] < product / said2 < SLOPE[1]:
+        raise InvalidInput(
+            f"{file}: the recorded gaps change by {product / said2:.2f} times the amount that the speeds imply (3.28"
+            " means gaps in feet and speeds in m/s; 0.28 means gaps in m and speeds in km/h); the file must be in"
+            f" {entry.units}"
+        )

@@ -1,28 +1,26 @@
 """Read all recordings in a folder; return rows, each with the gaps and speeds of one chain of vehicles at one moment.
 
-Each file is read once. The states of its vehicles at regular times are stored in a temporary database on disk, which
-returns them in order of time. Therefore memory contains only some lines of a file, the vehicles' states at one moment,
-and the rows.
+Only one file's states are in memory at a time, besides the rows.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
-import sqlite3
 from collections import Counter
 from collections.abc import Callable
-from contextlib import closing
 from fnmatch import fnmatch
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from ethbrake_marl.errors import InvalidInput, plain_text
-from ethbrake_marl.extensions.recorded.chains import Chains
+from ethbrake_marl.extensions.recorded.chains import cut_chains
 from ethbrake_marl.extensions.recorded.formats import Format
 from ethbrake_marl.extensions.recorded.reading import LARGEST_BYTES, NotARecording
-from ethbrake_marl.extensions.recorded.states import STATE_TABLE, keep_states, moments
+from ethbrake_marl.extensions.recorded.states import read_recording
 from ethbrake_marl.files.plain import open_plain
 from ethbrake_marl.scenario.vehicle_types import MOST_NUMBERS
 
@@ -54,40 +52,30 @@ def read_rows(
     if not files and (not refused or not folder.is_dir()):
         patterns = " or ".join(entry.files)
         raise InvalidInput(f"{folder}: must be a folder with files of {entry.title}; their names match {patterns}")
-    numbers, longest, left_out, others = 2 * vehicles - 1, 0, Counter[str](), dict[str, str]()
-    with closing(sqlite3.connect("")) as store:  # a temporary file on disk
-        store.execute(f"CREATE TABLE chain({','.join(f'n{k}' for k in range(numbers))},file,vehicles)")
-        store.execute(STATE_TABLE)
-        for shown, file in files.items():
-            names: dict[str, float] = {}
-            try:
-                with store:  # all chains of a file, or none
-                    keep_states(store, file, entry, every_s, names, partial(progress, f"read: {shown}"))
-                    named = {number: plain_text(name) for name, number in names.items()}
-                    chains = Chains(file, entry, every_s, vehicles, named)
-                    rows = ([*row, shown, who] for row, who in chains.cut(moments(store)))
-                    store.executemany(f"INSERT INTO chain VALUES ({', '.join('?' * (numbers + 2))})", rows)
-                    store.execute("DELETE FROM state")
-                left_out.update(chains.left_out)
-                longest = max(longest, chains.longest)
-            except NotARecording as error:
-                others[shown] = str(error)
-            except InvalidInput as error:
-                refused.append(str(error))
-            except sqlite3.Error as error:
-                raise InvalidInput(
-                    f"{folder}: the temporary database that sorts the recorded rows failed ({error})"
-                ) from None
-        if len(others) == len(files) and not refused:
-            raise InvalidInput(f"{folder}: contains no recording of {entry.title}: {'; '.join(others.values())}")
-        ((seen,),) = store.execute("SELECT COUNT(*) FROM chain")
-        each_of = seen * numbers // MOST_NUMBERS + 1
-        # Rows of the same vehicles are next to each other in this order, so every k-th row keeps all vehicles.
-        counted = "SELECT *, rowid AS row, ROW_NUMBER() OVER (ORDER BY file, vehicles, rowid) AS at FROM chain"
-        chosen = store.execute(f"SELECT * FROM ({counted}) WHERE at % ? = 0 ORDER BY row", (each_of,)).fetchall()
-    left_out[f"chains: a table has at most {MOST_NUMBERS:,} numbers, so one in {each_of} is used"] = seen - len(chosen)
-    lines, of = [list(row[:-4]) for row in chosen], [row[-4:-2] for row in chosen]
-    return Rows(lines, of, seen, longest, left_out, refused, [*others, *twice])
+    longest, left_out, others = 0, Counter[str](), dict[str, str]()
+    numbers, of = [np.empty((0, 2 * vehicles - 1))], list[tuple[str, str]]()
+    for shown, file in files.items():
+        try:
+            chains = cut_chains(read_recording(file, entry, every_s, partial(progress, f"read: {shown}")), vehicles)
+        except NotARecording as error:
+            others[shown] = str(error)
+        except InvalidInput as error:
+            refused.append(str(error))
+        else:
+            numbers.append(chains.numbers)
+            of += [(shown, each) for each in chains.vehicles]
+            left_out.update(chains.left_out)
+            longest = max(longest, chains.longest)
+    if len(others) == len(files) and not refused:
+        raise InvalidInput(f"{folder}: contains no recording of {entry.title}: {'; '.join(others.values())}")
+    each_of = len(of) * (2 * vehicles - 1) // MOST_NUMBERS + 1
+    # Rows of the same vehicles are next to each other in this order, so every k-th row keeps all vehicles.
+    chosen = sorted(sorted(range(len(of)), key=of.__getitem__)[each_of - 1 :: each_of])
+    left_out[f"chains: a table has at most {MOST_NUMBERS:,} numbers, so one in {each_of} is used"] = len(of) - len(
+        chosen
+    )
+    rows = [[round(number, 3) + 0.0 for number in row] for row in np.concatenate(numbers)[chosen].tolist()]
+    return Rows(rows, [of[k] for k in chosen], len(of), longest, left_out, refused, [*others, *twice])
 
 
 def _search(folder: Path, entry: Format) -> tuple[dict[str, Path], list[str], list[str]]:
@@ -102,7 +90,6 @@ def _search(folder: Path, entry: Format) -> tuple[dict[str, Path], list[str], li
     files, seen, refused, twice = dict[str, Path](), set[object](), list[str](), list[str]()
     walk = os.walk(folder, onerror=lambda error: refused.append(f"{error.filename}: cannot be read ({error.strerror})"))
     everything = {Path(top, name) for top, _, names in walk for name in names}
-    sizes = Counter(map(_size, everything))
     for file in sorted(everything):
         below = file.relative_to(folder)
         matches = any(fnmatch(file.name.lower(), pattern) for pattern in entry.files)
@@ -110,20 +97,13 @@ def _search(folder: Path, entry: Format) -> tuple[dict[str, Path], list[str], li
             continue
         shown = plain_text(below.as_posix())
         again = entry.headless and file.suffix == ".txt" and file.with_suffix(".csv") in everything
-        content = _content(file) if sizes[_size(file)] > 1 else file
+        content = _content(file)
         if again or shown in files or content in seen:
             twice.append(shown)
         else:
             seen.add(content)
             files[shown] = file
     return files, refused, twice
-
-
-def _size(file: Path) -> int:
-    try:
-        return file.stat().st_size
-    except OSError:
-        return -1
 
 
 def _content(file: Path) -> object:

@@ -21,8 +21,8 @@ class Format(NamedTuple):
 
     title: str  # name of the data set
     files: tuple[str, ...]  # patterns of the names of its files, in lower case
-    # Quantity -> name of its column. A quantity is a field of ``states.State``, or ``gap``, the gap behind a vehicle. A
-    # name with ``NUMBER`` means one column for each vehicle: Speed1, Speed2, ...
+    # Quantity -> name of its column. A name with ``NUMBER`` means one column for each vehicle: Speed1, Speed2, ... The
+    # quantity ``gap`` is the gap behind a vehicle.
     columns: dict[str, str]
     units: str  # units of lengths and speeds, for messages
     licence: str  # sentence on the licence, for the key ``source`` of the scenario
@@ -34,22 +34,20 @@ class Format(NamedTuple):
     impossible: float = 0.0
     # If one of two vehicles is slower than this (m/s), a gap of 0 or less is noise and not a fault.
     standing_mps: float = -math.inf
-    elsewhere: tuple[str, ...] = ()  # names of streets; rows that contain one of them are left out
+    streets: tuple[str, ...] = ()  # values of the column Location, if there is one, whose rows are left out
     alone: float = 0.0  # value in the column of the vehicle ahead if no vehicle is ahead
-    mixed: bool = False  # True if the folder may contain other tables besides recordings
     headless: tuple[str, ...] = ()  # names of the columns of a text file without a header, separated by blanks
-    texts: tuple[int, ...] = ()  # positions in ``columns`` of the columns with names instead of numbers
-    separators: str = ","  # characters that may separate cells
+    texts: tuple[str, ...] = ()  # quantities whose columns have names instead of numbers
 
     @property
     def gaps(self) -> bool:
-        """Whether files contain gaps instead of positions and lengths; an empty cell means a gap was not measured."""
+        """Whether files contain gaps instead of positions and lengths; an empty cell means it was not measured."""
         return "gap" in self.columns
 
     @property
     def by_lane(self) -> bool:
         """Whether the vehicle ahead must be determined from lanes and positions, because no column contains its id."""
-        return "preceding" not in self.columns and not self.gaps
+        return "ahead" not in self.columns and not self.gaps
 
 
 _NGSIM_TEXT = (
@@ -62,43 +60,41 @@ _LEVELX = "is lent on request for non-commercial use and must not be passed on: 
 FORMATS: dict[DataFormat, Format] = {
     "highd": Format(
         "highD", ("*_tracks.csv",),
-        {"tick": "frame", "id": "id", "lane": "laneId", "preceding": "precedingId", "front": "x", "length": "width",
+        {"time": "frame", "vehicle": "id", "lane": "laneId", "ahead": "precedingId", "front": "x", "length": "width",
          "speed": "xVelocity"},
         "m and m/s", f"highD {_LEVELX}", hertz=25.0,
     ),
     "exid": Format(
         "exiD", ("*_tracks.csv",),
-        {"tick": "frame", "id": "trackId", "preceding": "leadId", "front": "xCenter", "side": "yCenter",
+        {"time": "frame", "vehicle": "trackId", "ahead": "leadId", "front": "xCenter", "side": "yCenter",
          "heading": "heading", "length": "length", "speed": "lonVelocity"},
         "m and m/s", f"exiD {_LEVELX}", hertz=25.0, impossible=0.01, alone=-1.0,
     ),
     "ngsim": Format(
         "NGSIM", ("*.csv", "*.txt"),
-        {"tick": "Global_Time", "id": "Vehicle_ID", "lane": "Lane_ID", "preceding": "Preceding", "front": "Local_Y",
+        {"time": "Global_Time", "vehicle": "Vehicle_ID", "lane": "Lane_ID", "ahead": "Preceding", "front": "Local_Y",
          "length": "v_Length", "speed": "v_Vel"},
         "feet and feet/s",
         "NGSIM is of the US Department of Transportation, CC BY-SA: name the source, and share what you make of it"
         " under the same licence. Streets with crossings (lankershim, peachtree) are left out.",
-        metres=FOOT_M, mps=FOOT_M, ticks=0.01, impossible=0.05, elsewhere=("lankershim", "peachtree"), mixed=True,
-        headless=_NGSIM_TEXT,
+        metres=FOOT_M, mps=FOOT_M, ticks=0.01, impossible=0.05, streets=("lankershim", "peachtree"),
+        headless=_NGSIM_TEXT, texts=("location",),
     ),
     "openacc": Format(
-        "OpenACC", ("*.csv",), {"tick": "Time", "speed": f"Speed{NUMBER}", "gap": f"IVS{NUMBER}"}, "m and m/s",
+        "OpenACC", ("*.csv",), {"time": "Time", "speed": f"Speed{NUMBER}", "gap": f"IVS{NUMBER}"}, "m and m/s",
         "OpenACC is of the European Commission's Joint Research Centre, CC BY 4.0: name the source, and say that these"
         " rows are made from it.",
-        ticks=10.0, impossible=0.01, standing_mps=0.5, mixed=True,
+        ticks=10.0, impossible=0.01, standing_mps=0.5,
     ),
 }  # fmt: skip
 
-REFUSED = {  # format without lanes -> columns that its files have, columns that they do not have
-    "inD or rounD": ({"trackid", "xcenter", "lonvelocity"}, {"leadid"})
-}
+# The file beside each recording of highD that says in which direction each vehicle drives.
+HIGHD_META = FORMATS["highd"]._replace(columns={"vehicle": "id", "direction": "drivingDirection"})
 
 # Value of ``units`` -> length in m of the unit of length, speed in m/s of the unit of speed, names of both units.
 _UNITS = {"m": (1.0, 1.0, "m and m/s"), "ft": (FOOT_M, FOOT_M, "feet and feet/s"), "km/h": (1.0, 1 / 3.6, "m and km/h")}
 
-# Key of ``--columns`` -> quantity, a field of ``states.State``.
-_ROLES = {"time": "tick", "vehicle": "id", "lane": "lane", "front": "front", "length": "length", "speed": "speed"}
+_ROLES = ("time", "vehicle", "lane", "front", "length", "speed")  # keys of ``--columns`` that name a column
 
 
 def format_of(name: DataFormat, columns: str = "") -> Format:
@@ -134,8 +130,7 @@ def format_of(name: DataFormat, columns: str = "") -> Format:
                 " for instance 1000 for ms"
             )
     return Format(
-        "the table", ("*.csv", "*.txt", "*.parquet"), {role: settings[key] for key, role in _ROLES.items()},
-        units,
+        "the table", ("*.csv", "*.txt", "*.parquet"), {role: settings[role] for role in _ROLES}, units,
         "Its licence is unknown: look it up where the data come from.", metres, mps, 1.0 / (second or 1.0), 0.0, 0.01,
-        mixed=True, texts=(1, 2), separators=",;\t",
+        texts=("vehicle", "lane"),
     )  # fmt: skip

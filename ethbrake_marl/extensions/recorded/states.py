@@ -1,28 +1,26 @@
-"""Convert the numbers of a recording to states of vehicles: position, direction, length and speed, in m and m/s.
+"""Convert the columns of a recording to states of vehicles: position, direction, length and speed, in m and m/s.
 
-The states of all vehicles at regular times are stored in a temporary database on disk. ``every_s`` is the time between
-two moments at which chains of vehicles are formed, s. A *tick* is the interval between two recorded moments.
+The states of all formats are one table, sorted by time and vehicle, so that the order of a file's rows has no effect.
+A *tick* is the interval between two recorded moments.
 """
 
 from __future__ import annotations
 
-import sqlite3
-from collections import namedtuple
-from collections.abc import Callable, Iterator
-from itertools import groupby
-from operator import itemgetter
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.recorded.formats import Format
-from ethbrake_marl.extensions.recorded.reading import Piece, read_pieces
-from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.errors import InvalidInput, plain_text
+from ethbrake_marl.extensions.recorded.formats import HIGHD_META, Format
+from ethbrake_marl.extensions.recorded.reading import Source, open_source, read_columns
 from ethbrake_marl.scenario.fields import QUANTITY
 
 FASTEST_MPS, LONGEST_M = 75.0, 40.0  # largest speed (270 km/h) and length of a road vehicle
+
+FARTHEST_M = QUANTITY.usual["gaps_m"].high  # longest gap that a scenario may have
 
 # Range of the lengths of cars and vans (m), and the least share of such vehicles. Lengths in feet violate it.
 CAR_M, LEAST_CARS = (2.5, 8.0), 1 / 3
@@ -33,13 +31,26 @@ CHECK_S = 1.0
 
 OFF = 0.05  # largest accepted distance of a time from a tick, in ticks
 
-# State of a vehicle at one moment, in m and m/s. ``front`` and ``side`` are x and y of its front, ``dx`` and ``dy`` its
-# direction of travel (1 and 0 if positions are along the road). ``preceding`` is the id of the vehicle ahead, negative
-# if there is none. ``length`` is 0 if the data contain gaps. ``tick`` is the time, in units of the time between two
-# moments that become rows. A moment becomes rows if ``tick`` is whole. ``line`` is the number of the line in the file.
-State = namedtuple("State", "tick id lane preceding front side dx dy length speed line")
 
-STATE_TABLE = f"CREATE TABLE state({','.join(State._fields)})"
+class Recording(NamedTuple):
+    """The states of the vehicles of one file at the moments that become rows, and at those that check them.
+
+    ``states`` has one line per vehicle and moment, sorted by ``tick`` (number of ticks since the file's first moment)
+    and ``vehicle``. ``ahead`` is the vehicle ahead, negative if there is none. ``front`` and ``side`` are x and y of
+    its front (m), ``dx`` and ``dy`` its direction of travel (1 and 0 if positions are along the road). ``length`` (m)
+    is 0 if the data contain gaps. ``speed`` is in m/s, ``row`` the row in the file.
+    """
+
+    source: Source
+    entry: Format
+    stride: int  # number of ticks between two moments that become rows: all multiples of it
+    near: int  # number of ticks between two moments that are compared
+    states: Any
+    names: dict[float, str]  # number of a vehicle or lane -> its name, if files have names instead of numbers
+
+    def name(self, number: float) -> str:
+        """Return the name of a vehicle or lane."""
+        return self.names.get(number) or f"{number:.0f}"
 
 
 def check_every(every_s: float, entry: Format, what: str) -> int:
@@ -57,61 +68,48 @@ def check_every(every_s: float, entry: Format, what: str) -> int:
     return round(stride)
 
 
-def keep_states(
-    store: sqlite3.Connection,
-    file: Path,
-    entry: Format,
-    every_s: float,
-    names: dict[str, float],
-    progress: Callable[[int, int], None],
-) -> None:
-    """Read a recording, and write the states of its vehicles at regular times into a database.
+def read_recording(file: Path, entry: Format, every_s: float, progress: Callable[[int, int], None]) -> Recording:
+    """Read the states of the vehicles in a file at regular times, ``every_s`` apart, from the file's first moment.
 
-    ``store`` is the database, with an empty table ``state``. ``names`` maps names of vehicles and lanes to numbers; new
-    names are added to it. ``progress`` is called with the amount of data read so far and the size of the file (KiB).
-    Raises ``InvalidInput``, which names file, line and column, for an impossible value, for instance a length of 0 m.
+    The file is read twice: first the times, then the rows at the moments that are used. Raises ``InvalidInput``, which
+    names file, line and column, for an impossible value, for instance a length of 0 m.
     """
-    turned, first, stride, cars, states = np.empty((0, 2)), None, 1, 0, 0
-    for piece in read_pieces(file, entry, list(entry.columns.values()), names, progress):
-        times = piece.values[:, 0]
-        if first is None:
-            first, entry = times[0], entry if entry.hertz else _with_rate(entry, times, every_s)
-            stride = check_every(every_s, entry, entry.title)
-            turned = _directions(file, entry) if entry.title == "highD" else turned
-        ticks = (times - first) * entry.ticks
+    source = open_source(file, entry)
+    first = [quantity for quantity in ("time", "location") if quantity in source.at]
+    moments = (each["time"].unique() for each in read_columns(source, entry, first, progress))
+    times = np.unique(np.concatenate([np.empty(0), *moments]))
+    if not len(times):
+        right = f" except those from {' and '.join(entry.streets)}, which have crossings" * bool(entry.streets)
+        raise InvalidInput(f"{file}: contains no rows of data{right}")
+    if not entry.hertz:
+        entry = _with_rate(entry, times, every_s)
+    stride = check_every(every_s, entry, entry.title)
+    near = max(1, min(stride, int(CHECK_S * entry.hertz)))
+    pieces = []
+    for piece in read_columns(source, entry, list(source.at), progress):
+        ticks = (piece["time"] - times[0]) * entry.ticks
+        whole = ticks.round()
         right = f"must be a multiple of {1 / entry.hertz:g} s after the first time"
-        piece.refuse(~(abs(ticks - np.rint(ticks)) <= OFF), 0, right)
-        near = max(1, min(stride, int(CHECK_S * entry.hertz)))
-        taken = np.isin(np.rint(ticks) % stride, (0.0, near % stride))
-        some = piece._replace(values=piece.values[taken], lines=piece.lines[taken])
-        kept_states = _states(some, entry, np.rint(ticks[taken]) / stride, turned)
-        store.executemany(f"INSERT INTO state VALUES ({', '.join('?' * len(State._fields))})", kept_states.tolist())
-        lengths = kept_states[:, State._fields.index("length")]
-        cars, states = cars + int(((lengths > CAR_M[0]) & (lengths < CAR_M[1])).sum()), states + len(kept_states)
-    if not entry.gaps and cars < LEAST_CARS * states:
-        raise InvalidInput(
-            f"{file}: only {cars:,} of {states:,} vehicles are {CAR_M[0]:g} to {CAR_M[1]:g} m long, but at least a"
-            f" third should be; lengths and speeds must be in {entry.units}"
-        )
+        source.refuse(abs(ticks - whole) > OFF, "time", piece["time"], right)
+        pieces.append(piece.assign(tick=whole.astype("int64"))[np.isin(whole % stride, (0, near % stride))])
+    raw = pd.concat(pieces)
+    names = dict[float, str]()
+    if entry.gaps:
+        states = _openacc(raw, source, entry)
+    else:
+        if "lane" in entry.texts:
+            names = _number_names(raw, source)
+        states = _along_road(raw, source, entry)
+        if entry.title == "highD":
+            _turn_highd(states, source)
+        elif entry.title == "exiD":
+            _turn_exid(states, raw)
+        _check(states, source, entry)
+    states["row"] = states.index
+    return Recording(source, entry, stride, near, states.sort_values(list(states), ignore_index=True), names)
 
 
-def moments(store: sqlite3.Connection) -> Iterator[tuple[float, list[Any]]]:
-    """Yield (time, states) for each moment in the table ``state``, in order of time.
-
-    The time is in units of ``every_s``. The states of a moment have the order of the file.
-    """
-    for tick, rows in groupby(store.execute("SELECT * FROM state ORDER BY tick, line"), itemgetter(0)):
-        yield tick, [State(*row) for row in rows]
-
-
-def _directions(file: Path, entry: Format) -> Floats:
-    """Return the id and the driving direction of each vehicle in a highD recording, [vehicles, 2], sorted by id."""
-    meta = read_pieces(Path(f"{str(file)[:-4]}Meta.csv"), entry, ("id", "drivingDirection"))
-    turned = np.concatenate([piece.values for piece in meta])
-    return turned[np.argsort(turned[:, 0])]
-
-
-def _with_rate(entry: Format, times: Floats, every_s: float) -> Format:
+def _with_rate(entry: Format, times: Any, every_s: float) -> Format:
     """Return the format ``entry`` with the sampling rate of a file, computed from its ``times`` [rows].
 
     A tick is the smallest difference between two times, and the rate is 1 / tick. If some times are not multiples of
@@ -127,70 +125,101 @@ def _with_rate(entry: Format, times: Floats, every_s: float) -> Format:
     return entry._replace(hertz=hertz, ticks=entry.ticks * hertz)
 
 
-def _states(piece: Piece, entry: Format, ticks: Floats, turned: Floats) -> Floats:
-    """Return the states in the rows ``piece`` of a file, one per vehicle and time, [states, fields of State].
+def _number_names(raw: Any, source: Source) -> dict[float, str]:
+    """Replace the names of vehicles and lanes by numbers, in the order of the names; return the names by number."""
+    for column in ("vehicle", "lane"):
+        source.refuse(raw[column] == "", column, raw[column], "must be a name")
+    text = pd.concat([raw["vehicle"], raw["lane"]]).drop_duplicates()
+    names = pd.DataFrame({"number": pd.to_numeric(text, errors="coerce"), "text": text}).sort_values(["number", "text"])
+    numbers = {name: float(k) for k, name in enumerate(names["text"])}
+    for column in ("vehicle", "lane"):
+        raw[column] = raw[column].map(numbers)
+    return {number: plain_text(name) for name, number in numbers.items()}
 
-    ``ticks`` [rows] is the time since the first row of the file, in units of ``every_s``. ``turned`` [vehicles, 2] is
-    the result of ``_directions``, for highD only.
-    """
-    if entry.gaps:
-        return _of_gaps(piece, entry, ticks)
-    columns, at = dict(zip(entry.columns, piece.values.T, strict=True)), list(entry.columns).index
-    for role in ("id", "lane", "preceding") if not entry.texts else ():
-        if role in columns:
-            value, least = columns[role], entry.alone if role == "preceding" else 0.0
-            odd, right = (value != np.rint(value)) | (value < least), f"must be a whole number, {least:g} or above"
-            piece.refuse(odd, at(role), right)
-    zero = np.zeros(len(ticks))
-    who, lane, ahead = columns["id"], columns.get("lane", zero), columns.get("preceding", zero - 1.0)
-    ahead = np.where(ahead == entry.alone, -1.0, ahead)
-    front, side, length = (columns.get(role, zero) * entry.metres for role in ("front", "side", "length"))
-    dx, dy, speed = zero + 1.0, zero, columns["speed"] * entry.mps
+
+def _along_road(raw: Any, source: Source, entry: Format) -> Any:
+    """Return the states of a format with ids and positions along the road."""
+    zero = pd.Series(0.0, raw.index)
+    for role, least in (("vehicle", 0.0), ("lane", 0.0), ("ahead", entry.alone)):
+        if role in raw:
+            odd = (raw[role] != raw[role].round()) | (raw[role] < least)
+            source.refuse(odd, role, raw[role], f"must be a whole number, {least:g} or above")
+    ahead = raw.get("ahead", zero - 1.0)
+    return pd.DataFrame(
+        {
+            "tick": raw["tick"], "vehicle": raw["vehicle"], "lane": raw.get("lane", zero),
+            "ahead": ahead.where(ahead != entry.alone, -1.0), "front": raw["front"] * entry.metres,
+            "side": raw.get("side", zero) * entry.metres, "dx": zero + 1.0, "dy": zero,
+            "length": raw["length"] * entry.metres, "speed": raw["speed"] * entry.mps,
+        }
+    )  # fmt: skip
+
+
+def _turn_highd(states: Any, source: Source) -> None:
+    """Let positions increase in the direction of travel; x is the left edge of a vehicle and grows to the right."""
+    meta = open_source(Path(f"{str(source.file)[:-4]}Meta.csv"), HIGHD_META)
+    rows = pd.concat(read_columns(meta, HIGHD_META, list(meta.at), lambda *_: None))
+    direction = states["vehicle"].map(rows.drop_duplicates("vehicle").set_index("vehicle")["direction"])
+    right = "must have the drivingDirection 1 or 2 in its tracksMeta.csv"
+    source.refuse(~direction.isin([1.0, 2.0]), "vehicle", states["vehicle"], right)
+    to_right = direction == 2.0
+    states["front"] = (states["front"] + states["length"]).where(to_right, -states["front"])
+    states["speed"] = states["speed"].where(to_right, -states["speed"])
+
+
+def _turn_exid(states: Any, raw: Any) -> None:
+    """Set the direction of travel, and move positions from the centre of a vehicle to its front."""
+    heading = np.deg2rad(raw["heading"])
+    states["dx"], states["dy"] = np.cos(heading), np.sin(heading)
+    states["front"] += states["length"] / 2.0 * states["dx"]
+    states["side"] += states["length"] / 2.0 * states["dy"]
+
+
+def _check(states: Any, source: Source, entry: Format) -> None:
+    length, speed = states["length"], states["speed"]
     right = f"m: the length must be above 0 and at most {LONGEST_M:g} m; {entry.title} is in {entry.units}"
-    piece.refuse((length <= 0.0) | (length > LONGEST_M), at("length"), right, length)
-    if entry.title == "highD":
-        place = np.searchsorted(turned[:, 0], who).clip(max=len(turned) - 1)
-        odd = (turned[place, 0] != who) | ~np.isin(turned[place, 1], (1.0, 2.0))
-        piece.refuse(odd, at("id"), "must have the drivingDirection 1 or 2 in its tracksMeta.csv")
-        right_hand = turned[place, 1] == 2.0  # x is the left edge of the vehicle and grows to the right
-        front, speed = np.where(right_hand, front + length, -front), speed * np.where(right_hand, 1.0, -1.0)
-    elif entry.title == "exiD":  # x and y are the centre of the vehicle
-        dx, dy = np.cos(np.deg2rad(columns["heading"])), np.sin(np.deg2rad(columns["heading"]))
-        front, side = front + length / 2.0 * dx, side + length / 2.0 * dy
+    source.refuse((length <= 0.0) | (length > LONGEST_M), "length", length, right)
     right = f"m/s: the speed must be at most {FASTEST_MPS:g} m/s; {entry.title} is in {entry.units}"
-    piece.refuse(speed > FASTEST_MPS, at("speed"), right, speed)
-    return np.column_stack([ticks, who, lane, ahead, front, side, dx, dy, length, speed, piece.lines])
+    source.refuse(speed > FASTEST_MPS, "speed", speed, right)
+    cars = int(length.between(*CAR_M, inclusive="neither").sum())
+    if cars < LEAST_CARS * len(states):
+        raise InvalidInput(
+            f"{source.file}: only {cars:,} of {len(states):,} vehicles are {CAR_M[0]:g} to {CAR_M[1]:g} m long, but at"
+            f" least a third should be; lengths and speeds must be in {entry.units}"
+        )
 
 
-def _of_gaps(piece: Piece, entry: Format, ticks: Floats) -> Floats:
-    """Return the states in the rows ``piece`` of an OpenACC file, like ``_states``.
+def _openacc(raw: Any, source: Source, entry: Format) -> Any:
+    """Return the states of cars of which speeds and gaps were recorded, in numbered columns.
 
     Car k + 1 follows car k if the speeds of both cars and the gap between these cars (column ``IVS`` with the number k)
     are recorded. The first car of a queue has position 0. The position of every other car is minus the sum of the
     gaps between it and the first car of its queue.
     """
-    at = {name.lower(): k for k, name in enumerate(piece.columns)}
-    cars = sorted(int(name.removeprefix("speed")) for name in at if name.startswith("speed"))
-    ivs = {k: f"ivs{k - 1}" for k in cars if f"ivs{k - 1}" in at and k - 1 in cars}
-    if not ivs:
+    cars = sorted(int(name.removeprefix("speed")) for name in raw if name.startswith("speed"))
+    gap_of = {k: f"gap{k - 1}" for k in cars if k - 1 in cars and f"gap{k - 1}" in raw}
+    if not gap_of:
         raise InvalidInput(
-            f"{piece.file}: none of the columns {', '.join(piece.columns[1:])} is the gap between two cars; the file"
-            " must have the speeds of two cars and the gap between them, such as Speed1, Speed2 and IVS1"
+            f"{source.file}: no column is the gap between two cars; the file must have the speeds of two cars and the"
+            " gap between them, such as Speed1, Speed2 and IVS1"
         )
-    right = f"m/s: the speed must be at most {FASTEST_MPS:g} m/s; {entry.title} is in {entry.units}"
     for k in cars:
-        column = at[f"speed{k}"]
-        piece.refuse(piece.values[:, column] > FASTEST_MPS, column, right)
-    n, none = len(cars), np.zeros((len(ticks), len(cars)))
-    speeds = np.column_stack([piece.values[:, at[f"speed{k}"]] for k in cars])
-    gaps = np.column_stack([piece.values[:, at[ivs[k]]] if k in ivs else np.full(len(ticks), np.nan) for k in cars])
-    farthest = QUANTITY.usual["gaps_m"].high
-    for k, name in ivs.items():
-        piece.refuse(abs(gaps[:, cars.index(k)]) > farthest, at[name], f"m: the gap must be at most {farthest:g} m")
+        speed = raw[f"speed{k}"]
+        right = f"m/s: the speed must be at most {FASTEST_MPS:g} m/s; {entry.title} is in {entry.units}"
+        source.refuse(speed > FASTEST_MPS, f"speed{k}", speed, right)
+    for name in gap_of.values():
+        source.refuse(abs(raw[name]) > FARTHEST_M, name, raw[name], f"m: the gap must be at most {FARTHEST_M:g} m")
+    speeds = raw[[f"speed{k}" for k in cars]].to_numpy()
+    gaps = np.column_stack([raw[gap_of[k]] if k in gap_of else np.full(len(raw), np.nan) for k in cars])
     linked = np.isfinite(gaps) & np.isfinite(speeds)
     linked[:, 1:] &= np.isfinite(speeds[:, :-1])
-    behind, numbers = np.cumsum(np.where(linked, gaps, 0.0), axis=1), np.tile(np.array(cars, float), (len(ticks), 1))
-    ahead = np.where(linked, numbers - 1.0, -1.0)
-    tick, line = (np.repeat(each[:, None], n, axis=1) for each in (ticks, piece.lines))
-    fields = [tick, numbers, none, ahead, -behind, none, none + 1.0, none, none, speeds, line]
-    return np.stack(fields, axis=-1)[np.isfinite(speeds)]
+    numbers = np.tile(np.array(cars, float), (len(raw), 1))
+    states = pd.DataFrame(
+        {
+            "tick": raw["tick"].repeat(len(cars)), "vehicle": numbers.ravel(), "lane": 0.0,
+            "ahead": np.where(linked, numbers - 1.0, -1.0).ravel(),
+            "front": -np.cumsum(np.where(linked, gaps, 0.0), axis=1).ravel(), "side": 0.0, "dx": 1.0, "dy": 0.0,
+            "length": 0.0, "speed": speeds.ravel(),
+        }
+    )  # fmt: skip
+    return states.dropna()

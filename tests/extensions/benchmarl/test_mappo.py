@@ -18,7 +18,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::U
 TRAIN = Path(__file__).resolve().parents[3] / "train"
 
 
-PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")
+PAIR = eb.load_scenario("cooperation-3-pair")
 
 
 RECIPE = eb.load_recipe("cooperation-ppo").replace(

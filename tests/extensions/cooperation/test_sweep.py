@@ -2,7 +2,6 @@
 
 import csv
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,6 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.cooperation.comparison import compare
-from ethbrake_marl.extensions.cooperation.figures import ablation_figure
 from ethbrake_marl.extensions.cooperation.joint_optimum import Harms, LevelOptimum, Measured, best_known
 from ethbrake_marl.extensions.cooperation.levels import Level, Plan, common_worlds, plan_ablation
 from ethbrake_marl.extensions.cooperation.results import levels_csv
@@ -139,20 +137,6 @@ def test_tables__have_the_key_and_the_number_as_columns(measured: list[Measured]
     assert told[:3] == shown
 
 
-def test_figure__has_the_numbers_on_its_axis(measured: list[Measured]) -> None:
-    found = compare([*measured, *(replace(each, algorithm="sac") for each in measured)], SEARCHED)
-    first = ablation_figure(found, "Conditions.").axes[0]
-    assert first.get_xlabel() == "objective = social:…"
-    curve = next(each for each in first.containers if each.get_label() == "ppo")
-    assert [list(part) for part in curve.lines[0].get_data()] == [[0.0, 30.0, 90.0], [11.0, 9.0, 7.0]]
-    low, high = np.array([path.vertices[:, 1] for path in curve.lines[2][0].get_paths()]).T
-    assert [*low, *high] == pytest.approx([10.0, 9.0, 6.0, 12.0, 9.0, 8.0])  # over seeds: worlds are alike
-    lines = [
-        path.vertices for each in first.collections if each.get_label() == "joint optimum" for path in each.get_paths()
-    ]
-    assert [list(line[:, 1]) for line in lines] == [[5.0, 5.0]] and lines[0][:, 0].mean() == pytest.approx(0.0)
-
-
 SMALL = "--seeds 1 --steps 128 --episodes 20 --search-episodes 4"
 
 
@@ -174,11 +158,8 @@ def test_sweep__costs_runs_and_goes_on(
     folders = sorted(each.name for each in out.glob("trainings/*"))
     assert folders == [f"{name}-tiny-shared-seed0" for name in names]
     assert [each.name for each in out.glob("optimum/*")] == names[:1]  # one search: the objective changes no worlds
-    files = {"ablation.png", "ablation.csv", "ablation.json", "settings.json"}
-    assert files == {each.name for each in out.iterdir() if each.is_file() and each.suffix}
     found = json.loads((out / "ablation.json").read_text())
     assert found["settings"]["sweep"] == "objective=social:0,90" and found["channels"] == []
-    assert "cooperation-3-pair with objective=social:0,90; tiny-shared" in found["conditions"]
 
     again = ethbrake(*line.split())
     assert again.status == 0 and "to do: 0 trainings, 0 decisions" in again.err
@@ -189,15 +170,3 @@ def test_sweep__costs_runs_and_goes_on(
     more = ethbrake(*line.replace("0,90", "0,45,90").split(), "--cost")
     told = json.loads(more.out)
     assert (told["trainings"], told["training_folders"], told["search_s"]) == (1, 3, 0.0)
-
-
-def test_sweep__of_the_lines_is_said(
-    ethbrake: Command, empty_folder: Path, tiny_recipe: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    draw_nothing(monkeypatch)
-    line = f"study ablate --sweep mass_t.2=5,40 --recipes {tiny_recipe} {SMALL} --output out"
-    assert ethbrake(*line.split()).status == 0
-    out = Path("out")
-    assert len([*out.glob("optimum/*")]) == 2  # other masses, other searches
-    told = json.loads((out / "ablation.json").read_text())["conditions"]
-    assert "20 worlds of seed 7, drawn with the same random numbers at every level" in told

@@ -1,7 +1,5 @@
 """Episodes as a Parquet file, and the page's example for Minari."""
 
-import json
-import re
 from pathlib import Path
 
 import numpy as np
@@ -57,18 +55,6 @@ def test_file__has_the_episodes_of_an_evaluation(tmp_path: Path, monkeypatch: py
         harm = [-sum(own.filter(own["world"].to_numpy() == k)["reward_2"].to_pylist()) for k in range(5)]
         assert harm == pytest.approx(result.outcome(agent).first_impact_harm.tolist(), abs=1e-9)
         assert own["world"].to_pylist() == sorted(own["world"].to_pylist())
-
-
-def test_file__tells_what_it_has_and_the_page_lists_every_column(tmp_path: Path) -> None:
-    to_parquet(tmp_path / "a.parquet", "full_brake", scenario=PAPER, episodes=2, seed=3)
-    file = parquet.ParquetFile(tmp_path / "a.parquet")
-    told = json.loads(file.metadata.metadata[b"ethbrake_marl"])
-    assert eb.Scenario(**told["scenario"]) == PAPER and told["versions"]["ethbrake-marl"] == eb.__version__
-    assert [told[name] for name in ("agents", "seed", "learners")] == [["full_brake"], 3, ["vehicle_2"]]
-    text = DOCS.read_text("utf-8")
-    for name in file.schema_arrow.names:
-        listed = "observation_I.FEATURE" if "." in name else re.sub(r"_[123](?=_|$)", "_I", name)
-        assert f"`{listed}`" in text, name
 
 
 def test_file__is_refused_before_anything_is_written(empty_folder: Path) -> None:

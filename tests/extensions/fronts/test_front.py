@@ -1,7 +1,5 @@
 """The front of a list: no constant, agent or point of other weights is better; one answer for any batch."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -9,11 +7,10 @@ import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.statistics import mean, paired_difference
 from ethbrake_marl.extensions.fronts.front import Front, amounts_of, least_largest, search_front
-from ethbrake_marl.extensions.fronts.results import front_results, front_sheet, full_braking, hypervolumes
+from ethbrake_marl.extensions.fronts.results import FRONT, front_results, front_sheet, full_braking, hypervolumes
 from ethbrake_marl.extensions.fronts.weights import corners, weight_grid
 from ethbrake_marl.extensions.search.best_harm import task_problem
 from ethbrake_marl.extensions.search.shipped import best_known
-from ethbrake_marl.files.sheet import Column
 from ethbrake_marl.scenario.task import Task
 from tests.evaluation.test_clusters import recorded
 
@@ -101,11 +98,6 @@ def test_team__has_a_front_but_no_agents() -> None:
         search_front(pair, worlds, [[1, 1, 1]], agents=["full_brake"])
 
 
-def test_weights__of_another_number_are_refused() -> None:
-    with pytest.raises(InvalidInput, match="give one number for each of the 3 vehicles"):
-        search_front(PAPER, WORLDS, [[1.0, 1.0]])
-
-
 def test_results__of_recorded_rows_have_intervals_by_recording() -> None:
     scenario = recorded(8)
     sample = scenario.sample(80, 7)
@@ -120,15 +112,5 @@ def test_results__of_recorded_rows_have_intervals_by_recording() -> None:
     assert point["amount"] == mean(amounts[0], by).to_json()
     assert driven["above"] == paired_difference(amounts[1], amounts[0], by).to_json()
     assert found["recordings"] == 8 and "95 % intervals by 8 recordings." in front_sheet(found).note
-    wide, narrow = (hypervolumes(front, borne["first"], names)[0]["of"]["front"]["volume"] for names in (by, None))
+    wide, narrow = (hypervolumes(front, borne["first"], names)[0]["of"][FRONT]["volume"] for names in (by, None))
     assert wide["value"] == narrow["value"] and np.ptp(wide["interval"]) > np.ptp(narrow["interval"])
-
-
-def test_sheet__two_agents_have_two_headings() -> None:
-    agents: dict[str, list[Any]] = {
-        name: [] for name in ("policy@runs/a", "policy@runs/b", "policy@c+step", "universal")
-    }
-    results = {"harm_count": "first", "vehicles": [1, 2, 3], "agents": agents, "points": [], "beside": {}}
-    sheet = front_sheet(results | {"scenario": "mine", "episodes": 2})
-    headings = [column.short for column in sheet.columns if isinstance(column, Column)][-4:]
-    assert headings == ["policy@runs/\na", "policy@runs/\nb", "policy+step", "universal"]

@@ -13,9 +13,6 @@ from ethbrake_marl.extensions.learners import branches
 from ethbrake_marl.extensions.learners.branches import Offsets, play_to_the_end
 from tests.physics.random_worlds import line
 
-PAPER = eb.load_scenario("paper-random").replace(early_impacts="keep")
-
-
 PAIR = ["vehicle_2", "vehicle_3"]
 
 

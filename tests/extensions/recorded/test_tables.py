@@ -1,5 +1,7 @@
-"""Tables of trajectories by named columns, from CSV and Parquet; exiD; formats that are refused by name."""
+"""Tables of trajectories by named columns, from CSV and Parquet; exiD; order of rows."""
 
+import importlib
+import sys
 from math import cos, radians, sin
 from pathlib import Path
 
@@ -100,25 +102,31 @@ def test_parquet__gives_the_same_rows_and_names_rows(tmp_path: Path, monkeypatch
     numbered = [(k % 5 + 1, *row[1:2], int(row[2][-1]), *row[3:]) for k, row in enumerate(CARS)]
     assert made_of(write(numbered)).csv.endswith("a.parquet: 3-4-1\n")
     for k, cell, right in (
-        (4, -1.0, r"a.parquet, row 3, column l: -1 m: the length must be above 0 and at most 40 m"),
-        (5, None, "a.parquet, row 3, column v: the value is empty"),
-        (0, None, "a.parquet, row 3, column who: the value is empty"),
+        (4, -1.0, r"a.parquet, row 3, column l: -1.0 m: the length must be above 0 and at most 40 m"),
+        (5, None, "a.parquet, row 3, column v: must be a finite number, but is empty"),
+        (0, None, "a.parquet, row 3, column who: .*must be a name"),
     ):
         with pytest.raises(InvalidInput, match=right):
             made_of(write([*CARS[:2], (*CARS[2][:k], cell, *CARS[2][k + 1 :]), *CARS[3:]]))
-    with pytest.raises(InvalidInput, match=r"a.parquet, row 1, column v: 'fast' is not a number"):
+    with pytest.raises(InvalidInput, match=r"a.parquet, row 1, column v: must be a finite number, but is 'fast'"):
         made_of(write([(*car[:5], "fast") for car in CARS]))
-    monkeypatch.setattr(reading, "PIECE", 6)  # rows are counted over pieces
-    with pytest.raises(InvalidInput, match=r"a.parquet, row 13, column l: 0 m: the length"):
+    monkeypatch.setattr(reading, "BATCH_ROWS", 6)  # rows are counted over pieces
+    with pytest.raises(InvalidInput, match=r"a.parquet, row 13, column l: 0.0 m: the length"):
         made_of(write([*CARS[:12], (*CARS[12][:4], 0.0, 20.0), *CARS[13:]]))
-    with pytest.raises(InvalidInput, match=r"a.parquet: cannot be read as Parquet \(Unsupported cast from list"):
+    with pytest.raises(InvalidInput, match=r"a.parquet: cannot be read \(Unsupported cast from list"):
         made_of(write([(*car[:5], [car[5]]) for car in CARS]))
     (tmp_path / "a.parquet").write_bytes(b"PAR1 and no more")
-    with pytest.raises(InvalidInput, match=r"a.parquet: cannot be read as Parquet"):
+    with pytest.raises(InvalidInput, match=r"a.parquet: cannot be read"):
         made_of(tmp_path)
-    monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
-    with pytest.raises(MissingExtra, match=r"needs the package pyarrow.*pip install 'ethbrake-marl\[data\]'"):
-        made_of(tmp_path)
+
+
+@pytest.mark.parametrize("package", ["pandas", "pyarrow"])
+def test_missing_package__is_named_with_the_extra(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [name for name in sys.modules if name.startswith("ethbrake_marl.extensions.recorded.")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(MissingExtra, match=rf"needs the package {package}.*pip install 'ethbrake-marl\[data\]'"):
+        importlib.import_module("ethbrake_marl.extensions.recorded.scenario")
 
 
 def one_more(*car: object) -> list[tuple[object, ...]]:
@@ -140,10 +148,13 @@ WRONG = {
         r"change by 3.28 times the distance that the speeds imply; .* both columns must be in m and m/s",
     ),
     "km/h": (scaled(1.0, 2.5), r"change by 0.40 times the distance that the speeds imply"),
-    "twice": (one_more(*CARS[2]), "line 17: vehicle c is recorded twice for this time .see line 4"),
+    "twice": (one_more(*CARS[2]), "line 17: vehicle c is recorded twice for this time"),
     "overlap": (one_more("d", 1.0, "E1_0", 119.0, 5.0, 20.0), "line 17: vehicle d overlaps vehicle c ahead by 3.00 m"),
-    "no name": (one_more("", 1.0, "E1_0", 150.0, 5.0, 20.0), "line 17, column who: the value is empty"),
-    "no number": (one_more("d", 1.0, "E1_0", 150.0, "5 m", 20.0), "line 17, column l: '5 m' is not a number"),
+    "no name": (one_more("", 1.0, "E1_0", 150.0, 5.0, 20.0), "line 17, column who: .*must be a name"),
+    "no number": (
+        one_more("d", 1.0, "E1_0", 150.0, "5 m", 20.0),
+        "line 17, column l: must be a finite number, but is '5 m'",
+    ),
     "time": (
         one_more("d", 0.625, "E1_0", 150.0, 5, 20.0),
         "every = 0.8 s: the time between the moments that are read must be a multiple of 0.125 s",
@@ -212,18 +223,20 @@ def test_exid__has_gaps_along_the_direction_of_travel(degrees: float, tmp_path: 
     assert "must not be passed on" in made.text
 
 
-@pytest.mark.parametrize("name", ["exid", "highd"])
-def test_ind_and_round__are_refused_by_name(name: str, tmp_path: Path) -> None:
+def test_ind_and_round__are_refused_because_they_lack_the_vehicle_ahead(tmp_path: Path) -> None:
     file = exid(tmp_path, 0.0) / "03_tracks.csv"
     lines = [",".join(line.split(",")[:17]) for line in file.read_text().splitlines()]
     file.write_text("\n".join([*lines, ""]))
-    with pytest.raises(InvalidInput, match=r"03_tracks.csv: is a file of inD or rounD, which cannot be used"):
-        scenario_from_data("mine", tmp_path, name)  # type: ignore[arg-type]
+    with pytest.raises(InvalidInput, match=r"03_tracks.csv: lacks columns that files of exiD have: leadId"):
+        scenario_from_data("mine", tmp_path, "exid")
 
 
-def test_other_format__is_named(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInput, match=r"03_tracks.csv: is not a file of highD, but of exiD"):
-        scenario_from_data("mine", exid(tmp_path, 0.0), "highd")
+def test_order_of_rows_and_vehicles__has_no_effect(tmp_path: Path) -> None:
+    assert made_of(table(tmp_path, CARS[::-1])) == made_of(table(tmp_path))
+    numbered = [(10 - k % 5, *row[1:]) for k, row in enumerate(CARS)]
+    made = made_of(table(tmp_path, numbered), based_on="realistic-pair")
+    assert made == made_of(table(tmp_path, sorted(numbered)), based_on="realistic-pair")
+    assert made.csv.count("a.csv: 8-7\n") == 2
 
 
 def test_frames_of_video__keep_their_rate_and_names_of_columns_are_literal(tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """Pictures, pages and films of commands."""
 
-import json
 from pathlib import Path
 
 import pytest
@@ -8,7 +7,7 @@ import pytest
 from ethbrake_marl.errors import _EXTRA_OF
 from tests.cli.test_watch import check_extra
 from tests.files.test_files import check_target
-from tests.fixtures.commands import Command, Refuse, check_refused, told_json
+from tests.fixtures.commands import Command, Refuse, check_refused
 from tests.test_imports import ended
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
@@ -30,35 +29,6 @@ def test_evaluate__by_force_leaves_no_file_of_earlier_results(ethbrake: Command,
     check_refused(ethbrake(*line, folder), "results.json: already exists")
     assert ethbrake(*line, folder, "--force", "--per-world", "parquet").status == 0
     assert sorted(each.name for each in folder.iterdir()) == ["mine.txt", "results.json", "worlds.parquet"]
-
-
-def test_compare__a_run_its_report_and_shields_are_results_too(ethbrake, finished_run: Path, tmp_path: Path) -> None:
-    results = finished_run / "results.json"
-    told = told_json(ethbrake("compare", results, results, "--json"))
-    policies = {each["agent"]: each["policy"] for each in told["agents"]}
-    assert told["intervals"] == "paired" and policies["trained policy"] == "same"
-    assert all(each["total_harm_difference_interval"] == [0.0, 0.0] for each in told["agents"])
-    tests = ethbrake("compare", results, finished_run / "other_tests.json")
-    check_refused(tests, "write the results of each test to its own file")
-    page = (finished_run / "report.html").read_text()
-    assert all(json.loads(results.read_text())[0][name] in page for name in ("worlds_sha256", "scenario_sha256"))
-    for count in ("first", "total"):
-        line = ("shield", "--agents", "full_brake", "--episodes", "5", "--set", f"harm_count={count}", "--json")
-        (tmp_path / f"{count}.json").write_text(ethbrake(*line).out)
-    told = told_json(ethbrake("compare", tmp_path / "first.json", tmp_path / "first.json", "--json"))
-    found = {each["agent"]: each["harm_difference"] for each in told["agents"]}
-    assert found == {f"full_brake ({mode})": 0.0 for mode in ("none", "episode", "step", "step-alert")}
-    check_refused(ethbrake("compare", tmp_path / "first.json", tmp_path / "total.json"), "their counts of harm differ")
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_report__says_which_harm_the_shield_bounds(ethbrake: Command) -> None:
-    answer = ethbrake(
-        "evaluate", "--agents", "full_brake,constant:3+step", "--episodes", "12", "--report", "--output", "r"
-    )
-    assert answer.status == 0, answer.err
-    text = Path("r/report.html").read_text()
-    assert "minus episode mode" in text and "First-impact harm in m²/s²; the shield bounds this harm" in text
 
 
 def test_target__that_cannot_be_replaced_is_refused_before_any_work(

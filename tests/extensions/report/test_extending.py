@@ -8,16 +8,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import app, run_command
-from ethbrake_marl.extensions.report.report import Report
-from tests.extending.test_extending import changed, measured_by_vehicle
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_measure__of_each_vehicle_stands_in_the_report() -> None:
-    found = measured_by_vehicle()
-    report = Report("mine", eb.summarise(found), found).html
-    assert "squared (m2/s2)" in report and "injured, vehicle 2 (1)" in report
-    assert "Squared closing speed of every impact." in report
+from tests.extending.test_extending import changed
 
 
 def test_measure__stands_in_the_page_of_an_evaluation(empty_folder: Path) -> None:

@@ -1,7 +1,5 @@
 """Figures: the curves of a list and of a training, trajectories; drawn from the very numbers."""
 
-import re
-
 import matplotlib
 import numpy as np
 import pytest
@@ -9,7 +7,7 @@ from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
-from ethbrake_marl.envs.rendering import BODY_M, COLOURS
+from ethbrake_marl.envs.rendering import BODY_M
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
 from ethbrake_marl.evaluation.rollout import evaluate
@@ -22,8 +20,7 @@ from ethbrake_marl.extensions.report.harm_figures import harm_by_agent, harm_in_
 from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap, learning_curve
 from ethbrake_marl.extensions.report.scenario_figures import worlds_figure
 from ethbrake_marl.extensions.report.seed_curves import SeedCurve, seed_curves
-from ethbrake_marl.extensions.report.style import label_text, new_figure, picture_bytes, series_style
-from ethbrake_marl.extensions.search.limits import Limits, Proof
+from ethbrake_marl.extensions.report.style import label_text, new_figure, picture_bytes
 from ethbrake_marl.extensions.search.regret import regrets_of
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
@@ -37,7 +34,6 @@ POINTS = [
     {"steps": 0.0, "first_impact_harm": 30.0, "total_harm": 33.0, "collision_rate": 1.0},
     {"steps": 50_000.0, "first_impact_harm": 12.0, "total_harm": 15.0, "collision_rate": 0.8},
 ]
-UNIT = re.compile(r"\((m|s|m/s|m/s²|m²/s²|ms|µs|ns)\)|steps|Worlds|Decisions")
 
 
 def caption(figure: Figure) -> str:
@@ -76,24 +72,6 @@ def figures(evaluation: Evaluation, record: EpisodeRecord) -> dict[str, Figure]:
     }
 
 
-def test_figure__every_axis_says_what_it_is_and_its_unit(figures: dict[str, Figure]) -> None:
-    for axes in (axes for figure in figures.values() for axes in figure.axes):
-        below = [other for other in axes.get_shared_x_axes().get_siblings(axes) if other.get_xlabel()]
-        assert UNIT.search(axes.get_xlabel() or below[0].get_xlabel())
-        siblings = axes.get_shared_y_axes().get_siblings(axes)
-        names = [label.get_text() for other in siblings for label in other.get_yticklabels()]
-        told = [*(other.get_ylabel().replace("\n", " ") for other in siblings), axes.get_title(loc="left")]
-        assert any(re.search("[a-z]", each) for each in names) or any(map(UNIT.search, told))
-
-
-def test_figure__travels_with_its_fonts() -> None:
-    figure = new_figure(3.0, 2.0)
-    figure.subplots().set_xlabel("Time (s)")
-    svg, pdf = (picture_bytes(figure, name) for name in ("a.svg", "a.pdf"))
-    assert b"<text" not in svg and b"font-family" not in svg
-    assert b"/FontFile2" in pdf and b"/Type3" not in pdf
-
-
 @pytest.mark.parametrize(
     "style", [{"text.color": "red", "font.size": 20}, {"axes.facecolor": "black", "axes.grid": True}]
 )
@@ -116,12 +94,6 @@ def test_label__of_anybody_can_be_drawn(text: str) -> None:
     svg = picture_bytes(figure, "a.svg")
     assert b"<script" not in svg and len(svg) < 200_000
     assert figure._repr_png_().startswith(b"\x89PNG\r\n\x1a\n")
-
-
-@pytest.mark.parametrize("k", range(len(COLOURS) - 1))
-def test_series_style__neighbours_differ_in_more_than_colour(k: int) -> None:
-    one, other = series_style(k), series_style(k + 1)
-    assert all(one[name] != other[name] for name in ("color", "marker", "linestyle"))
 
 
 # ---------------------------------------------------------------- of a scenario
@@ -188,19 +160,6 @@ def test_harm_against_total_gap__means_and_bands_are_those_of_the_groups(
 # ---------------------------------------------------------------- of a training
 
 
-def test_learning_curve__shows_the_points_and_the_references(evaluation: Evaluation) -> None:
-    rows = summarise(evaluation)
-    figure = learning_curve(POINTS, references=rows[:2], caption="1,000 worlds, seed 3")
-    first, total, rate = figure.axes
-    assert first.lines[0].get_xydata().tolist() == [[0.0, 30.0], [50_000.0, 12.0]]
-    assert (total.lines[0].get_ydata().tolist(), rate.lines[0].get_ydata().tolist()) == ([33.0, 15.0], [1.0, 0.8])
-    assert first.lines[2].get_ydata()[0] == rows[1].first_impact_harm.value
-    assert rate.lines[1].get_ydata()[0] == rows[0].collision_rate.value
-    assert legend(figure) == ["policy", "full_brake", "constant:4.5"] and caption(figure) == "1,000 worlds, seed 3"
-    policy, *references = learning_curve(POINTS, references=[*rows, *rows]).axes[0].lines
-    assert policy.get_color() not in {each.get_color() for each in references}
-
-
 def test_seed_curves__draw_means_and_bands_of_one_standard_deviation() -> None:
     curve = SeedCurve.of([{0: 4.0, 10: 1.0, 15: 9.0}, {0: 8.0, 10: 3.0}])  # the steps that all have
     assert (curve.steps.tolist(), curve.values.tolist()) == ([0.0, 10.0], [[4.0, 1.0], [8.0, 3.0]])
@@ -258,26 +217,6 @@ def test_curve__the_others_follow_their_scripts(paper_random: Scenario) -> None:
     driven = evaluate(worlds, BRAKE, scenario=coasting).outcome("full_brake")
     assert 100.0 < curve.total_harm[-1] == pytest.approx(driven.total_harm[0], rel=1e-9)  # Vehicle 3 at about 20 m/s
     assert "Vehicle 1 full_brake, Vehicle 3 coast" in deceleration_figure(curve).get_supxlabel().replace("\n", " ")
-
-
-def test_deceleration_figure__marks_what_e_v2x_bm_takes_and_the_best_known(
-    monkeypatch: pytest.MonkeyPatch, pair: Scenario
-) -> None:
-    known = Limits(Proof(np.array([False]), np.array(["rear"]), np.array([0.5])), np.array([1.25]), np.array([2.5]))
-    with monkeypatch.context() as patch:
-        patch.setattr(module, "known_limits", lambda worlds, task: known)
-        figure = deceleration_figure(deceleration_curve(world(7.0, 7.0), Task(DISTANCE, (1,))), title="a title")
-    axes, strips = figure.axes
-    told = " | ".join(legend(figure))
-    assert "a* = 5.170 m/s², closed form: 4.03 predicted" in told
-    assert "coupled, least first-impact harm: 10.55" in told
-    best = "best known harm: 1.25 first-impact, 2.50 total; proven lower bound 0.50"
-    assert best in [text.get_text() for text in axes.texts] and axes.get_title(loc="left") == "a title"
-    assert {(1.25, 1.25), (2.5, 2.5)} <= {tuple(each.get_ydata()) for each in axes.lines}
-    assert [label.get_text() for label in strips.get_yticklabels()] == ["front pair", "rear pair"]
-    axes, strips = deceleration_figure(deceleration_curve(pair.sample(1, 0).worlds, Task(pair, (1,)))).axes
-    assert not [text for text in axes.texts if "best known" in text.get_text()]  # without limits
-    assert [label.get_text() for label in strips.get_yticklabels()] == ["front pair"]
 
 
 def test_curve_of_scenario_1__changes_its_regimes_at_the_known_decelerations() -> None:

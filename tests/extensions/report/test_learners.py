@@ -47,18 +47,3 @@ def test_tables__are_what_the_trained_vehicles_do(folder: Path) -> None:
     assert {name: [cell.value for cell in cells] for name, *cells in added.rows} == {
         name: pytest.approx(values) for name, values in more.items()
     }
-
-
-def test_page__has_the_tables_below_the_results(folder: Path, finished_run: Path) -> None:
-    page = (folder / "report.html").read_text()
-    assert page.index(">Results</h2>") < page.index(">Several learners</h2>") < page.index(">Episodes</h2>")
-    assert all(title in page for title in ("Who bears what", "What each learner adds"))
-    assert "Several learners" not in (finished_run / "report.html").read_text()
-
-
-def test_objective__is_told_where_it_is_not_the_harm_of_all(tmp_path: Path) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        draw_nothing(patch)
-        recipe = TINY_PPO.replace(total_steps=128, scheme="shared")
-        run_experiment(SCENARIO.replace(objective="own"), tmp_path / "run", recipe=recipe, episodes=12)
-    assert "first-impact harm (own)" in (tmp_path / "run" / "report.html").read_text()

@@ -15,7 +15,7 @@ from ethbrake_marl.scenario.task import Task
 from tests.contract.interfaces import CRASH
 from tests.refused import refused
 
-PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")
+PAPER = eb.load_scenario("paper-random")
 
 
 BRAKE = {"full_brake": eb.make_agent("full_brake")}

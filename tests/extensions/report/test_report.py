@@ -3,25 +3,23 @@ import hashlib
 import json
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.errors import AlreadyExists, plain_text
+from ethbrake_marl.errors import plain_text
 from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.report import page as page_module
-from ethbrake_marl.extensions.report.page import Page as Sections, Part, Section, read_file
+from ethbrake_marl.extensions.report.page import Part, Section, read_file
 from ethbrake_marl.extensions.report.paper_rows import with_paper_rows
-from ethbrake_marl.extensions.report.report import Report, shield_section
+from ethbrake_marl.extensions.report.report import Report
 from ethbrake_marl.extensions.report.shown_worlds import choose_shown, worst_rows
-from ethbrake_marl.extensions.report.style import add_caption, new_figure
+from ethbrake_marl.extensions.report.style import new_figure
 from ethbrake_marl.extensions.search.regret import regrets_of
 from ethbrake_marl.files.sheet import Column, Sheet, Shown
 from ethbrake_marl.game.harm import HarmCount
 from tests.evaluation.test_rollout import left_out_by
-from tests.evaluation.test_shield_modes import pair_modes
 from tests.fixtures.page import HOSTILE, UNSEEN, Page
 
 
@@ -78,19 +76,6 @@ def test_page__allows_its_own_style_and_script_alone() -> None:
     assert " style=" not in html and "url(" not in html and "@import" not in html
 
 
-def test_drawing__is_a_picture_in_the_page_and_its_caption_is_text() -> None:
-    figure = new_figure(6.0, 3.0)
-    figure.subplots().plot([0.0, 1.0])
-    add_caption(figure, "One hundred worlds of the list of seed 7. " * 5)
-    html = str(Part.drawing(figure, "<Title>", "Words.").html)
-    picture = re.search(r'src="data:image/svg[+]xml;base64,([^"]+)"', html)
-    assert picture is not None
-    svg = base64.b64decode(picture[1])
-    assert b'width="432pt"' in svg and b"One hundred" not in svg  # the caption is not drawn, too
-    assert Page(html).text.endswith("seed 7.") and figure.get_supxlabel().startswith("One hundred worlds")
-    assert [attributes["alt"] for tag, attributes in Page(html).tags if tag == "img"] == ["<Title>. Words."]
-
-
 EXTERNAL = re.compile(r"""(https?:)?//|@import|<(link|iframe|object|embed|base)\b""", re.IGNORECASE)
 
 
@@ -124,20 +109,6 @@ def test_report__loads_nothing_from_anywhere(html: str) -> None:
     for _, attributes in Page(html).tags:
         assert (attributes.get("href") or "#").startswith("#")
         assert attributes.get("src", "data:").startswith("data:")
-
-
-def test_report__is_well_formed_and_says_everything(html: str, report: Report) -> None:
-    page = Page(html)
-    told = [
-        "paper-random: 200 worlds, seed 7; d = ", "Training seed 5 Command ethbrake run", "numpy 2.4.6",
-        "Hybrid PPO 59.74 % 5.6202", "62.3 %", report.rows[0].worlds_sha256, "until all vehicles are at rest.",
-        "constant:4.5 does ", "One million steps.", "of the worlds, no command of Vehicle 2 avoids contact",
-    ]  # fmt: skip
-    for row in report.rows:
-        for estimate in (row.first_impact_harm, row.total_harm):
-            told += [row.agent, f"{estimate.value:.2f}", f"{estimate.interval[0]:.2f}, {estimate.interval[1]:.2f}"]
-    text = page.text.replace("\u00a0", " ")
-    assert page.open == [] and [each for each in told if each not in text] == []
 
 
 def test_report__embeds_fifty_worlds_whose_counts_are_the_ledgers(html: str, report: Report) -> None:
@@ -181,27 +152,6 @@ def test_report__calls_nothing_best_known_that_no_search_has_found() -> None:
     assert re.search(r"instead of [0-9.]+; best of these agents [0-9.]+\)", mine.first_sentence)
 
 
-def test_report__names_the_tests_in_which_the_agent_does_no_less_harm_than_full_braking(
-    paper_random: eb.Scenario,
-) -> None:
-    mine = summed_up(paper_random, "full_brake", "coast", "e_v2x_bm")
-    braking, coasting, _ = mine.rows
-    tests = [
-        ("Same test", "It brakes fully.", [braking, replace(braking, agent="e_v2x_bm")]),
-        ("Obstacle test", "It does not brake at all.", [braking, replace(coasting, agent="e_v2x_bm")]),
-        ("Easy test", "As here.", mine.rows),
-        ("Other test", "It is not there.", [braking]),
-    ]
-    harm, much = (f"{row.first_impact_harm.value:.2f}" for row in (braking, coasting))
-    told = replace(mine, tests=tests)
-    assert told.first_sentence.endswith(
-        f"), but as much in the same test ({harm} instead of {harm}) and more in the obstacle test ({much} instead of"
-        f" {harm})."
-    )
-    text = Page(told.html).text
-    assert text.index(told.first_sentence) < text.index("First-impact harm of each agent")
-
-
 def test_report__flatters_nobody(paper_random: eb.Scenario, pair: eb.Scenario) -> None:
     worse = summed_up(paper_random, "full_brake", "coast").first_sentence
     assert " % more harm than full braking (" in worse and "), and more in " in worse
@@ -215,24 +165,6 @@ def test_report__flatters_nobody(paper_random: eb.Scenario, pair: eb.Scenario) -
     assert harmless.endswith("), and in no world more.")
     harmful = summed_up(far, "full_brake", "coast").first_sentence  # no share of nothing
     assert harmful.startswith("coast does more harm than full braking (first impacts: ")
-
-
-def test_report__says_below_its_first_sentence_what_must_not_be_overlooked(
-    paper_random: eb.Scenario, pair: eb.Scenario
-) -> None:
-    short = summed_up(pair.replace(horizon_s=1.0), "full_brake", "coast")
-    mine = replace(short, remarks=["The training was interrupted."])
-    html = mine.html
-    (text,) = re.findall(r'<ul class="remarks">(.*?)</ul>', html, re.DOTALL)
-    assert re.findall(r"<li>(.*?)</li>", text) == [
-        "The training was interrupted.",
-        "In some of the 60 worlds a vehicle still moved at the horizon (1 s): full_brake 60, coast 60. Harm after the"
-        " horizon is not counted.",
-        "‡ Harm does not count this: full_brake runs past the horizon in 100.0 % of worlds; coast"
-        " runs past the horizon in 100.0 % of worlds (docs/train.md).",
-    ]
-    assert html.index('class="lead"') < html.index('class="remarks"') < html.index('class="beside"')
-    assert 'class="remarks"' not in summed_up(paper_random, "full_brake").html
 
 
 def episode_data(html: str) -> dict:
@@ -295,35 +227,6 @@ ALLOWED = {
 }
 
 
-def test_report__leaves_out_what_has_no_value_and_says_where_the_horizon_cut_episodes_off(pair: eb.Scenario) -> None:
-    short = pair.replace(horizon_s=1.0)
-    result = eb.evaluate(short.sample(2, 0), COASTING, scenario=short)
-    text = Page(Report("t", eb.summarise(result), result).driven(COASTING).html).text
-    assert "left out: Decrease, first-impact; Decrease, total; Predicted harm" in text
-    assert text.count("Decrease, total") == text.count("Predicted harm") == 1
-    assert "First-impact harm" in text and "Squared closing speed" in text
-    absent = (
-        "1 − (mean harm) / (mean harm of full braking",
-        "as printed",
-        "5.6202",
-    )  # the paper's rows are of its own scenario
-    assert [each for each in absent if each in text] == []
-    moving = 2 - int(result.outcome("coast").at_rest.sum())
-    assert moving and f"the horizon of 1 s. In {moving} worlds, vehicles still moved" in text
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_write_report__overwrites_only_by_force(tmp_path: Path, pair: eb.Scenario) -> None:
-    found, path = eb.evaluate(pair.sample(2, 0), COASTING, scenario=pair), tmp_path / "report.html"
-    mine = Report("Mine", eb.summarise(found), found)
-    mine.write(path)
-    with pytest.raises(AlreadyExists):
-        mine.write(path)
-    assert path.read_text("utf-8") == mine.html
-    replace(mine, title="Other").write(path, force=True)
-    assert "<h1>Other</h1>" in path.read_text("utf-8")
-
-
 def test_report__counts_a_cascade_whole_but_draws_its_last_impact(pair: eb.Scenario) -> None:
     bouncy = pair.replace(restitution=0.8)
     result = eb.evaluate(bouncy.sample(1, 0), COASTING, scenario=bouncy)
@@ -332,11 +235,6 @@ def test_report__counts_a_cascade_whole_but_draws_its_last_impact(pair: eb.Scena
     assert np.diff([impact[4] for impact in episode["impacts"]]).min() > 0
     _, _, closing_mps, _, number, first, total = episode["impacts"][0]
     assert number == 1 and first == total == closing_mps**2
-
-
-def test_shield_section__shows_bound_and_shares_of_a_team() -> None:
-    text = Page(Sections("Shield", [shield_section(pair_modes(), "30 worlds")]).html).text
-    assert "minus no shield" in text and "coast, step-cap, vehicle_3" in text.replace("\u200b", "")
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -10,16 +10,11 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.evaluation.lineup import make_lineup
-from ethbrake_marl.extensions.report import experiment
-from ethbrake_marl.extensions.report.experiment import telling_world, write_figures
-from ethbrake_marl.extensions.report.run_figures import learning_curve
+from ethbrake_marl.extensions.report.experiment import telling_world
 from tests.cli.test_train import ctrl_c_when, status_of
 from tests.fixtures.commands import rows_of, told_json
 
 AGENTS = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "trained policy", "hybrid"]
-
-
-SCENARIO = eb.load_scenario("paper-random")
 
 
 def test_run__leaves_results_figures_report_and_policy(finished_run: Path) -> None:
@@ -41,11 +36,6 @@ def test_run__the_other_two_tests_stand_beside_the_main_one(finished_run: Path) 
     assert [(row["parameters"]["scenario"], row["agent"]) for row in rows] == expected
     flat = rows_of(finished_run / "other_tests.csv")
     assert [(line["scenario"], line["agent"]) for line in flat] == expected
-    page = (finished_run / "report.html").read_text()
-    assert "<h1>ethbrake run: paper-random</h1>" in page
-    assert all(f">{test} test</h2>" in page for test in ("Brake-only", "Obstacle"))
-    assert page.count(">Vehicle 1 shoved (m)</th>") == 3
-    assert page.count(">Sampled harm</th>") == 2  # nobody samples where an obstacle stands ahead
     for test, row in zip(tests, rows[::4], strict=True):
         scenario = eb.load_scenario(test)
         result = eb.evaluate(scenario.sample(60, 7), make_lineup(["full_brake"], scenario), scenario=scenario, seed=7)
@@ -62,19 +52,6 @@ def test_run__json_prints_the_rows_alone_and_force_replaces(ethbrake, tiny_recip
     assert (folder / "per_world.csv").read_bytes() == (finished_run / "per_world.csv").read_bytes()
     assert "training" in answer.err and str(folder / "report.html") in answer.err
     assert all(picture.read_bytes().startswith(b"\x89PNG") for picture in folder.glob("*.png"))
-
-
-def test_run__the_learning_curve_has_the_lines_of_its_references(monkeypatch, finished_run, tmp_path) -> None:
-    specs = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise"]
-    agents = {**make_lineup(specs, SCENARIO), "trained policy": eb.LearnedAgent(eb.load_policy(finished_run))}
-    result = eb.evaluate(SCENARIO.sample(5, 7), agents, scenario=SCENARIO, seed=7)
-    drawn = []
-    monkeypatch.setattr(experiment, "learning_curve", lambda *a, **k: drawn.append(learning_curve(*a, **k)) or drawn[0])
-    monkeypatch.setattr(experiment, "write_picture", lambda *given, **settings: None)
-    course = [{"steps": 0.0, "first_impact_harm": 30.0, "total_harm": 33.0, "collision_rate": 1.0}]
-    write_figures(tmp_path, result, eb.summarise(result), course=course, course_caption="", agents=agents)
-    labels = [text.get_text() for text in drawn[0].legends[0].get_texts()]
-    assert labels == ["trained policy", "full_brake", "e_v2x_bm"]
 
 
 @pytest.mark.slow

@@ -1,17 +1,14 @@
 """Learning curves of several trainings."""
 
-import re
 import signal
 
 import pytest
-import yaml
 
 import ethbrake_marl as eb
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.identity import scenario_sha256, worlds_sha256
 from ethbrake_marl.extensions.reproduction.learning_curves import LearningCurves
 from ethbrake_marl.progress import Progress
-from tests.fixtures.commands import TINY_RECIPE, rows_of
+from tests.fixtures.commands import rows_of
 
 SCENARIO = eb.load_scenario("paper-random")
 
@@ -47,29 +44,3 @@ def test_curves__are_trained_drawn_and_gone_on_with(tiny_recipe, tiny_sac, tmp_p
     curves._replace(against="cpu").write()
     spent = [float(row["cpu_s"]) for row in rows_of(folder / "learning_curves.csv")[:3]]
     assert 0.0 <= spent[0] < spent[1] < spent[2]
-
-
-def test_curves__another_training_or_an_edited_scenario_is_told_before_any_is_begun(
-    tiny_recipe, scenario_file, tmp_path
-) -> None:
-    folder, other = tmp_path / "curves", tmp_path / "other.yaml"
-    other.write_text(yaml.safe_dump({**TINY_RECIPE, "gamma": 0.9}))
-
-    def curves(recipes: list[object], old: str, new: str) -> None:
-        plan = [(eb.load_recipe(recipe), 1) for recipe in recipes]
-        asked = LearningCurves(eb.load_scenario(scenario_file(old, new)), plan, folder)
-        assert asked.train()
-        asked.write()
-
-    curves([tiny_recipe], "horizon_s: 8", "horizon_s: 8")
-    drawn = (folder / "learning_curves.json").stat().st_mtime_ns
-    for recipes, horizon, what in (
-        ([tiny_recipe], "horizon_s: 9", "scenario horizon_s"),
-        (["ppo", other], "horizon_s: 8", "recipe gamma"),
-    ):
-        told = f"tiny-seed0: this folder contains another training run, which differs in {what}; choose another folder"
-        with pytest.raises(InvalidInput, match=re.escape(told)):
-            curves(recipes, "horizon_s: 8", horizon)
-    assert (folder / "learning_curves.json").stat().st_mtime_ns == drawn and not (folder / "ppo-seed0").exists()
-    # Words change no training: its result is kept.
-    curves([tiny_recipe], 'title: "One-line title for lists and figures"', 'title: "Another line"')

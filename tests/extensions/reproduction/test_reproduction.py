@@ -1,7 +1,5 @@
 """The paper made again: verdicts that follow from numbers, its items, and the folder and pages of a reproduction."""
 
-import json
-import re
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -16,11 +14,9 @@ from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS, PaperRow
 from ethbrake_marl.extensions.report.seed_curves import SeedCurve
 from ethbrake_marl.extensions.reproduction import delay_curves, folder as folder_module, hybrid, trainings
 from ethbrake_marl.extensions.reproduction.delay_curves import Course
-from ethbrake_marl.extensions.reproduction.figures import estimates_figure
 from ethbrake_marl.extensions.reproduction.folder import Drawn, Item, Made, Reproduction, checked_result, stated
 from ethbrake_marl.extensions.reproduction.items import ITEMS, read_results
 from ethbrake_marl.extensions.reproduction.making import choose_items, make_items, open_folder
-from ethbrake_marl.extensions.reproduction.open_quantities import GAPS
 from ethbrake_marl.extensions.reproduction.pages import render_page
 from ethbrake_marl.extensions.reproduction.strategies import FULL_BRAKE, NAMES, READINGS, lineup
 from ethbrake_marl.extensions.reproduction.tables import (
@@ -235,14 +231,6 @@ def test_trajectories__of_the_scenarios_have_no_impact_under_the_policies(made_o
     assert {row[3] for row in table.rows if row[2] in ("PPO", "SAC")} == {0}
 
 
-def test_register__every_gap_says_what_the_paper_says_and_what_is_measured() -> None:
-    names = [gap.name for gap in GAPS]
-    assert len(set(names)) == len(names)
-    for gap in GAPS:
-        assert gap.paper and gap.ours
-        assert bool(gap.alternatives) != gap.otherwise.startswith(("trained by --full: ", "not measured: ")), gap.name
-
-
 def test_hybrid__is_driven_anew_once_its_policy_was_trained(
     settings: Reproduction, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -252,24 +240,8 @@ def test_hybrid__is_driven_anew_once_its_policy_was_trained(
     assert hybrid._drive_hybrid("paper-random", settings, READINGS[0]) is not first
 
 
-def drawn() -> dict[Drawn, Figure]:
-    line = {0.0: Estimate(1.0, None), 1.0: Estimate(2.0, (1.0, 3.0))}
-    figure = estimates_figure({"panel": {"line": line}}, x_label="x", y_label="y", caption="c")
-    return {Drawn("a-figure", "A figure", "What it shows."): figure}
-
-
 def hidden(folder: Path) -> list[Path]:
     return [path for path in folder.rglob(".*") if path.name != ".lock"]
-
-
-def test_reproduce__writes_figures_data_results_and_one_page(settings: Reproduction) -> None:
-    results, finished = make_items(settings, [planted("gaps", lambda s: made(figures=drawn()))])
-    assert finished and [each.name for each in results] == ["gaps"] and hidden(settings.folder) == []
-    names = sorted(path.name for path in (settings.folder / "gaps").iterdir())
-    assert names == ["a-figure.png", "a-figure.svg", "data.csv", "result.json"]
-    page = (settings.folder / "index.html").read_text("utf-8")
-    assert page.count('src="data:image/svg+xml;base64,') == page.count("<img") == 1 and "<script" not in page
-    assert re.search(r"https?://", re.sub(r'xmlns(:\w+)?="[^"]*"', "", page)) is None
 
 
 def test_pages__tell_everything_that_a_result_holds(settings: Reproduction) -> None:
@@ -354,31 +326,9 @@ def test_groups__fit_their_recipes_and_every_item_names_groups_that_exist() -> N
                     assert getattr(recipe, key) == getattr(stated, key)
 
 
-def test_cost__is_told_before_and_at_most_an_hour(tmp_path: Path) -> None:
-    settings = Reproduction("full", tmp_path)
-    assert "trainings before them about" in settings.cost(ITEMS)
-    assert 600.0 < settings.seconds_left(list(trainings.groups())) <= 3_600.0
-    assert "trainings" not in replace(settings, mode="quick").cost(ITEMS)
-    assert settings.trained(["low"]) == {}
-
-
 def course(returns: list[list[float]], harm: list[list[float]]) -> Course:
     steps = np.arange(len(returns[0]), dtype=float)
     return Course(SeedCurve(steps, np.array(returns)), SeedCurve(steps, np.array(harm)))
-
-
-@pytest.mark.slow
-def test_trajectories__are_watched_side_by_side(tmp_path: Path) -> None:
-    make_items(Reproduction("quick", tmp_path / "out", 10), choose_items(["trajectories"]))
-    page = (tmp_path / "out" / "index.html").read_text("utf-8")
-    shown, text = Page(page), page.split('type="application/json"')[1].partition(">")[2]
-    content = json.loads(text.partition("</script>")[0])
-    assert shown.open == []
-    assert [content["agents"][k] for k in content["shown"]] == ["PPO", "SAC"]
-    titles = [world["title"] for world in content["worlds"]]
-    assert titles[0] == "Scenario 1, as stated" and len(set(titles)) == 4
-    whys = [world["why"] for world in content["worlds"]]
-    assert whys[0] == "" and whys[3].startswith("--set latency_s=[")
 
 
 def test_course_of_a_training__by_hand() -> None:

@@ -1,7 +1,5 @@
 """Best known harm: search, profiles, tables, agent and command; and what is proven beside it, once and on demand."""
 
-import csv
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,13 +23,11 @@ from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.extensions.proofs import lower_bound as bounding
 from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
 from ethbrake_marl.extensions.proofs.onset import onset_states
-from ethbrake_marl.extensions.report.report import avoidable_section, worst_section
 from ethbrake_marl.extensions.report.three_tests import TESTS
 from ethbrake_marl.extensions.search import limits, regret, shipped
 from ethbrake_marl.extensions.search.best_harm import best_harm, fold_episodes, search_list, task_problem
 from ethbrake_marl.extensions.search.extreme_profiles import KEPT, extreme_profiles
-from ethbrake_marl.extensions.search.limit_measures import LIMITS
-from ethbrake_marl.extensions.search.limits import Proof, Unproven, known_limits, prove
+from ethbrake_marl.extensions.search.limits import Proof, known_limits, prove
 from ethbrake_marl.extensions.search.problem import search_profiles
 from ethbrake_marl.extensions.search.recall import BestHarm
 from ethbrake_marl.extensions.search.regret import limits_of, regrets_of
@@ -347,20 +343,6 @@ def searched(file: Path, *more: str) -> BestHarmTable:
     return BestHarmTable.load(file)
 
 
-def test_best_harm_programme__one_count_from_an_earlier_table(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    given = ("--episodes", "4", "--harm-count", "first")
-    before = searched(tmp_path / "t.npz", *given)
-    told = capsys.readouterr().out
-    assert re.search(rf"best_known_first_impact_harm +{before.best['first'].harm.mean():.4f}\n", told)
-    assert str(before.header["command"]) in told and before.header["list_seed"] == 7
-    assert [path.name for path in tmp_path.iterdir()] == ["t.npz"]
-    after = searched(tmp_path / "u.npz", *given, "--start", str(tmp_path / "t.npz"))
-    assert list(after.best) == ["first"] and (after.best["first"].harm <= before.best["first"].harm + 1e-6).all()
-    assert "--start" in after.header["command"]
-
-
 def test_best_harm_programme__takes_what_agents_do_better(tmp_path: Path) -> None:
     before = searched(tmp_path / "t.npz", "--episodes", "15")
     after = searched(tmp_path / "u.npz", "--episodes", "15", "--agents", "constant:5+search,full_brake")
@@ -423,18 +405,6 @@ def test_known_limits__are_the_proof_and_the_best_known() -> None:
     assert (np.minimum(found.first_impact_harm, found.total_harm) >= proof.harm - 1e-9).all()
 
 
-def test_known_limits__say_why_nothing_is_proven() -> None:
-    coasts = load_scenario("cooperation-3-pair").replace(roles={"vehicle_1": "coast", "vehicle_2": "learner"})
-    for task, why in (
-        (Task(SCENARIO, ()), "the controlled vehicles are none; avoidability is proven for one controlled vehicle"),
-        (
-            Task(coasts, (1, 2)),
-            "vehicle_1 follows the script coast; the best known harm holds where it follows full_brake",
-        ),
-    ):
-        assert known_limits(LISTED, task) == Unproven(why)
-
-
 def test_prove__decides_contact_of_vehicles_2_and_3_as_of_vehicle_2_alone_and_bounds_one_vehicle_only() -> None:
     scenario = load_scenario("cooperation-3-pair")
     alone, both = prove(LISTED, Task(scenario, (1,))), prove(LISTED, Task(scenario, (2, 1)))
@@ -460,19 +430,3 @@ def test_known_limits__without_a_proof_are_the_best_known_harm(name: str, vehicl
     found = known_limits(scenario.sample(30, 7).worlds, Task(scenario, vehicles))
     assert found.proof == Proof(None, None, None) and found.proof.contact is None
     assert found.known.any() == found.known.all() == (name == "cooperation-2-five")  # for which a table ships
-
-
-def test_evaluation__without_a_proof_shows_best_known_harm_alone(tmp_path: Path) -> None:
-    scenario = load_scenario("cooperation-3-five")
-    agents = {name: make_agent(name) for name in ("full_brake", "coast")}
-    found = evaluate(scenario.sample(20, 7), agents, scenario=scenario)
-    rows = summarise(found)
-    told, text = rows[0], " ".join(LIMITS.notes(rows))
-    nothing = ("unavoidable_rate", "impact_proven_rate", "avoidable_collision_rate", "proven_harm")
-    assert [told[name] for name in nothing] == [None] * 4 and told.more["limits"]["impact_unproven"] is None
-    assert told["best_known_first_impact_harm"].value > 0.0 and "proven" not in text.lower()
-    write_per_world(tmp_path / "out.csv", found)
-    with (tmp_path / "out.csv").open(newline="") as lines:
-        cells = next(csv.DictReader(lines))
-    assert cells["avoidable"] == cells["unavoidable_reason"] == cells["proven_harm"] == ""
-    assert avoidable_section(found).title and worst_section(found, "coast", ()).title

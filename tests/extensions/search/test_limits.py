@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,7 +19,7 @@ from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.measure_sets import measures
 from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk, evaluate
-from ethbrake_marl.evaluation.summary import SummaryTable, summarise
+from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.evaluation.tally import Tally
 from ethbrake_marl.extensions.search import limits, regret
 from ethbrake_marl.extensions.search.limit_measures import LIMITS
@@ -255,20 +254,6 @@ def test_distance__a_best_that_is_not_known_everywhere_realises_nothing(four: Ev
     )
 
 
-@pytest.mark.parametrize(("seeds", "share"), [((7,), 1.0), ((4711,), None), ((7, 4711), None)])
-def test_limits__of_a_list_longer_than_its_table_are_told_in_a_warning_and_of_no_table_are_not(
-    seeds: tuple[int, ...], share: float | None, paper_random: Scenario
-) -> None:
-    worlds, partly = eb.Worlds.concatenate([paper_random.sample(8, seed).worlds for seed in seeds]), len(seeds) > 1
-    found = evaluate(worlds, BRAKE, scenario=paper_random, aftermath=False)
-    with pytest.warns(IncompleteTable) if partly else nullcontext():
-        (row,) = summarise(found)
-    assert (row.more["limits"]["known_best_share"] == 1.0) == (share == 1.0)
-    assert (row.to_json()["best_known_warning"] is not None) == partly
-    for text in (SummaryTable([row]).markdown(), SummaryTable([row])._repr_html_()):
-        assert ("WARNING" in text) == partly
-
-
 LINE = load_scenario("paper-random")
 
 
@@ -351,21 +336,6 @@ def test_shipped__stress_wide_has_a_loose_proof_and_says_so() -> None:
     assert leaning["proven"]["between"]["mean_first"] < 0.03  # in the paper's lists leaning explains what is between
 
 
-def test_shipped__every_table_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    names = [table.header["scenario"] for table in shipped_tables()]
-    few = [replace(table, header={**table.header, "episodes": 20}) for table in shipped_tables()]
-    monkeypatch.setattr(STUDY, "shipped_tables", lambda: few)
-    found, sheet = STUDY.shipped_bounds()
-    assert [one["scenario"] for one in found] == names and len(sheet.markdown().splitlines()) == 2 + len(found)
-
-
-def test_shipped__where_nothing_is_proven_the_reason_stands_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(STUDY, "unproven_because", lambda *_: "an obstacle stands ahead of vehicle_1")
-    (found,), sheet = STUDY.shipped_bounds([shipped_table("paper-delay-low", episodes=5)])
-    assert found["proven"] is None and found["gap_first"] is None
-    assert "an obstacle stands ahead" in sheet.markdown().splitlines()[2]
-
-
 def test_between__proven_contact_and_proven_impact() -> None:
     contact, impact = np.array([0, 1, 1, 1, 1], bool), np.array([0, 1, 0, 0, 0], bool)
     first, total = np.array([0, 9, 1e-4, 6, np.nan]), np.array([0, 9, 2e-4, 8, np.nan])
@@ -377,15 +347,6 @@ def test_between__proven_contact_and_proven_impact() -> None:
     assert nobody.rate == 0.0
     assert nobody.mean_first is None
     assert nobody.harmless_rate is None
-
-
-def test_proven_of_table__leaves_out_what_cannot_be_advanced() -> None:
-    scenario, table = load_scenario("paper-delay-low"), shipped_table("paper-delay-low")
-    worlds, task = scenario.sample(6, 7).worlds, Task(scenario, (1,))
-    whole = STUDY.proven_of_table(worlds.take([0, 1, 3, 4, 5]), task, table)
-    worlds.gaps_m[2], worlds.speeds_mps[2] = [0.2, -1.0], [10.0, 20.0, 16.0]
-    assert whole is not None
-    assert STUDY.proven_of_table(worlds, task, table) == whole
 
 
 PAPER = eb.load_scenario("paper-random")

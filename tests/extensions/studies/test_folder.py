@@ -1,6 +1,5 @@
 """Studies that go on after a kill: one contract for their folders, and trainings several at a time."""
 
-import re
 import shutil
 import subprocess
 import sys
@@ -14,14 +13,12 @@ from filelock import FileLock
 
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.extensions.cooperation.ablation import ablation_cost
-from ethbrake_marl.extensions.cooperation.levels import plan_ablation
 from ethbrake_marl.extensions.studies.folder import StudyFolder
 from ethbrake_marl.extensions.studies.trainings import TrainingJob, train_all
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.training.recipe import load_recipe
 from ethbrake_marl.training.training import Training
-from tests.extensions.studies.conftest import ABLATE, LEVELS
+from tests.extensions.studies.conftest import ABLATE
 
 ROOT = Path(__file__).resolve().parents[3]
 QUESTION = {"seed": 1, "levels": [1, 2], "versions": {"numpy": "2", "torch": "2"}}
@@ -247,29 +244,3 @@ def test_damaged_file__is_named_in_one_line_before_anything_is_done(
         damaged.write_text(text.replace(*damage))
     said = told(tmp_path / "copy", *study.line, but=damaged.name)
     assert message in said and said.count("\n") == 2
-
-
-@pytest.mark.parametrize("study", ["ablation"], indirect=True)
-@pytest.mark.parametrize(
-    ("copied", "seeds", "patterns"),
-    [
-        (True, 2, ["to do: 0 trainings, 0 decisions: 0 s; joint", "npz: is damaged; its worlds are"]),
-        (True, 3, ["to do: 2 trainings, 512 decisions at"]),
-        (False, 1, ["to do: 2 trainings, 512 decisions at"]),
-    ],
-)
-def test_cost__is_told_and_nothing_is_made(
-    study: Study, copied: bool, seeds: int, patterns: list[str], tmp_path: Path
-) -> None:
-    folder = tmp_path / "there"
-    if copied:
-        shutil.copytree(study.folder, folder)
-    for damaged in [*folder.glob("optimum/*/*.npz")][:1]:
-        damaged.write_bytes(b"no table")
-    recipe = str(study.line[study.line.index("--recipes") + 1])
-    plan = plan_ablation(
-        LEVELS, recipe, ["scheme=shared"], seeds=seeds, steps_per_learner=128, episodes=20, search_episodes=4,
-        folder=folder,
-    )  # fmt: skip
-    said = str(ablation_cost(plan))
-    assert [each for each in patterns if not re.search(each, said)] == [] and folder.exists() == copied

@@ -4,14 +4,10 @@ import math
 import time
 from typing import Any
 
-import numba
 import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.envs.making import make_engine
-from ethbrake_marl.extensions.studies.machine import this_machine
-from ethbrake_marl.physics.advance import advance
 from tests.docs.site import load
 
 benchmark = load("../studies/speed")
@@ -31,38 +27,12 @@ def test_rates__are_work_per_processor_second_without_the_first_round(monkeypatc
     assert benchmark.rates(work, benchmark.Effort(2, 0.5)).tolist() == [10.0, 40.0]
 
 
-def test_measure__sets_world_steps_against_the_first_figure(monkeypatch: pytest.MonkeyPatch) -> None:
-    def figure(unit: str, *values: float) -> Any:
-        return benchmark.Benchmark("x", "y", unit, 5, None, lambda effort: np.array(values))
-
-    figures = (figure("world-steps/s", 7.0, 8.0, 9.0), figure("s", 4.0), figure("world-steps/s", 1.0, 2.0, 2.0))
-    monkeypatch.setattr(benchmark, "BENCHMARKS", figures)
-    found = benchmark.measure()
-    assert [speed.relative for speed in found] == [1.0, None, 0.25]
-    assert [(speed.lowest, speed.value, speed.highest) for speed in found] == [(7, 8, 9), (4, 4, 4), (1, 2, 2)]
-
-
-def test_braking__counts_world_steps_to_rest() -> None:
-    worlds = make_engine(benchmark.SCENARIO, 5, seed=benchmark.SEED).worlds
-    command = -worlds.vehicles.braking_capacity_mps2
-    steps = 0
-    while worlds.speeds_mps.any():
-        worlds, steps = advance(worlds, command, 0.1)[0], steps + 1
-    assert benchmark.braking(5, 1.0)() == 5 * steps and steps > 20
-
-
 @pytest.mark.parametrize(
     "each", [pytest.param(each, marks=pytest.mark.slow if each.unit == "s" else ()) for each in benchmark.BENCHMARKS]
 )
 def test_benchmarks__each_measures_something(each: Any) -> None:
     speed = each.measure(SHORT)
     assert each.workload and each.worlds >= 1 and 0.0 < speed.lowest == speed.value == speed.highest < math.inf
-
-
-def test_machine__is_named_in_words() -> None:
-    machine = this_machine()
-    parts = (machine.processor, f"{machine.cores_usable} of {machine.cores} cores", f"numba {numba.__version__}")
-    assert machine.processor and all(part in str(machine) for part in parts)
 
 
 SPEED = load("../studies/speed")

@@ -1,0 +1,1 @@
+"""Pictures, words and a window of running episodes."""

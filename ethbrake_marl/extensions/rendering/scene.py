@@ -1,0 +1,181 @@
+"""What a picture shows: one world at one moment, and how to find it inside a step."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.step import advance_worlds
+from ethbrake_marl.motion.layout import (
+    BRAKING,
+    COUNT,
+    DRIVING,
+    FAR_M,
+    FIRST,
+    GAP,
+    LATENCY,
+    NEXT_CLOSING,
+    NEXT_TIME,
+    SPEED,
+    TOTAL,
+    Floats,
+    scratch_for,
+)
+
+BODY_M = 4.5  # drawn length of a vehicle (m); in the physics, vehicles have no length
+FLASH_S = 0.3  # time for which an impact is shown (s)
+POST_M = 1e6  # place of a post far ahead, from which the way of Vehicle 1 is measured (m)
+BEHIND_M, AHEAD_M = 3.0, 5.0  # free road behind and ahead of the line (m)
+LEAST_WIDTH_M = 40.0  # shortest road that is shown (m)
+LATE_S = 3.0  # longest latency that counts for the length of road (s)
+COLUMNS = 100  # width of the road in characters
+
+
+class Impact(NamedTuple):
+    """The first impact of a pair in a step."""
+
+    pair: int  # 0: Vehicle 1 and the obstacle
+    closing_mps: float
+    time_s: float  # since the alert
+
+    def __str__(self) -> str:
+        who = f"Vehicles {self.pair} and {self.pair + 1}" if self.pair else "Vehicle 1 and the obstacle"
+        return f"{who} at {self.closing_mps:.1f} m/s" if self.closing_mps >= 0.05 else f"{who} at < 0.1 m/s"
+
+
+class Scene(NamedTuple):
+    """One world at one moment. Places are m ahead of Vehicle 1's front bumper at the first decision."""
+
+    title: str
+    learners: tuple[int, ...]  # bodies
+    ended: bool
+    time_s: float  # since the alert
+    line: Floats  # [LINE_ROWS, N + 1]
+    car: Floats  # [CAR_ROWS, N + 1]
+    wanted: Floats  # [N + 1] commands (m/s2)
+    front_m: float  # place of Vehicle 1's front bumper
+    impacts: tuple[Impact, ...]  # of the last FLASH_S
+    road_m: tuple[float, float]  # places of the ends of the road that the episode needs
+
+    @property
+    def fronts_m(self) -> list[float]:
+        """Places of the front bumpers: true gaps between bodies of length BODY_M."""
+        behind = np.concatenate([[0.0], np.cumsum(self.line[GAP, 1:-1] + BODY_M)])
+        return [float(self.front_m - way) for way in behind]
+
+    @property
+    def shown_m(self) -> tuple[float, float]:
+        """Places of the ends of the road that is shown: moved forward and widened until it holds the whole line."""
+        (left, right), fronts = self.road_m, self.fronts_m
+        on = max(fronts[0] + AHEAD_M - right, 0.0)
+        return min(left + on, fronts[-1] - BODY_M - BEHIND_M), right + on
+
+    @property
+    def has_obstacle(self) -> bool:
+        return bool(self.line[GAP, 0] < FAR_M)
+
+    @property
+    def obstacle_m(self) -> float:
+        """Place of the obstacle."""
+        return self.front_m + float(self.line[GAP, 0])
+
+    def command(self, body: int) -> float:
+        """Return the command that takes effect (m/s2); 0 before the body's latency has elapsed."""
+        return float(self.wanted[body]) if self.car[LATENCY, body] <= self.time_s else 0.0
+
+    def share(self, body: int) -> float:
+        """Return the command as a share of the capacity, -1 (brakes fully) to 1 (drives fully)."""
+        command = self.command(body)
+        return command / float(self.car[BRAKING if command < 0.0 else DRIVING, body]) if command else 0.0
+
+    def said_of(self, body: int) -> str:
+        """Return what a vehicle does, such as "brakes 3.0 m/s2"."""
+        latency, command = float(self.car[LATENCY, body]), self.command(body)
+        if latency > self.time_s:
+            return f"acts from {latency:.2f} s" if latency < math.inf else "never acts"
+        return f"{'brakes' if command < 0.0 else 'drives'} {abs(command):.1f} m/s2" if command else "coasts"
+
+    @property
+    def clock(self) -> str:
+        return f"{self.time_s:.2f} s after the alert{' (ended)' if self.ended else ''}"
+
+    @property
+    def harm(self) -> str:
+        first, total = (float(self.line[row, :-1].sum()) for row in (FIRST, TOTAL))
+        return f"harm {first:.2f} by first impacts, {total:.2f} in total (m2/s2)"
+
+    def text(self) -> str:
+        """Return the scene in words: the road to scale, then a line for each vehicle."""
+        left, right = self.shown_m
+
+        def column(place_m: float) -> int:
+            return min(max(int((place_m - left) / (right - left) * COLUMNS), 0), COLUMNS - 1)
+
+        road, lines, fronts = ["."] * COLUMNS, [], self.fronts_m
+        for body in range(len(fronts), 0, -1):
+            first, last = column(fronts[body - 1] - BODY_M), column(fronts[body - 1])
+            road[first : last + 1] = f"[{body}>".center(last + 1 - first, "=")[: last + 1 - first]
+            gap = f"gap ahead {self.line[GAP, body - 1]:6.2f} m" if body > 1 or self.has_obstacle else ""
+            learns = "learns" if body in self.learners else ""
+            lines.append(
+                f"vehicle_{body:<3} {learns:6}  {self.line[SPEED, body]:6.2f} m/s  {gap:18}  {self.said_of(body)}"
+            )
+        if self.has_obstacle:
+            road[column(self.obstacle_m)] = "#"
+        for impact in self.impacts:
+            road[column(fronts[impact.pair])] = "*"
+        lines = [f"{self.title}  {self.clock}", "".join(road), *(line.rstrip() for line in reversed(lines)), self.harm]
+        return "\n".join([*lines, *(f"impact of {impact}, {impact.time_s:.2f} s" for impact in self.impacts)]) + "\n"
+
+
+class Motion:
+    """One world from one decision to the next. Every moment of it is computed with the physics of the episode."""
+
+    def __init__(self, state: State, row: int, front_m: float = 0.0, impacts: tuple[Impact, ...] = ()) -> None:
+        self.line, self.car, self.wanted = state.line[row].copy(), state.car[row], state.wanted[row].copy()
+        self.start_s = self.until_s = float(state.time_s[row])
+        self.front_m, self.impacts = front_m, impacts
+        self.has_obstacle = bool(self.line[GAP, 0] < FAR_M)
+
+    def at(self, time_s: float) -> tuple[Floats, float, tuple[Impact, ...]]:
+        """Return line, place of Vehicle 1 and recent impacts at a time of this motion (s after the alert)."""
+        line = self.line.copy()
+        if not self.has_obstacle:
+            line[GAP, 0] = POST_M
+        ahead_m, counts, scratch = line[GAP, 0], line[COUNT].copy(), scratch_for(len(self.wanted))
+        times = np.array([self.start_s]), np.array([time_s])
+        if time_s > self.start_s:
+            advance_worlds(line[np.newaxis], self.car[np.newaxis], *times, self.wanted[np.newaxis], scratch)
+        new = [
+            Impact(int(p), float(scratch[NEXT_CLOSING, p]), self.start_s + float(scratch[NEXT_TIME, p]))
+            for p in np.flatnonzero(line[COUNT] > counts)
+        ]
+        recent = tuple(impact for impact in (*self.impacts, *new) if impact.time_s > time_s - FLASH_S)
+        front_m = self.front_m + float(ahead_m - line[GAP, 0])
+        if not self.has_obstacle:
+            line[GAP, 0] = self.line[GAP, 0]
+        return line, front_m, recent
+
+    def next(self, state: State, row: int) -> Motion:
+        """Return the motion that begins where this one ends, and leads to a state."""
+        line, front_m, impacts = self.at(self.until_s)
+        new = Motion(state, row, front_m, impacts)
+        new.line, new.start_s = line, self.until_s
+        return new
+
+
+def whole_road(state: State, row: int) -> tuple[float, float]:
+    """Return the road on which the line comes to rest if all vehicles brake fully as soon as they can.
+
+    A rear vehicle that would come to rest further ahead is taken to push the others.
+    """
+    speeds, braking = state.speeds_mps[row], state.braking_capacity_mps2[row]
+    behind = np.concatenate([[0.0], np.cumsum(state.gaps_m[row])])
+    late = np.clip(state.latency_s[row] - state.time_s[row], 0.0, LATE_S)
+    ways = speeds * late + speeds**2 / (2.0 * braking) - behind
+    left = -float(behind[-1]) - state.vehicles * BODY_M - BEHIND_M
+    right = min(float(ways.max()), float(state.obstacle_gap_m[row])) + AHEAD_M
+    return left, max(right, left + LEAST_WIDTH_M)

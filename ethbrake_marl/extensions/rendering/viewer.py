@@ -1,0 +1,159 @@
+"""The render modes of environments: ``rgb_array``, ``ansi`` and ``human``."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.errors import InvalidInput, check_whole_number, need
+from ethbrake_marl.extensions.rendering.scene import Motion, Scene, whole_road
+from ethbrake_marl.motion.layout import Floats
+
+SMOOTH_FPS = 50  # frames per second in the window, and default of `step_frames`
+
+
+class Viewer:
+    """Draws the running episodes of an environment with one world, or with many (``num_envs``)."""
+
+    def __init__(self, environment: Any) -> None:
+        self.environment = environment
+        self.many = hasattr(environment, "num_envs")
+        self.motions: list[Motion] = []  # of each world, since its last decision
+        self.roads: list[tuple[float, float]] = []
+
+    def began(self, state: State) -> None:
+        """Start the pictures of new episodes; those that go on keep theirs."""
+        if len(self.motions) != state.n:
+            self.motions = [Motion(state, row) for row in range(state.n)]
+            self.roads = [whole_road(state, row) for row in range(state.n)]
+        self.stepped(state)
+
+    def stepped(self, state: State) -> None:
+        """Remember the step that led to this state, in every world."""
+        for row, last in enumerate(self.motions):
+            if state.steps[row] == 0:
+                self.motions[row], self.roads[row] = Motion(state, row), whole_road(state, row)
+            elif state.time_s[row] > last.until_s:
+                self.motions[row] = last.next(state, row)
+
+    def scenes(self, row: int, times_s: Floats | None = None) -> list[Scene]:
+        """Return a world at some times of its last step (s after the alert); None: at its end."""
+        motion, environment = self.last_step(row), self.environment
+        ended = bool(environment.episode.ended[row])
+        learners = tuple(int(body) for body in environment.game.rules.learners)
+        return [
+            Scene(
+                environment.scenario.name, learners, ended and time == motion.until_s, float(time), line, motion.car,
+                motion.wanted, front_m, impacts, self.roads[row],
+            )
+            for time in ([motion.until_s] if times_s is None else times_s)
+            for line, front_m, impacts in [motion.at(float(time))]
+        ]  # fmt: skip
+
+    def last_step(self, row: int) -> Motion:
+        """Return the last step of a world."""
+        if not self.motions:
+            raise InvalidInput("render: no episode has started; call reset first")
+        return self.motions[row]
+
+    def render(self) -> Any:
+        """Return the present moment, as the mode shows it; of every world if there are many."""
+        shown = [self.show(self.scenes(row)[0]) for row in range(len(self.motions) or 1)]
+        return shown if self.many else shown[0]
+
+    def show(self, scene: Scene) -> Any:
+        """Return a scene as a picture, [304, 800, 3] uint8."""
+        from ethbrake_marl.extensions.rendering.picture import picture
+
+        return picture(scene)
+
+    def step_frames(self, fps: int = SMOOTH_FPS, row: int = 0) -> list[Any]:
+        """Return the last step of a world as pictures, ``fps`` per second of the episode."""
+        check_whole_number("step_frames: fps", fps, 1)
+        motion = self.last_step(row)
+        count = max(round((motion.until_s - motion.start_s) * fps), 1)
+        times: Floats = np.linspace(motion.start_s, motion.until_s, count + 1)[1:]
+        return [Viewer.show(self, scene) for scene in self.scenes(row, times)]
+
+    def close(self) -> None:
+        """Do nothing: there is no window."""
+
+
+class Words(Viewer):
+    """Mode ``ansi``: the present moment as plain text."""
+
+    def show(self, scene: Scene) -> Any:
+        """Return a scene as text."""
+        return scene.text()
+
+
+class Window(Viewer):
+    """Mode ``human``: a window that shows every step in real time. The user may close it until the next episode."""
+
+    def __init__(self, environment: Any) -> None:
+        super().__init__(environment)
+        if self.many:
+            raise InvalidInput("render_mode = 'human': must be 'rgb_array' or 'ansi' for many worlds")
+        need("pygame")
+        self.window: Any = None
+        self.closed = False
+
+    def began(self, state: State) -> None:
+        """Open the window."""
+        super().began(state)
+        self.closed = False
+        self._play()
+
+    def stepped(self, state: State) -> None:
+        """Show the step in real time."""
+        super().stepped(state)
+        self._play()
+
+    def render(self) -> None:
+        """Return nothing: the window shows every step by itself."""
+
+    def _play(self) -> None:
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+        import pygame
+
+        clock = pygame.time.Clock()
+        for frame in [] if self.closed else self.step_frames():
+            size = frame.shape[1::-1]
+            if self.window is None:
+                self.window = _open(pygame, size)
+            self.window.get_surface().blit(pygame.image.frombuffer(frame.tobytes(), size, "RGB"), (0, 0))
+            self.window.flip()
+            clock.tick(SMOOTH_FPS)
+            for event in pygame.event.get(pygame.WINDOWCLOSE):
+                if event.window is self.window:
+                    self.closed = True
+                else:  # another environment's
+                    pygame.event.post(event)
+            pygame.event.pump()
+            if self.closed:
+                self.close()
+                return
+
+    def close(self) -> None:
+        """Close the window; those of other environments stay open."""
+        if self.window is not None:
+            self.window.destroy()
+            self.window = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy opens a window of its own."""
+        return {**self.__dict__, "window": None}
+
+
+def _open(pygame: Any, size: tuple[int, int]) -> Any:
+    """Return a new window. Raises ``InvalidInput`` without a display."""
+    try:
+        pygame.display.init()
+        return pygame.Window("EthBrake", size)
+    except pygame.error as error:
+        raise InvalidInput(
+            f"render_mode = 'human': cannot open a window ({error}); use 'rgb_array', which needs no display"
+        ) from None
