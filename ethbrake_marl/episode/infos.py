@@ -77,29 +77,28 @@ def numbers(state: State, bodies: Ints) -> Floats:
 
 def of_step(game: Game, state: State, step: Step | None, seed: int) -> dict[str, Any]:
     """Return the infos that belong to a world, and terms of vehicles: name -> [n] or [n, N]. ``step`` None: a reset."""
-    nothing = np.zeros(state.n)
-    params = game.rewarding.params
-    found: dict[str, Any] = {"cost": nothing, "world_seed": np.full(state.n, seed), "world": state.clock[:, NUMBER]}
-    found |= {f"reward_{name}": nothing for name in params.counted}
-    if step is not None:
-        found["cost"] = step.total_harm if params.harm_count == "total" else step.first_impact_harm
-        terms = step.terms or game.rewarding.shared(step)
-        found |= {f"reward_{name}": terms[name] for name in params.counted}
-    return found | game.own_infos(state)
+    counted, total = game.rewarding.counted, game.rewarding.params.harm_count == "total"
+    worlds = {"world_seed": np.full(state.n, seed), "world": state.clock[:, NUMBER].astype(np.int64)}
+    if step is None:
+        nothing = np.zeros(state.n)
+        return {"cost": nothing, **worlds, **{f"reward_{name}": nothing for name in counted}}
+    terms = step.terms or game.rewarding.shared(step)
+    cost = step.total_harm if total else step.first_impact_harm
+    return {"cost": cost, **worlds, **{f"reward_{name}": terms[name] for name in counted}}
 
 
 def dictionaries(game: Game, state: State, step: Step | None, seed: int, bodies: Ints) -> list[dict[str, Any]]:
     """Return one dictionary for each world and body, world by world."""
+    found = of_step(game, state, step, seed) | game.own_infos(state)
+    shared = {name: value.tolist() for name, value in found.items() if value.ndim == 1}
+    own = {name: value[:, bodies - 1].tolist() for name, value in found.items() if value.ndim == 2}
     infos: list[dict[str, Any]] = []
-    of_worlds = of_step(game, state, step, seed)
     for k, world in enumerate(numbers(state, bodies).tolist()):
-        shared = {name: value[k].item() for name, value in of_worlds.items() if value.ndim == 1}
-        shared["world"] = int(shared["world"])
-        each = [(name, value[k, bodies - 1].tolist()) for name, value in of_worlds.items() if value.ndim == 2]
+        common = {name: column[k] for name, column in shared.items()}
         for o, values in enumerate(world):
             info = dict(zip(NUMBERS, values, strict=True))
             info["collided"] = values[COLLIDED] == 1.0
-            infos.append(info | shared | {name: column[o] for name, column in each})
+            infos.append(info | common | {name: column[k][o] for name, column in own.items()})
     return infos
 
 
@@ -107,7 +106,6 @@ def arrays(game: Game, state: State, step: Step | None, seed: int, body: int) ->
     """Return the infos of one body in every world: name -> [n]."""
     columns = dict(zip(NUMBERS, numbers(state, np.array([body]))[:, 0].T, strict=True))
     columns["collided"] = columns["collided"] == 1.0
-    for name, value in of_step(game, state, step, seed).items():
+    for name, value in (of_step(game, state, step, seed) | game.own_infos(state)).items():
         columns[name] = value if value.ndim == 1 else value[:, body - 1]
-    columns["world"] = columns["world"].astype(np.int64)
     return columns

@@ -132,11 +132,6 @@ class RewardParams(FileModel):
         """Weight of every built-in and every registered term."""
         return {**{name: getattr(self, name) for name in BUILT_IN}, **self.terms}
 
-    @property
-    def counted(self) -> tuple[str, ...]:
-        """Names of the terms whose weight is not 0."""
-        return tuple(name for name, weight in self.weights.items() if weight != 0.0)
-
 
 REWARDS = {
     "harm": RewardParams(),
@@ -175,6 +170,7 @@ class Rewarding(NamedTuple):
     """A reward, ready to be computed: what the compiled step does not know of it."""
 
     params: RewardParams
+    counted: tuple[str, ...]  # names of the terms whose weight is not 0
     terms: tuple[tuple[str, float, TermFunction], ...]  # name, weight and function
     shaping: Shaping | None
     components: tuple[tuple[str, TermFunction], ...]  # of a vector reward
@@ -217,9 +213,10 @@ class Rewarding(NamedTuple):
             functions = {"harm": objective_term(objectives, params.harm_count), **functions}
         terms = [(name, params.weights[name], function) for name, function in functions.items() if params.weights[name]]
         shaping = Shaping(rules, params.shaping_discount) if params.shaping else None
-        names = () if vector is None else components_of(vector, params.counted, vehicles)
+        counted = tuple(name for name, weight in params.weights.items() if weight != 0.0)
+        names = () if vector is None else components_of(vector, counted, vehicles)
         parts = [(name, component(name, vehicles, params.harm_count) or partial(_value, name)) for name in names]
-        return cls(params, tuple(terms), shaping, tuple(parts)), rules
+        return cls(params, counted, tuple(terms), shaping, tuple(parts)), rules
 
     @property
     def is_compiled(self) -> bool:
@@ -248,7 +245,7 @@ class Rewarding(NamedTuple):
         """Return the values of the terms that the compiled step knows, [n]."""
         harm = step.total_harm if self.params.harm_count == "total" else step.first_impact_harm
         known = {"harm": -harm, "terminal": step.out[-1]}
-        return {name: value for name, value in known.items() if name in self.params.counted}
+        return {name: value for name, value in known.items() if name in self.counted}
 
 
 def _wide(value: Floats) -> Floats:

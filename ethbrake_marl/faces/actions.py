@@ -38,7 +38,8 @@ def checked_actions(actions: ArrayLike, shape: tuple[int, ...], whose: str, coun
                 f" whole number from 0 to {count - 1}"
             )
         given = (2 * given.astype(np.int64) - (count - 1)) / (count - 1)
-    long = tuple(length for length in given.shape if length != 1)
-    if given.shape != shape and long != tuple(length for length in shape if length != 1):
-        raise InvalidInput(f"action of {whose}: has shape {given.shape}; must have shape {shape}")
-    return given.astype(np.float64).reshape(shape)
+    if given.shape != shape:
+        if [length for length in given.shape if length != 1] != [length for length in shape if length != 1]:
+            raise InvalidInput(f"action of {whose}: has shape {given.shape}; must have shape {shape}")
+        given = given.reshape(shape)
+    return given.astype(np.float64)

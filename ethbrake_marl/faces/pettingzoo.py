@@ -190,7 +190,7 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, Any]):  # type: ignore[
             action = actions.get(agent)
             if action is None and self.game.shield is None:
                 raise InvalidInput(f"step: the action of learner {agent} is missing")
-            columns[0, c] = np.nan if action is None else checked_actions(action, (), agent, self.actions)
+            columns[0, c] = np.nan if action is None else checked_actions(action, (1,), agent, self.actions)[0]
         return columns
 
     def _warn_of_ignored(self, actions: Mapping[str, Any]) -> None:

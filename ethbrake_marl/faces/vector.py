@@ -177,10 +177,9 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         """
         infos: dict[str, Any] = {}
         for name, column in arrays(self.game, self.episode, step, self.stream.seed or 0, self.body).items():
-            if name == "cost" or name.startswith("reward_"):
-                column = np.where(stepped, column, 0.0)
-            infos[name] = np.zeros_like(column, order="C")
-            infos[name][rows] = column[rows]
+            of_step = name == "cost" or name.startswith("reward_")
+            told = rows & stepped if of_step else rows
+            infos[name] = column.copy() if told.all() else np.where(told, column, np.zeros((), column.dtype))
             infos[f"_{name}"] = rows.copy()
         return infos
 

@@ -25,10 +25,9 @@ from ethbrake_marl.motion.layout import (
     WEIGHT,
 )
 from ethbrake_marl.scenario.tables import worlds_from_table as first_from_table
-from ethbrake_marl.worlds.catalogue import list_scenarios, load_scenario
+from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.given import worlds_from_table
-
-NAMES = [entry.name for entry in list_scenarios()]
+from tests.fixtures.scenarios import SHIPPED
 
 
 def as_state(worlds):
@@ -58,7 +57,7 @@ def as_state(worlds):
 
 
 @pytest.mark.parametrize("seed", [7, 2024])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SHIPPED)
 def test_worlds__have_the_bits_of_the_first_edition(name: str, seed: int) -> None:
     channel = "list" if seed == 7 else "training"
     old = first.load_scenario(name).sample(1500, seed, first=seed, channel=channel)
@@ -71,7 +70,7 @@ def test_worlds__have_the_bits_of_the_first_edition(name: str, seed: int) -> Non
         assert other.tolist() == (np.full(other.shape, "") if one is None else one).tolist()
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SHIPPED)
 def test_content__is_that_of_the_first_edition(name: str) -> None:
     old, new = first.load_scenario(name), load_scenario(name)
     assert new.declared() == old.declared()
@@ -79,7 +78,7 @@ def test_content__is_that_of_the_first_edition(name: str) -> None:
     assert (new.has_obstacle, [i - 1 for i in new.learners]) == (old.has_obstacle, list(old.learners))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SHIPPED)
 def test_given_worlds__are_those_of_the_first_edition_or_refused_in_its_words(name: str) -> None:
     one, other = first.load_scenario(name), load_scenario(name)
     columns = first.QUANTITY.columns(one.sample(200, 7).worlds)
@@ -96,7 +95,7 @@ def test_given_worlds__are_those_of_the_first_edition_or_refused_in_its_words(na
         assert expected.tobytes() == array.tobytes()
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SHIPPED)
 def test_bounds__are_those_of_the_first_edition(name: str) -> None:
     for key in first.QUANTITY.usual:
         assert load_scenario(name).bounds(key) == first.load_scenario(name).bounds(key)

@@ -22,6 +22,7 @@ from ethbrake_marl.worlds.counters import numbers_of
 from ethbrake_marl.worlds.describe import clusters_of, kinds_of
 from ethbrake_marl.worlds.rules import RULES
 from ethbrake_marl.worlds.scenario import Scenario
+from tests.fixtures.scenarios import SHIPPED
 from tests.refused import refused
 
 PAPER = load_scenario("paper-random")
@@ -227,7 +228,7 @@ def test_mixture__is_world_by_world_that_of_its_members(empty_folder: Path) -> N
 # ---------------------------------------------------------------- the object
 
 
-@pytest.mark.parametrize("name", [entry.name for entry in list_scenarios()])
+@pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_scenario__goes_round(name: str, empty_folder: Path) -> None:
     scenario = load_scenario(name)
     assert Scenario(**scenario.declared()) == scenario
