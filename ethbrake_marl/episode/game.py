@@ -58,22 +58,18 @@ class Game(NamedTuple):
 
     def begin(self, alert: State) -> State:
         """Return the episodes of these worlds at their first decision. Scripts have decided once, at the alert."""
-        wanted, memories = alert.wanted, dict[Any, Any]()
+        wanted, memories = alert.wanted, dict(alert.memories)
         if self.scripts:
             wanted = wanted.copy()
             for body, script in self.scripts.items():
                 wanted[:, body], memories[body] = script.act(alert, script.begin(alert, body), body)
-        state = one_step.begin(
-            alert._replace(wanted=wanted, memories=memories),
-            self.deciders,
-            self.rules.time_step_s,
-            self.rules.horizon_s,
-        )
+        state = self.first_decision(alert._replace(wanted=wanted, memories=memories))
+        memories = dict(state.memories)
         if self.rewarding.shaping is not None:
             memories["shaping"] = self.rewarding.shaping.begin(state)
         if self.shield is not None:
             memories["shield"] = self.shield.begin(self, alert, state)
-        return state
+        return state._replace(memories=memories)
 
     def start(self, n: int, seed: int, first: int) -> State:
         """Return worlds ``first`` to ``first + n - 1`` of the seed at their first decision."""
@@ -89,12 +85,23 @@ class Game(NamedTuple):
             actions, memory = self.shield.decide(self, state, actions, donate=donate)
             state = state._replace(memories={**state.memories, "shield": memory})
         if self.rewarding.is_compiled:
-            return one_step.step(self.rules, self.scripts, state, actions, donate=donate)
-        return self.rewarding.complete(state, *self._step_and_after(state, actions))
+            return self.follow(state, actions, donate=donate)
+        after, step = self.follow(state, actions)
+        return self.rewarding.complete(state, step, after)
 
-    def _step_and_after(self, state: State, actions: Floats) -> tuple[Step, State]:
-        after, step = one_step.step(self.rules, self.scripts, state, actions)
-        return step, after
+    def first_decision(self, alert: State) -> State:
+        """Return the episodes at their first decision, before shaping and shield. Scripts have decided."""
+        return one_step.begin(alert, self.deciders, self.rules.time_step_s, self.rules.horizon_s)
+
+    def follow(self, state: State, actions: Floats, *, donate: bool = False) -> tuple[State, Step]:
+        """Return the state after one step, and what it did: ``step`` without shield and without terms of the reward."""
+        return one_step.step(self.rules, self.scripts, state, actions, donate=donate)
+
+    def own_infos(self, state: State) -> dict[str, Any]:
+        """Return the infos that only this game has: name -> [n] or [n, N]."""
+        if self.shield is None:
+            return {}
+        return {f"shield_{name}": value for name, value in self.shield.infos(self, state).items()}
 
     def observe(self, state: State, bodies: Ints) -> list[Observations]:
         """Return what each of the ``bodies`` observes, [n, F] each."""

@@ -87,16 +87,9 @@ def of_step(game: Game, state: State, step: Step | None, seed: int) -> dict[str,
     return {"cost": cost, **worlds, **{f"reward_{name}": terms[name] for name in counted}}
 
 
-def of_shield(game: Game, state: State) -> dict[str, Any]:
-    """Return what a shield reports: name -> [n]."""
-    if game.shield is None:
-        return {}
-    return {f"shield_{name}": value for name, value in game.shield.infos(game, state).items()}
-
-
 def dictionaries(game: Game, state: State, step: Step | None, seed: int, bodies: Ints) -> list[dict[str, Any]]:
     """Return one dictionary for each world and body, world by world."""
-    found = of_step(game, state, step, seed) | of_shield(game, state)
+    found = of_step(game, state, step, seed) | game.own_infos(state)
     shared = {name: value.tolist() for name, value in found.items() if value.ndim == 1}
     own = {name: value[:, bodies - 1].tolist() for name, value in found.items() if value.ndim == 2}
     infos: list[dict[str, Any]] = []
@@ -113,6 +106,6 @@ def arrays(game: Game, state: State, step: Step | None, seed: int, body: int) ->
     """Return the infos of one body in every world: name -> [n]."""
     columns = dict(zip(NUMBERS, numbers(state, np.array([body]))[:, 0].T, strict=True))
     columns["collided"] = columns["collided"] == 1.0
-    for name, value in of_step(game, state, step, seed).items():
+    for name, value in (of_step(game, state, step, seed) | game.own_infos(state)).items():
         columns[name] = value if value.ndim == 1 else value[:, body - 1]
-    return columns | of_shield(game, state)
+    return columns

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ethbrake_marl.episode.state import CLOCK_COLUMNS, ENDED, STEPS, State, harm_so_far
-from ethbrake_marl.episode.step import advance, command, step
+from ethbrake_marl.episode.step import advance, command
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.drive import FAILED, drive
 from ethbrake_marl.motion.layout import BRAKING, LINE_ROWS, Floats, scratch_for
@@ -78,7 +78,7 @@ def price(game: Game, state: State, plans: Floats, count: str, most: Any = math.
         rows = np.arange(len(plans))
         while not state.ended.all():
             now = np.minimum(state.steps, plans.shape[1] - 1)
-            state, _ = step(game.rules, game.scripts, state, plans[rows, now])
+            state, _ = game.follow(state, plans[rows, now])
         return state.harm(count)
     out, rules = np.empty(len(plans)), game.rules
     most = np.broadcast_to(np.float64(most), out.shape).copy()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -63,6 +63,16 @@ class State(NamedTuple):
             put(old, rows, part, donate) for old, part in zip(self[:5], new[:5], strict=True)
         )
         memories = {who: put(memory, rows, new.memories[who], donate) for who, memory in self.memories.items()}
+        return State(line, car, clock, know, wanted, memories)
+
+    @staticmethod
+    def join(parts: Sequence[State], merged: Callable[[Sequence[Any]], Any] = np.concatenate) -> State:
+        """Return the episodes of all parts, which have memories of the same kinds, in one state.
+
+        ``merged`` returns one array of those of the parts; by default they stand one after the other.
+        """
+        memories = {who: join([part.memories[who] for part in parts], merged) for who in parts[0].memories}
+        line, car, clock, know, wanted = (merged(each) for each in zip(*(part[:5] for part in parts), strict=True))
         return State(line, car, clock, know, wanted, memories)
 
     @property
@@ -176,6 +186,14 @@ def put(memory: Any, rows: Any, new: Any, donate: bool = False) -> Any:
         memory = memory if donate else memory.copy()
         memory[rows] = new
     return memory
+
+
+def join(memories: Sequence[Any], merged: Callable[[Sequence[Any]], Any]) -> Any:
+    """Return memories of one kind as one."""
+    if isinstance(memories[0], tuple):
+        parts = [join(part, merged) for part in zip(*memories, strict=True)]
+        return type(memories[0])(*parts) if hasattr(memories[0], "_fields") else tuple(parts)
+    return None if memories[0] is None else merged(memories)
 
 
 @kernel

@@ -237,9 +237,7 @@ class EthBrakeVecEnv(VecEnv):
                 "set_options: give initial_state in all entries or in none, one for each learner of each world, and the"
                 " same for all learners of a world"
             )
-        worlds = [worlds_from_state(self.scenario, options[k * L]["initial_state"]) for k in range(self.n)]
-        line, car, clock, know, wanted = (np.concatenate(part) for part in zip(*(w[:5] for w in worlds), strict=True))
-        return State(line, car, clock, know, wanted, {})
+        return State.join([worlds_from_state(self.scenario, options[k * L]["initial_state"]) for k in range(self.n)])
 
     def snapshot(self) -> dict[str, Any]:
         """Return what a restored environment needs, between two steps, as arrays and numbers."""

@@ -13,7 +13,7 @@ from ethbrake_marl.episode.state import NUMBER, State
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.worlds.describe import columns_of
 from ethbrake_marl.worlds.given import worlds_from_state
-from ethbrake_marl.worlds.sampling import Drawn, join
+from ethbrake_marl.worlds.sampling import Drawn, merged
 from ethbrake_marl.worlds.scenario import Scenario
 
 OPTIONS = ("initial_state", "listed_world")
@@ -69,7 +69,8 @@ class Stream:
         if (rows := numbers >= 0).any():
             ordered, places = np.unique(numbers[rows], return_inverse=True)
             seed = self.seed or 0
-            drawn = join([self.scenario.draw(1, seed, first=int(k), channel="training") for k in ordered])
+            parts = [self.scenario.draw(1, seed, first=int(k), channel="training") for k in ordered]
+            drawn = merged(parts, np.arange(len(parts)))
             for name, column in columns_of(drawn).items():
                 if name not in columns:
                     columns[name] = np.full(state.n, "" if column.dtype.kind == "U" else np.nan, column.dtype)
@@ -81,7 +82,7 @@ class Stream:
             raise InvalidInput(f"reset: options has both {OPTIONS[0]} and {OPTIONS[1]}; pass only one of them")
         if "initial_state" in options:
             one = worlds_from_state(self.scenario, options["initial_state"])
-            return Drawn(one.take(np.zeros(n, np.int64)))
+            return Drawn.given(one.take(np.zeros(n, np.int64)))
         if "listed_world" not in options:
             return None
         wanted = options["listed_world"]

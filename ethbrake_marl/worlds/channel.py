@@ -20,17 +20,24 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from operator import not_
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
-from pydantic import AfterValidator, Field, GetJsonSchemaHandler, ValidationError, model_validator
+from pydantic import ConfigDict, Field, GetJsonSchemaHandler, model_validator
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.files.model import NAME_PATTERN, FileModel, Wording, explain, require
+from ethbrake_marl.files.model import NAME_PATTERN, UNSHOWN, Wording, read_model, require, suggestion
 from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.motion.layout import Bools, Floats, Ints
+from ethbrake_marl.registry import Registry
+from ethbrake_marl.worlds.counters import Numbers
+from ethbrake_marl.worlds.quantity import Part
+
+if TYPE_CHECKING:
+    from ethbrake_marl.episode.game import Game
+    from ethbrake_marl.worlds.scenario import Scenario
 
 PER_LINK = 4  # uniform numbers of a link: wait, burst, loss, hop
 
@@ -40,7 +47,7 @@ Seconds = Annotated[float, Field(ge=0.0, le=60.0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 
 
-class Equipage(FileModel):
+class Equipage(Part):
     """V2X equipment of one vehicle, or of all vehicles of one type."""
 
     sends: bool = Field(default=True, description="whether the vehicle sends messages")
@@ -95,7 +102,7 @@ class Channel(NamedTuple):
     def heard_and_seen(self, u: Floats, equipped: Equipped) -> tuple[Floats, Floats]:
         """Return when i can use the first message of j, and the delay until i sees j, [n, N, N] s each.
 
-        Infinite: never. Minus infinite: at once.
+        ``u`` [n, PER_LINK N^2] are the uniform numbers of the links. Infinite: never. Minus infinite: at once.
         """
         N = equipped.sends.shape[1]
         links, (receiver, sender) = u.reshape(len(u), N, N, PER_LINK), np.indices((N, N))
@@ -108,8 +115,7 @@ class Channel(NamedTuple):
 
     def news(self, own_latency: Floats, u: Floats, equipped: Equipped) -> tuple[Floats, Floats]:
         """Return when each vehicle can react, [n, N] s, and from when it acts on news of each other, [n, N, N] s."""
-        N = own_latency.shape[1]
-        heard, seen = self.heard_and_seen(u, equipped)
+        N, (heard, seen) = own_latency.shape[1], self.heard_and_seen(u, equipped)
         latency = own_latency.copy()
         for i in range(1, N if self.timing != "latency" else 0):
             first = np.minimum(heard[:, i, 0], latency[:, i - 1] + seen[:, i, i - 1])
@@ -121,15 +127,12 @@ class Channel(NamedTuple):
     def latest_reaction_s(self, own_latency: Sequence[float], equipped: Equipped) -> list[float]:
         """Return upper bounds of the times from which the vehicles can react, from those of their own latencies."""
         latest = list(own_latency)
-        sure = self.hears != "none" and self.lost == 0.0
-        heard = float(self.first_message_s(_LATEST)[0]) if sure else np.inf
+        slowest = np.array([[1.0, 0.0, 1.0, 1.0]])  # numbers of a link with the largest delay of a message
+        heard = float(self.first_message_s(slowest)[0]) if self.hears != "none" and self.lost == 0.0 else np.inf
         for i in range(1, len(latest) if self.timing != "latency" else 0):
             seen = latest[i - 1] + self.sensing_s[1] if self.senses != "none" else np.inf
             latest[i] = max(latest[i], min(seen, np.inf if equipped.unheard[0, i, 0] else heard))
         return latest
-
-
-_LATEST = np.array([[1.0, 0.0, 1.0, 1.0]])  # numbers of a link with the largest delay of a message that arrives
 
 
 def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
@@ -145,6 +148,42 @@ def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
     return periods
 
 
+class Extension(Protocol):
+    """What a package adds to the knowledge of vehicles, declared by keys of ``v2x``."""
+
+    name: str  # of its memory in `State.memories`
+    keys: tuple[str, ...]  # of `v2x`
+    schemas: Mapping[str, JsonSchemaValue]  # JSON schema of each key, with a description
+
+    def read(self, key: str, value: Any) -> Any:
+        """Return the value of a key as plain data. Refuses (``files.model.refuse``) a bad value."""
+
+    def uses(self, v2x: V2X) -> tuple[str, ...]:
+        """Return the keys of messages that have an effect because of this extension. Refuses keys without effect."""
+
+    def is_random(self, v2x: V2X) -> bool:
+        """Return whether random numbers determine what vehicles know, beside those of the channel."""
+
+    def check(self, scenario: Scenario) -> None:
+        """Refuse a scenario in which these keys cannot be used."""
+
+    def check_alike(self, where: str, first: Scenario, other: Scenario) -> None:
+        """Raise ``InvalidInput`` unless worlds of both scenarios can be drawn together."""
+
+    def at_alert(self, scenario: Scenario, numbers: Numbers, equipped: Equipped, n: int) -> Any:
+        """Return the memory of n worlds at the alert."""
+
+    def game(self, game: Game) -> Game:
+        """Return the game with this extension."""
+
+
+def register_v2x_extension(key: str, extension: Extension) -> None:
+    """Register what the key ``key`` of ``v2x`` declares. Entry points: ``ethbrake_marl.v2x_extensions``."""
+    EXTENSIONS.add(key, extension, lambda other: other is extension)
+
+
+EXTENSIONS: Registry[Extension] = Registry("key of v2x", "v2x_extensions", register_v2x_extension)
+
 CHANNELS = {
     "paper": Channel("latency", senses="none"),
     "clear": Channel("messages", loss_begins=0.01, loss_ends=0.5),
@@ -154,27 +193,18 @@ CHANNELS = {
     "sensors-only": Channel("messages", hears="none"),
 }
 
-_OF_MESSAGES = ("message_period_s", "loss_begins", "loss_ends", "radio_s", "processing_s", "actuation_s")
+OF_MESSAGES = ("message_period_s", "loss_begins", "loss_ends", "radio_s", "processing_s", "actuation_s")
 
 
-def _known_preset(name: str) -> str:
-    *names, last = CHANNELS
-    require(name in CHANNELS, (), name, f"must be a preset: {', '.join(names)} or {last}")
-    return name
+class V2X(Part):
+    """The key ``v2x`` of a scenario: the name of a preset, or a mapping with settings that differ from a preset.
 
+    Other packages may add keys (``EXTENSIONS``).
+    """
 
-class _PresetSchema:
-    @classmethod
-    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        return {"enum": list(CHANNELS), "type": "string"}
+    model_config = ConfigDict(extra="allow")
 
-
-class V2X(FileModel):
-    """The key ``v2x`` of a scenario: the name of a preset, or a mapping with settings that differ from a preset."""
-
-    preset: Annotated[str, AfterValidator(_known_preset), _PresetSchema] = Field(
-        default="paper", description="preset whose values are used for keys that are left out"
-    )
+    preset: str = Field(default="paper", description="preset whose values are used for keys that are left out")
     hears: Hears | None = Field(
         default=None, description="senders whose messages a vehicle receives: all, front (vehicles ahead) or none"
     )
@@ -185,13 +215,13 @@ class V2X(FileModel):
         default=None, description="fixed delay from every sender to every receiver, instead of a random one"
     )
     lost: Share | None = Field(default=None, description="share of links (not of vehicles) on which no message arrives")
-    message_period_s: Annotated[float, Field(gt=0.0, le=60.0, allow_inf_nan=False)] | None = Field(
+    message_period_s: Annotated[Seconds, Field(gt=0.0)] | None = Field(
         default=None, description="T, time between two messages of a sender"
     )
     loss_begins: Share | None = Field(
         default=None, description="p, probability per message period that a burst of losses begins"
     )
-    loss_ends: Annotated[float, Field(ge=0.01, le=1.0, allow_inf_nan=False)] | None = Field(
+    loss_ends: Annotated[Share, Field(ge=0.01)] | None = Field(
         default=None, description="r, probability per message period that a burst of losses ends"
     )
     radio_s: Seconds | None = Field(default=None, description="L_radio, time to transmit a message")
@@ -211,40 +241,55 @@ class V2X(FileModel):
     @model_validator(mode="before")
     @classmethod
     def _by_name(cls, value: Any) -> Any:
+        value = {"preset": value} if isinstance(value, str) else value
+        name = value.get("preset", "paper") if isinstance(value, dict) else value
         right = f"must be a preset ({', '.join(CHANNELS)}), or a mapping such as {{preset: nominal, lost: 0.1}}"
-        require(isinstance(value, str | dict | V2X), (), value, right)
-        return {"preset": value} if isinstance(value, str) else value
+        require(isinstance(value, V2X) or (isinstance(name, str) and name in CHANNELS), (), name, right)
+        if not isinstance(value, dict):
+            return value
+        known = cls.model_fields
+        for key in value.keys() - known.keys():
+            close = suggestion(str(key), [*known, *EXTENSIONS]) or f"known: {', '.join((*known, *EXTENSIONS))}"
+            require(key in EXTENSIONS, (key,), UNSHOWN, f"unknown key; {close}")
+        return {key: each if key in known else EXTENSIONS[key].read(key, each) for key, each in value.items()}
 
     @model_validator(mode="after")
     def _possible(self) -> V2X:
-        channel = self.channel
-        if channel.hears == "none":
-            why = "hears: none means that no vehicle gets messages"
-            self._leave_out(("link_latency_s", "lost", "vehicles", *_OF_MESSAGES), why)
-        elif channel.timing == "fixed":
-            self._leave_out(_OF_MESSAGES, "link_latency_s fixes the delay of messages")
-        elif channel.timing == "latency":
-            self._leave_out((*_OF_MESSAGES, "vehicles"), f"preset {self.preset} generates no messages")
+        channel, timing = self.channel, self.channel.timing
+        used = [key for extension in self.extensions for key in extension.uses(self)]
+        useless: dict[str, str] = {}  # key -> why it has no effect
         if channel.senses == "none":
-            self._leave_out(("sensing_s",), "senses: none means that no vehicle is in sight")
-        low, high = channel.sensing_s
-        require(low <= high, ("sensing_s",), channel.sensing_s, "low must not be above high")
-        silent = channel.timing == "messages" or channel.hears == "none" or channel.lost > 0.0
-        if channel.senses == "none" and silent and channel.timing != "latency":
-            key = "senses" if self.senses is not None else "lost"  # one that the user has written
-            right = "a vehicle that may never get a message must see the vehicle ahead; use senses: both or front"
-            require(False, (key,), getattr(channel, key), right)
-        return self
-
-    def _leave_out(self, keys: tuple[str, ...], why: str) -> None:
-        for key in keys:
+            useless |= {"sensing_s": "senses: none means that no vehicle is in sight"}
+        if timing == "latency":
+            useless |= dict.fromkeys((*OF_MESSAGES, "vehicles"), f"preset {self.preset} generates no messages")
+        if timing == "fixed":
+            unused = [key for key in OF_MESSAGES if key not in used]
+            useless |= dict.fromkeys(unused, "link_latency_s fixes the delay of messages")
+        if channel.hears == "none":
+            unheard = ("link_latency_s", "lost", "vehicles", *OF_MESSAGES)
+            useless |= dict.fromkeys(unheard, "hears: none means that no vehicle gets messages")
+        for key, why in useless.items():
             value = getattr(self, key)
             require(value is None, (key,), value, f"has no effect, because {why}; leave it out")
+        low, high = channel.sensing_s
+        require(low <= high, ("sensing_s",), channel.sensing_s, "low must not be above high")
+        silent = timing == "messages" or channel.hears == "none" or channel.lost > 0.0
+        blind = channel.senses == "none" and silent and timing != "latency"
+        right = "a vehicle that may never get a message must see the vehicle ahead; use senses: both or front"
+        require(not blind, (), self, right)
+        return self
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         mapping = handler(core)
+        added = {key: extension.schemas[key] for key, extension in EXTENSIONS.usable().items()}
+        mapping = {**mapping, "properties": {**mapping["properties"], **added}, "additionalProperties": False}
         return {"anyOf": [{"enum": list(CHANNELS), "type": "string"}, mapping]}
+
+    @property
+    def extensions(self) -> tuple[Extension, ...]:
+        """The extensions whose keys are written here."""
+        return tuple(dict.fromkeys(EXTENSIONS[key] for key in self.model_extra or ()))
 
     @property
     def channel(self) -> Channel:
@@ -264,7 +309,8 @@ class V2X(FileModel):
         channel = self.channel
         heard = channel.hears != "none" and (channel.timing == "messages" or 0.0 < channel.lost < 1.0)
         seen = channel.senses != "none" and channel.sensing_s[0] != channel.sensing_s[1]
-        return self.by_link and (heard or seen)
+        own = any(extension.is_random(self) for extension in self.extensions)
+        return self.by_link and (heard or seen or own)
 
 
 def register_preset(name: str, settings: Mapping[str, Any]) -> None:
@@ -278,11 +324,7 @@ def register_preset(name: str, settings: Mapping[str, Any]) -> None:
             f"preset {name!r:.80}: the name must be 1 to 64 characters a-z, 0-9, - and _, beginning with a letter or"
             " digit"
         )
-    if not isinstance(settings, Mapping):
-        raise InvalidInput(f"preset {name!r}: settings = {settings!r:.80}: must be a mapping such as {{'lost': 0.1}}")
-    try:
-        channel = V2X.model_validate(dict(settings)).channel
-    except ValidationError as error:
-        raise explain(Document(f"preset {name!r}", dict(settings), {}), error, Wording(V2X)) from None
+    document = Document(f"preset {name!r}", settings, {})
+    channel = read_model(document, V2X, Wording(V2X), "such as {'lost': 0.1}").channel
     if CHANNELS.setdefault(name, channel) != channel:
         raise AlreadyExists(f"preset {name!r}: another channel is already registered under this name; choose another")

@@ -17,7 +17,7 @@ def columns_of(drawn: Drawn) -> dict[str, NDArray[np.generic]]:
     return {"world": numbers, **kinds_of(drawn), **quantities_of(drawn.worlds, drawn.friction)}
 
 
-def quantities_of(worlds: State, friction: Floats | None = None) -> dict[str, Floats]:
+def quantities_of(worlds: State, friction: Floats | float = np.nan) -> dict[str, Floats]:
     """Return the quantities of worlds at the alert: ``gap_1_m`` and so on -> [n], as ``worlds_from_table`` reads them.
 
     Capacities are those on the road, whose ``friction`` [n] is a column if every world has one. An obstacle, rates and
@@ -28,25 +28,22 @@ def quantities_of(worlds: State, friction: Floats | None = None) -> dict[str, Fl
     values |= {key: worlds.car[:, row, 1:] for key, row in CAR_ROWS.items()}
     gap = worlds.obstacle_gap_m[:, np.newaxis]
     values["obstacle_gap_m"] = np.where(np.isfinite(gap), gap, np.nan)
-    there = {
-        key: bool(np.isfinite(values[key]).any()) for key in ("obstacle_gap_m", "brake_rate_mps3", "release_rate_mps3")
-    }
-    there["harm_weight"] = bool((values["harm_weight"] != 1.0).any())
-    if friction is not None and np.isfinite(friction).all():
-        values["friction"], there["friction"] = friction[:, np.newaxis], True
-    shown = [key for key in RULES if key in USUAL or there.get(key, False)]
+    values["friction"] = np.broadcast_to(friction, worlds.n)[:, np.newaxis]
+    there = {key: np.isfinite(values[key]).any() for key in ("obstacle_gap_m", "brake_rate_mps3", "release_rate_mps3")}
+    there |= {"harm_weight": (values["harm_weight"] != 1.0).any(), "friction": np.isfinite(values["friction"]).all()}
     return {
         RULES[key].column_of(i): np.minimum(column, RULES[key].high)
-        for key in shown
+        for key in RULES
+        if key in USUAL or there.get(key)
         for i, column in enumerate(values[key].T)
     }
 
 
 def kinds_of(drawn: Drawn) -> dict[str, Texts]:
     """Return columns of texts: ``scenario`` of a mixture, ``recording``, ``vehicle_1_type`` and so on."""
-    columns = {} if drawn.scenarios is None else {"scenario": drawn.scenarios}
-    columns |= {} if drawn.recordings is None else {RECORDING: drawn.recordings}
-    types = () if drawn.types is None else drawn.types.T
+    columns = {"scenario": drawn.scenarios, RECORDING: drawn.recordings}
+    types = drawn.types.T if (drawn.types != "").any() else ()
+    columns = {name: column for name, column in columns.items() if (column != "").any()}
     return columns | {f"vehicle_{i + 1}_type": column for i, column in enumerate(types)}
 
 
@@ -62,18 +59,6 @@ def clusters_of(drawn: Drawn) -> Texts | None:
 
     Worlds of one recording depend on each other. A world without a recording is a cluster of its own.
     """
-    if drawn.recordings is None:
-        return None
     recording = recording_of(drawn.recordings)
     own = np.char.add(" ", drawn.worlds.clock[:, NUMBER].astype(np.int64).astype(str))
-    return np.where(recording == "", own, recording)
-
-
-def count_kinds(drawn: Drawn) -> str:
-    """Return how many worlds there are of each kind, ``; vehicle_1_type: car 7, truck 3``, and how many recordings."""
-    text = ""
-    for kind, column in kinds_of(drawn).items():
-        names, counts = np.unique(column, return_counts=True)
-        each = ", ".join(f"{name or 'none'} {count}" for name, count in zip(names, counts, strict=True))
-        text += f"; {kind}: {each if kind != RECORDING else f'{len(names)} different'}"
-    return text
+    return np.where(recording == "", own, recording) if (recording != "").any() else None

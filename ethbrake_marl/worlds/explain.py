@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from ethbrake_marl.episode.objectives import OBJECTIVES
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.json_schema import FileSchema, schema_lines
 from ethbrake_marl.files.model import NAME_PATTERN
-from ethbrake_marl.files.yaml import flow_text
-from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.channel import CHANNELS
-from ethbrake_marl.worlds.describe import recording_of
-from ethbrake_marl.worlds.mixture import member_content
-from ethbrake_marl.worlds.quantity import DISTRIBUTIONS
-from ethbrake_marl.worlds.rules import ALTERNATIVES, NEEDED, OF_A_TYPE, OPTIONAL, RULES, USUAL
+from ethbrake_marl.files.yaml import flow_text, read_yaml
+from ethbrake_marl.worlds.catalogue import load_scenario, scenario_path
+from ethbrake_marl.worlds.roles import LEARNER
+from ethbrake_marl.worlds.rules import ALTERNATIVES, RULES
 from ethbrake_marl.worlds.scenario import Scenario
-from ethbrake_marl.worlds.table import WEIGHT
 
 
 class Key(NamedTuple):
@@ -29,117 +24,42 @@ class Key(NamedTuple):
     range: str  # of a quantity: ``finite and in (0, 1000] t (tonnes)``
     about: str
 
+    @property
+    def text(self) -> str:
+        """What the key means, its range, and which key cannot stand beside it."""
+        other = {**ALTERNATIVES, **{new: usual for usual, new in ALTERNATIVES.items()}}.get(self.name)
+        either = f"give either this key or {other}" if other else ""
+        return "; ".join(part for part in (self.about, self.range, either) if part)
+
 
 def listed_keys() -> list[Key]:
     """Return every key of a scenario file, in the order of the file."""
-    listed = []
+    keys = []
     for name, field in Scenario.model_fields.items():
         fixed = field.default_factory is None and field.default is not None and not field.is_required()
-        rule = RULES.get(name)
-        listed.append(
-            Key(name, flow_text(field.default) if fixed else "", rule.interval if rule else "", str(field.description))
-        )
-    return listed
+        interval = RULES[name].interval if name in RULES else ""
+        keys.append(Key(name, flow_text(field.default) if fixed else "", interval, str(field.description)))
+    return keys
 
 
-# ---- sentences
-
-
-def sentences(scenario: Scenario, scripts: Mapping[str, str] = {}) -> Iterator[str]:
-    """Yield sentences about a scenario. ``scripts`` says of a script's name what it does."""
+def sentences(scenario: Scenario) -> Iterator[str]:
+    """Yield sentences about a scenario: its line, its roles, and what every key of its file says and means."""
     yield f"{scenario.name}: {scenario.title or 'no title'}. {scenario.description}".rstrip()
-    learners = ", ".join(scenario.vehicle_names[i - 1] for i in scenario.learners) or "nobody"
-    yield f"{scenario.vehicles} vehicles in line, vehicle_1 in front, {_obstacle(scenario)}. Learners: {learners}."
-    others = [role for role in scenario.roles.values() if role != "learner"]
-    for script in dict.fromkeys(others):
-        who = ", ".join(name for name, role in scenario.roles.items() if role == script)
-        about = f" ({scripts[script]})" if script in scripts else ""
-        yield f"Script {script}{about}: {who}."
-    if scenario.mixture is not None:
-        members = ", ".join(f"{each.scenario['name']} ({each.weight:g})" for each in scenario.mixture)
-        yield (
-            f"Each world is drawn from one of these scenarios (weights in brackets): {members}. The following ranges"
-            " cover all of them."
-        )
-    yield from _table(scenario)
-    yield from _types(scenario)
-    for key, rule in RULES.items():
-        if text := _declared(scenario, key):
-            yield f"{rule.label[0].upper()}{rule.label[1:]}: {text}; {rule.meaning}."
-    common = scenario.model_fields_set if scenario.members else Scenario.model_fields  # the same for all members
-    yield _news(scenario) if "v2x" in common else "The V2X channel differs between these scenarios."
-    early = "is kept" if scenario.early_impacts == "keep" else "is rejected and drawn again"
-    yield (
-        f"Vehicles decide every {scenario.time_step_s:g} s; an episode is truncated after {scenario.horizon_s:g} s."
-        + (f" A world with an impact before a learner can act {early}." if "early_impacts" in common else "")
-    )
-    objectives = [scenario.objective] if isinstance(scenario.objective, str) else scenario.objective
-    aims = (f"{each} ({OBJECTIVES[each.partition(':')[0]].about})" for each in dict.fromkeys(objectives))
-    yield f"Objective: {', '.join(aims)}; a shield always bounds the harm of the whole line."
-
-
-def _obstacle(scenario: Scenario) -> str:
     there = {each.has_obstacle for each in scenario.members or (scenario,)}
-    return f"{'an' if any(there) else 'no'} obstacle ahead{'' if len(there) == 1 else ' in some worlds'}"
-
-
-def _table(scenario: Scenario) -> Iterator[str]:
-    if scenario.table is not None:
-        rows, columns = len(scenario.table.rows or ()), ", ".join(scenario.table.columns)
-        yield f"Each world takes one of the {rows:,} rows of a table with the columns {columns}."
-    if scenario.recordings is not None:
-        recordings = {*recording_of(scenario.recordings.rows).tolist()}
-        yield (
-            f"The rows come from {len(recordings):,} recordings; confidence intervals treat worlds of one recording"
-            " as dependent."
-        )
-
-
-def _types(scenario: Scenario) -> Iterator[str]:
-    for name, kind in (scenario.vehicle_types or {}).items():
-        own = {RULES[key].label: getattr(kind, key) for key in OF_A_TYPE}
-        parts = [f"{label} {in_words(each)}" for label, each in own.items() if each is not None]
-        parts += [f"V2X {flow_text(kind.v2x)}"] if kind.v2x is not None else []
-        text = "; ".join(parts) or "quantities as declared for all types"
-        yield f"Vehicle type {name}, weight {kind.weight:g}, load {in_words(kind.load)}: {text}."
-    if scenario.vehicle_types:
-        yield f"Possible vehicle types, front to rear: {flow_text(scenario.types or 'any')}."
-
-
-def _declared(scenario: Scenario, key: str) -> str:
-    """Return how a quantity is drawn; empty if the scenario does not declare it."""
-    if scenario.members:
-        roads = key == "friction" and all(each.declares(key) for each in scenario.members)
-        ends = [end for each in (scenario.bounds(key) if key in USUAL or roads else ()) for end in each]
-        return " to ".join(dict.fromkeys(f"{end(ends):.4g}" for end in (min, max))) if ends else ""
-    value = getattr(scenario, key)
-    if value is None or (key == "speed_deviations_mps" and key not in scenario.model_fields_set):
-        return ""
-    if isinstance(value, tuple):
-        return ", ".join(map(in_words, value))
-    per = RULES[key].per
-    return in_words(value) + ("" if isinstance(value, float) or per == "world" else f", drawn for each {per}")
-
-
-def in_words(quantity: Any) -> str:
-    """Return a number or distribution in words: ``5 to 9 (uniform)``."""
-    if isinstance(quantity, float):
-        return f"{quantity:g}"
-    (kind, shape), *more = quantity.model_dump(exclude_none=True).items()
-    inner, ends = (shape, quantity.support) if isinstance(shape, dict) else (dict(more), shape)
-    details = [f"{name} {flow_text(each)}" for name, each in inner.items() if name not in ("low", "high")]
-    values = (" or " if kind == "choice" else " to ").join(f"{each:g}" for each in ends)
-    return f"{values} ({', '.join([kind.replace('_', ' '), *details])})"
-
-
-def _news(scenario: Scenario) -> str:
-    about, usual = type(scenario.v2x).model_fields, CHANNELS["paper"]._asdict()
-    channel = scenario.v2x.channel._asdict()
-    other = {key: value for key, value in channel.items() if key in about and value != usual[key]}
-    parts = [f"{key} {flow_text(value)} ({about[key].description})" for key, value in other.items()]
-    parts += [flow_text(scenario.v2x.vehicles)] if scenario.v2x.vehicles else []
-    text = "; ".join(parts) or "each vehicle knows the whole line from its own latency on"
-    return f"V2X preset {scenario.v2x.preset}: {text}."
+    obstacle = f"{'an' if any(there) else 'no'} obstacle ahead{'' if len(there) == 1 else ' in some worlds'}"
+    learners = ", ".join(name for name, role in scenario.roles.items() if role == LEARNER) or "nobody"
+    yield f"{scenario.vehicles} vehicles in line, vehicle_1 in front, {obstacle}. Learners: {learners}."
+    for script in dict.fromkeys(role for role in scenario.roles.values() if role != LEARNER):
+        yield f"Script {script}: {', '.join(name for name, role in scenario.roles.items() if role == script)}."
+    for key in listed_keys():
+        value = getattr(scenario, key.name)
+        if key.name == "mixture" and value is not None:
+            value = {each.name: entry.weight for each, entry in zip(scenario.members, value, strict=True)}
+        if key.name == "table" and value is not None:
+            value = f"{len(value.rows):,} rows with the columns {', '.join(value.columns)}"
+        own = key.name in RULES and scenario.members  # a mixture itself has no quantities
+        if key.name not in ("name", "title", "description", "vehicles", "roles") and value is not None and not own:
+            yield f"{key.name}: {flow_text(value)} ({key.about})."
 
 
 # ---- a new file
@@ -174,95 +94,33 @@ def check_file_name(kind: str, name: str) -> None:
 
 
 def new_scenario_text(name: str, based_on: str = "paper-random", *, rows_file: str = "") -> str:
-    """Return the commented text of a new scenario file with every key, and the values of ``based_on``.
+    """Return the commented text of a new scenario file with every key, and the values of the file ``based_on``.
 
-    A key that is not used stands in a comment, with an example. With ``rows_file`` the text names this CSV file
-    instead of the table's rows (``table.rows_text``).
+    A key that is not used stands in a comment, with an example. ``rows_file`` names a copy of the table's CSV file.
     """
     check_file_name("scenario", name)
-    base = load_scenario(based_on)
-    values: dict[str, Any] = {"mixture": base.declared()["mixture"]} if base.members else {}
-    if not base.members:
-        values = base.model_dump(mode="json", exclude_none=True)
+    base, values = load_scenario(based_on), dict(read_yaml(scenario_path(based_on)).content)
     values |= {
         "name": name,
         "title": "One-line title for lists and figures",
-        "description": "What this scenario is for.",
-        "source": f"Values of {base.name}, to be changed." + f" Its table: {base.source}" * (base.table is not None),
+        "description": "What the scenario is for.",
     }
+    values["source"] = f"Values of {base.name}, to be changed. Its own source: {base.source}"
     if base.table is not None and rows_file:
-        weights = {} if base.table.weights is None else {"weights": WEIGHT}
-        values["table"] = {"file": rows_file, "columns": list(base.table.columns), **weights}
-    if base.line_speed_mps is None:
-        values.pop("speed_deviations_mps", None)
-    if base.members:
-        values["mixture"] = [_short_member(entry) for entry in values["mixture"]]
-    text = "".join(f"\n# {_comment(key)}\n{_line(key, values)}\n" for key in Scenario.model_fields)
-    return _HEAD.format(name=name, based_on=base.name) + schema_lines("scenario", "scenario schema") + text
-
-
-def _short_member(entry: dict[str, Any]) -> dict[str, Any]:
-    """Return an entry of ``mixture`` with the name of a shipped scenario instead of its content."""
-    content, name = entry["scenario"], entry["scenario"]["name"]
-    try:
-        as_shipped = member_content(load_scenario(name)) == content
-    except InvalidInput:
-        as_shipped = False
-    return {**entry, "scenario": name} if as_shipped else entry
-
-
-def _comment(key: str) -> str:
-    rule = RULES.get(key)
-    if rule is None:
-        return str(Scenario.model_fields[key].description)
-    other = {**ALTERNATIVES, **{new: usual for usual, new in ALTERNATIVES.items()}}.get(key)
-    besides = f"; give either this key or {other}" if other else ""
-    besides = "; only together with line_speed_mps" if key == "speed_deviations_mps" else besides
-    return f"{rule.meaning}; {rule.interval}{', below horizon_s' if key == 'latency_s' else ''}{besides}"
-
-
-def _line(key: str, values: Mapping[str, Any]) -> str:
-    if key not in values:
-        example = RULES[key].example if key in RULES else _EXAMPLES.get(key)
-        return f"# {key}: {flow_text(Scenario.model_fields[key].default) if example is None else example}"
-    value = values[key]
-    if isinstance(value, dict) and all(isinstance(entry, str) for entry in value.values()):
-        return f"{key}:" + "".join(f"\n  {name}: {flow_text(entry)}" for name, entry in value.items())
-    return f"{key}: {flow_text(value)}"
-
-
-# ---- JSON Schema
+        values["table"] = {**values["table"], "file": rows_file}
+    text = _HEAD.format(name=name, based_on=base.name) + schema_lines("scenario", "scenario schema")
+    for key in listed_keys():
+        example = RULES[key.name].example if key.name in RULES else _EXAMPLES.get(key.name, key.default)
+        line = f"{key.name}: {flow_text(values[key.name])}" if key.name in values else f"# {key.name}: {example}"
+        text += f"\n# {key.text}\n{line}\n"
+    return text
 
 
 def scenario_json_schema() -> dict[str, Any]:
     """Return the JSON Schema of a scenario file, with which editors complete and check YAML."""
-    one_of_two: list[dict[str, Any]] = [
-        {"not": {"required": [*pair]}} if pair[0] in OPTIONAL else {"oneOf": [{"required": [key]} for key in pair]}
-        for pair in ALTERNATIVES.items()
-    ]
-    by_types = {"anyOf": [{"required": ["vehicle_types"]}, {"required": [*NEEDED]}]}
-    elsewhere = {"anyOf": [{"required": ["mixture"]}, {"required": ["table"]}]}
-    whole = {"if": {"not": elsewhere}, "then": {"allOf": [*one_of_two, by_types]}}
     schema = Scenario.model_json_schema(schema_generator=FileSchema)
-    ranges = {key: _range(key, rule.low, rule.high, rule.positive) for key, rule in RULES.items()}
-    ranges["load"] = _range("load", 0.0, 1.0)
     for properties in (schema["properties"], schema["$defs"]["VehicleType"]["properties"]):
-        for key in properties.keys() & ranges.keys():
-            properties[key]["allOf"] = [_reference(key)]
-    defined = schema["$defs"] | {f"range_{key}": limits for key, limits in ranges.items()}
-    needed = {"speed_deviations_mps": ["line_speed_mps"]}
-    return FileSchema.publish({**schema, **whole, "dependentRequired": needed, "$defs": defined})
-
-
-def _reference(key: str) -> dict[str, Any]:
-    return {"$ref": f"#/$defs/range_{key}"}
-
-
-def _range(key: str, low: float, high: float, positive: bool = False) -> dict[str, Any]:
-    """Return the schema of a quantity whose numbers, in distributions and lists too, are in [low, high]."""
-    limits = {"exclusiveMinimum" if positive else "minimum": low, "maximum": high}
-    above = {"exclusiveMinimum": 0}
-    inside: dict[str, Any] = dict.fromkeys(("low", "high", "with_load", *DISTRIBUTIONS), _reference(key))
-    inside |= {"loguniform": {"items": {**limits, **above}}, "sd": above, "sigma": above, "weights": {"items": above}}
-    inside["lognormal"] = {"allOf": [_reference(key)], "properties": {"median": above, "low": above}}
-    return {**limits, "items": _reference(key), "properties": inside}
+        for key in properties.keys() & RULES.keys():
+            properties[key]["allOf"] = [{"$ref": f"#/$defs/range_{key}"}]
+    ranges = {f"range_{key}": rule.schema for key, rule in RULES.items()}
+    return FileSchema.publish({**schema, "$defs": {**schema["$defs"], **ranges}})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,6 @@ from ethbrake_marl.episode.game import Game, Script
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.reward import Reward, Rewarding
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.scenario import Scenario
 
@@ -58,41 +57,29 @@ def game_of(
     """
     loaded = load_scenario(scenario)
     if learners is not None:
-        if isinstance(learners, str) or not isinstance(learners, Iterable):
-            raise InvalidInput(f"learners = {learners!r}: must be a list of vehicle names, for instance ['vehicle_2']")
         loaded = loaded.with_learners(learners)
+    if observation is not None:
+        now = {name: view.names for name, view in zip(loaded.vehicle_names, views_of(loaded), strict=True)}
+        loaded = loaded.replace(observation={**now, **observation} if isinstance(observation, Mapping) else observation)
     bodies = np.array(loaded.learners, np.int64)
     rewarding, rules = Rewarding.of(
         reward, loaded.objective, loaded.vehicles, bodies, (loaded.time_step_s, loaded.horizon_s), reward_vector
     )
-    views = (View(), *views_of(loaded, observation))
-    return loaded, Game(Pool(loaded), loaded.name, rules, rewarding, views, bodies, scripts or {})
+    views = (View(), *views_of(loaded))
+    game = Game(Pool(loaded), loaded.name, rules, rewarding, views, bodies, scripts or {})
+    for extension in (loaded.members or (loaded,))[0].v2x.extensions:  # members of a mixture have the same
+        game = extension.game(game)
+    return loaded, game
 
 
-def views_of(scenario: Scenario, given: Any = None) -> tuple[View, ...]:
-    """Return what each vehicle observes, front to rear: what is given, else what the scenario says, else the default.
+def views_of(scenario: Scenario) -> tuple[View, ...]:
+    """Return what each vehicle observes, front to rear.
 
-    Both are a list of features, or a mapping from names of vehicles to lists. By default a vehicle observes itself and
-    one neighbour on each side; where there may be an obstacle, also its place in the line and the obstacle.
+    By default a vehicle observes itself and one neighbour on each side; where there may be an obstacle, also its place
+    in the line and the obstacle.
     """
     usual = View(["own", "front_1", "rear_1", *(["role", "obstacle"] if scenario.has_obstacle else [])])
-    each = dict.fromkeys(scenario.vehicle_names, usual)
-    for listed in (scenario.observation, given):
-        if isinstance(listed, View):
-            each = dict.fromkeys(each, listed)
-        elif isinstance(listed, Mapping):
-            for name, features in listed.items():
-                if name not in each:
-                    raise unknown_name("vehicle", name, scenario.vehicle_names)
-                try:
-                    each[name] = features if isinstance(features, View) else View(features)
-                except InvalidInput as error:
-                    raise type(error)(f"{name}: {error}") from None
-        elif isinstance(listed, Sequence) and not isinstance(listed, str):
-            each = dict.fromkeys(each, View(listed))
-        elif listed is not None:
-            raise InvalidInput(
-                f"observation = {listed!r}: must be a list of groups and features such as ['own', 'front_1'], or a"
-                " mapping from vehicles to such lists"
-            )
-    return tuple(each.values())
+    listed = scenario.observation
+    if not isinstance(listed, dict):
+        return (usual if listed is None else View(listed),) * scenario.vehicles
+    return tuple(View(listed[name]) if name in listed else usual for name in scenario.vehicle_names)

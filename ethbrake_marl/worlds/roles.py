@@ -9,18 +9,31 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.files.yaml import parse_numeral
+from ethbrake_marl.files.model import require, suggestion
+from ethbrake_marl.files.yaml import YamlPath, parse_numeral
 from ethbrake_marl.motion.layout import Floats
 
 LEARNER = "learner"
 HELD = ("full_brake", "coast", "constant")  # scripts that hold one command
 
 _FORM = re.compile(r"(?P<name>[a-z][a-z0-9_@.-]*)(:(?P<argument>\S+))?")
+
+
+def names_of(vehicles: int) -> tuple[str, ...]:
+    """Return ``vehicle_1`` (front) to ``vehicle_N`` (rear)."""
+    return tuple(f"vehicle_{i + 1}" for i in range(vehicles))
+
+
+def check_vehicle(name: str, vehicles: int, at: YamlPath, value: Any) -> None:
+    """Raise, in a pydantic validator, the error for a vehicle that is not in the line."""
+    close = "" if name.startswith("vehicle_") else suggestion(name, names_of(vehicles))
+    hint = close or f"this scenario has vehicle_1 ... vehicle_{vehicles}"
+    require(name in names_of(vehicles), at, value, f"unknown vehicle; {hint}")
 
 
 def check_role(role: str) -> None:
@@ -40,12 +53,10 @@ def check_role(role: str) -> None:
             f"agent {role!r}: is a function in a Python file, which a scenario cannot use (the option --agents can)"
             "; to use the function in a scenario, register it as an agent in a package that you install"
         )
-    if name in ("full_brake", "coast") and argument is not None:
+    if name in (LEARNER, "full_brake", "coast") and argument is not None:
         raise InvalidInput(f"agent {role!r}: {name} takes no argument")
-    if name == LEARNER and argument is not None:
-        raise InvalidInput(f"{LEARNER} takes no argument")
     number = parse_numeral(argument or "")
-    if name == "constant" and not (number is not None and math.isfinite(number)):
+    if name == "constant" and (number is None or not math.isfinite(number)):
         raise InvalidInput(
             f"agent {role!r}: constant needs a finite deceleration in m/s2 after the colon, for instance constant:3.5"
         )
@@ -83,4 +94,4 @@ class Roles(dict[str, str]):
     @classmethod
     def complete(cls, given: Mapping[str, str], vehicles: int) -> Roles:
         """Return the role of each vehicle; one without a role brakes fully."""
-        return cls({f"vehicle_{i + 1}": given.get(f"vehicle_{i + 1}", "full_brake") for i in range(vehicles)})
+        return cls({name: given.get(name, "full_brake") for name in names_of(vehicles)})

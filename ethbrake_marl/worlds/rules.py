@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from ethbrake_marl.files.model import UNITS
+from ethbrake_marl.files.model import UNITS, UNSHOWN, require
+from ethbrake_marl.files.yaml import YamlPath
 from ethbrake_marl.motion.layout import BRAKE_RATE, BRAKING, DRIVING, LATENCY, LIMIT, MASS, RELEASE_RATE, WEIGHT
+from ethbrake_marl.worlds.quantity import DISTRIBUTIONS, support
 
 # A stream is an independent sequence of uniform random numbers, named by a tuple.
 MAIN: tuple[int, ...] = ()
@@ -44,25 +46,28 @@ class Rule(NamedTuple):
     stream: tuple[int, ...] = MAIN
 
     @property
-    def symbol(self) -> str:
-        """Symbol of the unit, such as ``m/s2``; empty for a plain number."""
-        return {"mps": "m/s", "mps2": "m/s2", "mps3": "m/s3"}.get(self.unit, self.unit)
-
-    @property
-    def label(self) -> str:
-        """Name in words and unit, for the axis of a figure: ``braking capacity (m/s²)``."""
-        words = self.key.removesuffix(f"_{self.unit}").replace("_", " ")
-        return f"{words} ({self.symbol.replace('s2', 's²').replace('s3', 's³')})" if self.unit else words
-
-    @property
     def interval(self) -> str:
         """Allowed range for error messages: ``finite and in (0, 1000] t (tonnes)``."""
-        unit = f" {self.symbol} ({UNITS[self.unit]})" if self.unit else ""
+        symbol = {"mps": "m/s", "mps2": "m/s2", "mps3": "m/s3"}.get(self.unit, self.unit)
+        unit = f" {symbol} ({UNITS[self.unit]})" if self.unit else ""
         return f"finite and in {'(' if self.positive else '['}{self.low:g}, {self.high:g}]{unit}"
+
+    @property
+    def schema(self) -> dict[str, Any]:
+        """JSON Schema of the range, in lists and distributions too, as ``#/$defs/range_KEY`` of a file's schema."""
+        inside = {"$ref": f"#/$defs/range_{self.key}"}
+        limits = {"exclusiveMinimum" if self.positive else "minimum": self.low, "maximum": self.high, "items": inside}
+        return {**limits, "properties": dict.fromkeys(("low", "high", "with_load", *DISTRIBUTIONS), inside)}
 
     def allows(self, low: float, high: float) -> bool:
         """Return whether all values from ``low`` to ``high`` are allowed; False for NaN."""
         return (low > 0.0 if self.positive else low >= self.low) and high <= self.high
+
+    def check(self, quantity: Any, at: YamlPath = ()) -> None:
+        """Raise, in a pydantic validator, the error for a number or distribution out of range."""
+        low, high = support(quantity)
+        overlap = "; a negative gap means overlapping vehicles" if self.per == "pair" and low < 0.0 else ""
+        require(self.allows(low, high), at, quantity, f"must be {self.interval}{overlap}")
 
     def count(self, vehicles: int) -> int:
         """Return how many values the quantity has in a world."""
@@ -187,6 +192,18 @@ CAR_ROWS = {
     "release_rate_mps3": RELEASE_RATE,
     "harm_weight": WEIGHT,
 }  # rows of `State.car`
+
+
+def width_of(stream: tuple[int, ...], vehicles: int) -> int:
+    """Return how many numbers a world has in a stream of quantities."""
+    return BLOCK * vehicles if stream in (MAIN, BRAKES) else OF_WORLD
+
+
+def check_count(value: Any, count: int, per: str, at: YamlPath = ()) -> None:
+    """Raise, in a pydantic validator, the error for a list that does not have ``count`` entries."""
+    right = f"must have {count}, one per {per}, or be a single entry for all"
+    holds = not isinstance(value, tuple) or len(value) == count
+    require(holds, at, UNSHOWN, f"has {len(value) if isinstance(value, tuple) else 1} entries; {right}")
 
 
 def table_columns(keys: tuple[str, ...], vehicles: int) -> dict[str, Entry]:

@@ -3,96 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from difflib import get_close_matches
 from functools import cached_property
 from operator import not_
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import (
-    BaseModel,
-    Field,
-    GetJsonSchemaHandler,
-    PrivateAttr,
-    ValidationError,
-    ValidationInfo,
-    field_validator,
-    model_validator,
-)
-from pydantic.json_schema import JsonSchemaValue
-from pydantic_core import CoreSchema, PydanticCustomError
+from pydantic import BaseModel, Field, PrivateAttr, ValidationError, ValidationInfo, field_validator, model_validator
 
-from ethbrake_marl.episode.features import known_names, listed_features
-from ethbrake_marl.episode.objectives import OBJECTIVES, objectives_of
+from ethbrake_marl.episode.features import listed_features
+from ethbrake_marl.episode.objectives import objectives_of
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, unknown_name
-from ethbrake_marl.files.model import NAME_PATTERN, UNSHOWN, FileModel, explain, refuse, require, suggestion
+from ethbrake_marl.files.model import NAME_PATTERN, UNSHOWN, explain, refuse
 from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.motion.layout import Floats, Ints
 from ethbrake_marl.worlds.channel import HEARS, V2X, Equipage, Equipped
-from ethbrake_marl.worlds.checks import check_whole, undeclared_by_type
+from ethbrake_marl.worlds.checks import check_whole
 from ethbrake_marl.worlds.counters import Channel
-from ethbrake_marl.worlds.derived import on_road, world_values
+from ethbrake_marl.worlds.derived import world_values
 from ethbrake_marl.worlds.describe import columns_of
 from ethbrake_marl.worlds.mixture import WORDS, Member, build_members, changed_content
-from ethbrake_marl.worlds.quantity import LEAVE_OUT, PerVehicle, Quantity, support
-from ethbrake_marl.worlds.roles import LEARNER, Roles, check_role
-from ethbrake_marl.worlds.rules import (
-    ALTERNATIVES,
-    NEEDED,
-    OF_A_TYPE,
-    OPTIONAL,
-    RECORDING,
-    RULES,
-    USUAL,
-    Entry,
-    table_columns,
-)
+from ethbrake_marl.worlds.quantity import Part, PerVehicle, Quantity, support
+from ethbrake_marl.worlds.roles import LEARNER, Roles, check_role, check_vehicle, names_of
+from ethbrake_marl.worlds.rules import OF_A_TYPE, OPTIONAL, RECORDING, RULES, USUAL, Entry, check_count, table_columns
 from ethbrake_marl.worlds.sampling import Drawn, draw
 from ethbrake_marl.worlds.table import Table, TableColumn
-from ethbrake_marl.worlds.vehicle_types import Types, TypesOfLine, VehicleTypes, check_types
+from ethbrake_marl.worlds.vehicle_types import Types, TypesOfLine, VehicleTypes
 from ethbrake_marl.worlds.wording import ScenarioWording
 
-_LEFT_OUT: Any = object()  # default of a missing key, which a check then accepts or refuses
+Listed = Annotated[tuple[str, ...], Field(strict=False)]
 
 
-class _ObjectiveSchema:
-    @classmethod
-    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        kinds = OBJECTIVES.usable()
-        plain = [name for name, kind in kinds.items() if ":" not in kind.form]
-        with_argument = "|".join(name for name, kind in kinds.items() if ":" in kind.form)
-        return {"type": "string", "anyOf": [{"enum": plain}, {"pattern": f"^({with_argument}):"}]}
+def _quantity(key: str, default: Any = None, **more: Any) -> Any:
+    """Return the field of a quantity."""
+    return Field(default=default, description=RULES[key].meaning, **more)
 
 
-class _FeaturesSchema:
-    @classmethod
-    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        further = {"type": "string", "pattern": r"^(front|rear)_[1-9][0-9]?(\.[a-z0-9_]+)?$"}
-        items = {"anyOf": [{"type": "string", "enum": known_names()}, further]}
-        return {"type": "array", "items": items, "minItems": 1, "uniqueItems": True}
-
-
-Objective = Annotated[str, _ObjectiveSchema]
-Listed = Annotated[tuple[str, ...], Field(strict=False), _FeaturesSchema]
-ListedByVehicle = Annotated[
-    dict[Annotated[str, Field(pattern=r"^vehicle_[1-9][0-9]?$")], Listed],
-    Field(min_length=1, json_schema_extra={"additionalProperties": False}),
-]
-
-
-def _meaning(key: str, **more: Any) -> Any:
-    """Return the field of a quantity that may be left out."""
-    return Field(default=None, description=RULES[key].meaning, **more)
-
-
-def _needed(key: str) -> Any:
-    return Field(default_factory=lambda: _LEFT_OUT, validate_default=True, description=RULES[key].meaning)
-
-
-class Scenario(FileModel):
+class Scenario(Part):
     """A line of vehicles, the distribution of each quantity, and the vehicles that learn.
 
     A quantity is a number, ``{uniform: [low, high]}``, ``{loguniform: [low, high]}``,
@@ -123,7 +72,7 @@ class Scenario(FileModel):
         description="possible types of each vehicle: a type's name, any, or a mapping from types to weights; give one"
         " entry for all vehicles or a list with one entry per vehicle",
     )
-    mixture: Annotated[tuple[Member, ...], Field(strict=False)] | None = Field(
+    mixture: Annotated[tuple[Member, ...], Field(strict=False, min_length=1)] | None = Field(
         default=None, exclude_if=not_, description="scenarios with weights; each world is drawn from one of them"
     )
     table: Table | None = Field(
@@ -135,36 +84,36 @@ class Scenario(FileModel):
     horizon_s: float = Field(
         default=8.0, gt=0.0, le=3600.0, allow_inf_nan=False, description="time at which an episode is truncated"
     )
-    gaps_m: PerVehicle | None = _meaning("gaps_m")
-    time_gaps_s: PerVehicle | None = _meaning("time_gaps_s")
-    speeds_mps: PerVehicle | None = _meaning("speeds_mps")
-    line_speed_mps: Quantity | None = _meaning("line_speed_mps")
-    speed_deviations_mps: PerVehicle = Field(default=0.0, description=RULES["speed_deviations_mps"].meaning)
-    braking_capacity_mps2: PerVehicle | None = _needed("braking_capacity_mps2")
-    driving_capacity_mps2: PerVehicle | None = _needed("driving_capacity_mps2")
-    mass_t: PerVehicle | None = _needed("mass_t")
-    latency_s: PerVehicle | None = _needed("latency_s")
-    speed_limit_mps: PerVehicle = Field(default=40.0, description=RULES["speed_limit_mps"].meaning)
-    restitution: Quantity = Field(default=0.1, description=RULES["restitution"].meaning)
+    gaps_m: PerVehicle | None = _quantity("gaps_m")
+    time_gaps_s: PerVehicle | None = _quantity("time_gaps_s")
+    speeds_mps: PerVehicle | None = _quantity("speeds_mps")
+    line_speed_mps: Quantity | None = _quantity("line_speed_mps")
+    speed_deviations_mps: PerVehicle = _quantity("speed_deviations_mps", 0.0)
+    braking_capacity_mps2: PerVehicle | None = _quantity("braking_capacity_mps2")
+    driving_capacity_mps2: PerVehicle | None = _quantity("driving_capacity_mps2")
+    mass_t: PerVehicle | None = _quantity("mass_t")
+    latency_s: PerVehicle | None = _quantity("latency_s")
+    speed_limit_mps: PerVehicle = _quantity("speed_limit_mps", 40.0)
+    restitution: Quantity = _quantity("restitution", 0.1)
     roles: dict[str, str] = Field(
         default_factory=lambda data: Roles.complete({"vehicle_2": LEARNER}, data.get("vehicles", 3)),
         description="role of each vehicle: learner, or the name of a script; a vehicle without an entry brakes fully",
     )
-    obstacle_gap_m: Quantity | None = _meaning("obstacle_gap_m")
-    obstacle_margin_m: Quantity | None = _meaning("obstacle_margin_m")
-    friction: Quantity | None = _meaning("friction", exclude_if=not_)
-    brake_rate_mps3: PerVehicle | None = _meaning("brake_rate_mps3", exclude_if=not_)
-    release_rate_mps3: PerVehicle | None = _meaning("release_rate_mps3", exclude_if=not_)
-    harm_weight: PerVehicle | None = _meaning("harm_weight", exclude_if=not_)
-    alert_s: Quantity | None = _meaning("alert_s", exclude_if=not_)
+    obstacle_gap_m: Quantity | None = _quantity("obstacle_gap_m")
+    obstacle_margin_m: Quantity | None = _quantity("obstacle_margin_m")
+    friction: Quantity | None = _quantity("friction", exclude_if=not_)
+    brake_rate_mps3: PerVehicle | None = _quantity("brake_rate_mps3", exclude_if=not_)
+    release_rate_mps3: PerVehicle | None = _quantity("release_rate_mps3", exclude_if=not_)
+    harm_weight: PerVehicle | None = _quantity("harm_weight", exclude_if=not_)
+    alert_s: Quantity | None = _quantity("alert_s", exclude_if=not_)
     early_impacts: Literal["keep", "reject"] = Field(
         default="keep", description="keep or reject worlds with an impact at or before the first decision of a learner"
     )
-    objective: Objective | Annotated[tuple[Objective, ...], Field(strict=False)] = Field(
+    objective: str | Listed = Field(
         default="total",
         description="whose harm a reward counts: one objective for all vehicles, or a list with one per vehicle",
     )
-    observation: Listed | ListedByVehicle | None = Field(
+    observation: Listed | dict[str, Listed] | None = Field(
         default=None,
         exclude_if=not_,
         description="features and groups of features that a vehicle observes, in this order: one list for all"
@@ -188,120 +137,50 @@ class Scenario(FileModel):
         _build(scenario, document)
         return scenario
 
-    @field_validator(*ALTERNATIVES, *ALTERNATIVES.values(), *OPTIONAL, "alert_s", mode="before")
-    @classmethod
-    def _given(cls, value: Any) -> Any:
-        require(value is not None, (), value, LEAVE_OUT)
-        return value
-
-    @field_validator(*NEEDED, mode="before")
-    @classmethod
-    def _needed(cls, value: Any, info: ValidationInfo) -> Any:
-        """Refuse a quantity that nobody declares: neither the scenario, nor every type, nor the table, nor members."""
-        key, data = str(info.field_name), info.data
-        kinds = data.get("vehicle_types")
-        without = None if kinds is None else next((k for k, kind in kinds.items() if getattr(kind, key) is None), None)
-        if value is not _LEFT_OUT:
-            require(value is not None, (), value, LEAVE_OUT)
-            right = f"must be left out, because every vehicle type declares {key}"
-            require(kinds is None or without is not None, (), value, right)
-            return value
-        if data.get("mixture") is None and {"vehicle_types", "mixture"} <= data.keys() and not _is_tabled(data, key):
-            if kinds is None:
-                raise PydanticCustomError("missing", "missing", {"at": ()})
-            require(without is None, (), UNSHOWN, undeclared_by_type(key, without))
-        return None
-
-    @field_validator("vehicle_types", "types", "mixture", "table", mode="before")
-    @classmethod
-    def _not_empty(cls, value: Any) -> Any:
-        empty = value is None or (isinstance(value, dict | list | tuple) and not value)
-        require(not empty, (), value, "must not be empty; leave the key out if you do not need it")
-        return value
-
-    @field_validator("types")
-    @classmethod
-    def _types(cls, value: Any, info: ValidationInfo) -> Any:
-        if {"vehicles", "vehicle_types"} <= info.data.keys():
-            check_types(value, info.data["vehicle_types"], info.data["vehicles"])
-        return value
-
     @field_validator("table")
     @classmethod
-    def _columns_of_line(cls, value: Table | None, info: ValidationInfo) -> Table | None:
-        if value is None or "vehicles" not in info.data:
-            return value
-        known = table_columns((*USUAL, *OPTIONAL), info.data["vehicles"])
-        for name, column in value.column_values().items():
-            if name == RECORDING:
-                continue
-            hint = suggestion(name, known) or f"known: {', '.join(known)}"
-            require(name in known, ("columns",), name, f"unknown column; {hint}")
-            rule = RULES[known[name][0]]
-            bad = [k for k, number in enumerate(column.rows.tolist()) if not rule.allows(number, number)]
-            at = ("rows", bad[0], value.columns.index(name)) if bad else ()
-            require(not bad, at, column.rows[bad[0]] if bad else 0.0, f"{name} must be {rule.interval}")
+    def _cells(cls, value: Table, info: ValidationInfo) -> Table:
+        if "vehicles" in info.data:
+            value.check_cells(table_columns((*USUAL, *OPTIONAL), info.data["vehicles"]))
         return value
 
     @field_validator(*RULES)
     @classmethod
     def _entries(cls, value: Any, info: ValidationInfo) -> Any:
         """Refuse values out of range, and a list that has not one entry per vehicle or pair."""
-        rule, vehicles = RULES[str(info.field_name)], info.data.get("vehicles")
-        if value is None:
-            return value
+        rule = RULES[str(info.field_name)]
+        if "vehicles" in info.data:
+            check_count(value, rule.count(info.data["vehicles"]), rule.per)
         listed = isinstance(value, tuple)
-        if listed and vehicles is not None:
-            count, per = rule.count(vehicles), "one per pair" if rule.per == "pair" else "one per vehicle"
-            right = f"has {len(value)} entries; must have {count}, {per}, or be a single entry for all"
-            require(len(value) == count, (), UNSHOWN, right)
         for index, entry in enumerate(value if listed else (value,)):
-            low, high = support(entry)
-            overlap = "; a negative gap means overlapping vehicles" if rule.per == "pair" and low < 0.0 else ""
-            at = (index,) if listed else ()
-            require(rule.allows(low, high), at, entry, f"must be {rule.interval}{overlap}")
+            rule.check(entry, (index,) if listed else ())
         return value
 
     @field_validator("roles")
     @classmethod
     def _roles(cls, value: dict[str, str], info: ValidationInfo) -> dict[str, str]:
-        vehicles = info.data.get("vehicles")
-        if vehicles is None:
-            return value
-        names = [f"vehicle_{i + 1}" for i in range(vehicles)]
+        vehicles = info.data.get("vehicles", len(value))
         for name, role in value.items():
-            close = [] if name.startswith("vehicle_") else get_close_matches(name, names, n=1)
-            hint = f"did you mean {close[0]}?" if close else f"this scenario has vehicle_1 ... vehicle_{vehicles}"
-            require(name in names, (name,), role, f"unknown vehicle; {hint}")
+            check_vehicle(name, vehicles, (name,), role)
             try:
                 check_role(role)
             except InvalidInput as error:
                 refuse((name,), role, str(error))
         return Roles.complete(value, vehicles)
 
-    @field_validator("objective", mode="before")
+    @field_validator("objective", "observation", mode="before")
     @classmethod
-    def _objective(cls, value: Any, info: ValidationInfo) -> Any:
-        if "vehicles" in info.data:
+    def _names(cls, value: Any, info: ValidationInfo) -> Any:
+        """Refuse names of objectives, features and vehicles that nobody knows."""
+        vehicles, by_vehicle = info.data.get("vehicles", 64), isinstance(value, dict) and len(value) > 0
+        for name, names in value.items() if by_vehicle else [("", value)]:
+            at = (name,) if by_vehicle else ()
+            if by_vehicle:
+                check_vehicle(name, vehicles, at, UNSHOWN)
             try:
-                objectives_of(value, info.data["vehicles"])
+                listed_features(names) if info.field_name == "observation" else objectives_of(names, vehicles)
             except InvalidInput as error:
-                refuse((), value, str(error).removeprefix("objective: "))
-        return value
-
-    @field_validator("observation", mode="before")
-    @classmethod
-    def _observation(cls, value: Any, info: ValidationInfo) -> Any:
-        vehicles = info.data.get("vehicles", 0)
-        names = [f"vehicle_{i + 1}" for i in range(vehicles)]
-        for name, listed in value.items() if isinstance(value, dict) and value else [(None, value)]:
-            at = () if name is None else (name,)
-            right = f"unknown vehicle; this scenario has vehicle_1 ... vehicle_{vehicles}"
-            require(name is None or not names or name in names, at, UNSHOWN, right)
-            try:
-                listed_features(listed)
-            except InvalidInput as error:
-                refuse(at, listed, str(error).removeprefix("observation: "))
+                refuse(at, names, str(error).removeprefix(f"{info.field_name}: "))
         return value
 
     @model_validator(mode="after")
@@ -345,7 +224,7 @@ class Scenario(FileModel):
     @cached_property
     def vehicle_names(self) -> tuple[str, ...]:
         """``vehicle_1`` (front) to ``vehicle_N`` (rear)."""
-        return tuple(f"vehicle_{i + 1}" for i in range(self.vehicles))
+        return names_of(self.vehicles)
 
     @cached_property
     def learners(self) -> tuple[int, ...]:
@@ -361,19 +240,14 @@ class Scenario(FileModel):
     def equipped(self, types: Ints | None = None) -> Equipped:
         """Return the V2X equipment of vehicles with these types [n, N], or the least that each vehicle may have."""
         line, own = self.types_of_line, self.v2x.vehicles or {}
-        kinds = [Equipage()] if line is None else [kind.v2x or Equipage() for kind in line.kinds]
-        sends, hears = [], []
-        for i, name in enumerate(self.vehicle_names):
-            here = [own[name]] * len(kinds) if name in own else kinds
-            sending, hearing = np.array([each.sends for each in here]), np.array([HEARS.index(e.hears) for e in here])
-            if types is None:
-                possible = [0] if line is None else line.possible(i)
-                sends.append(np.array([sending[possible].all()]))
-                hears.append(np.array([hearing[possible].max()]))
-            else:
-                sends.append(sending[types[:, i]])
-                hears.append(hearing[types[:, i]])
-        return Equipped(np.stack(sends, axis=1), np.stack(hears, axis=1))
+        kinds = [None] if line is None else [kind.v2x for kind in line.kinds]
+        each = [[own.get(name, kind) or Equipage() for kind in kinds] for name in self.vehicle_names]  # [N, types]
+        sends = np.array([[one.sends for one in here] for here in each])
+        hears = np.array([[HEARS.index(one.hears) for one in here] for here in each])
+        if types is not None:
+            return Equipped(*(np.take_along_axis(every, types.T, axis=1).T for every in (sends, hears)))
+        possible = np.ones(sends.shape, bool) if line is None else line.possible
+        return Equipped((sends | ~possible).all(axis=1)[np.newaxis], (hears * possible).max(axis=1)[np.newaxis])
 
     # ---- its quantities
 
@@ -394,14 +268,24 @@ class Scenario(FileModel):
         """Column of the table that names each row's recording; None without it."""
         return None if self.table is None else self.table.column_values().get(RECORDING)
 
+    @cached_property
+    def _possible(self) -> dict[str, tuple[dict[int, Any], ...]]:
+        """For each quantity what ``declarations`` returns; None where nobody declares it."""
+        possible = {}
+        for key, rule in RULES.items():
+            own, line, entries = getattr(self, key), self.types_of_line if key in OF_A_TYPE else None, []
+            for i, outside in enumerate(own if isinstance(own, tuple) else (own,) * rule.count(self.vehicles)):
+                here = {0: self.columns.get((key, i), outside)}
+                if line is not None and (key, i) not in self.columns:
+                    kinds = {kind: getattr(line.kinds[kind], key) for kind in np.flatnonzero(line.possible[i]).tolist()}
+                    here = {kind: outside if inside is None else inside for kind, inside in kinds.items()}
+                entries.append(here)
+            possible[key] = tuple(entries)
+        return possible
+
     def declares(self, key: str) -> bool:
         """Return whether the scenario declares a quantity, by its key, in a vehicle type, or by a whole table."""
-        kinds = (self.vehicle_types or {}).values() if key in OF_A_TYPE else ()
-        return (
-            getattr(self, key) is not None
-            or any(getattr(kind, key) is not None for kind in kinds)
-            or _is_tabled({"table": self.table, "vehicles": self.vehicles}, key)
-        )
+        return all(quantity is not None for entry in self._possible[key] for quantity in entry.values())
 
     def declarations(self, key: str) -> tuple[dict[int, Any], ...]:
         """Return for each vehicle, pair or world: vehicle type (0 without types) -> number, distribution or column.
@@ -419,27 +303,15 @@ class Scenario(FileModel):
                 f"scenario {self.name!r}: does not declare {key}; if {key} follows from other quantities,"
                 " Scenario.bounds gives its range"
             )
-        own, line = getattr(self, key), self.types_of_line if key in OF_A_TYPE else None
-        each = own if isinstance(own, tuple) else (own,) * RULES[key].count(self.vehicles)
-        entries = []
-        for i, outside in enumerate(each):
-            if (key, i) in self.columns:
-                entries.append({0: self.columns[key, i]})
-            elif line is None:
-                entries.append({0: outside})
-            else:
-                kinds = {kind: getattr(line.kinds[kind], key) for kind in line.possible(i)}
-                entries.append({kind: outside if inside is None else inside for kind, inside in kinds.items()})
-        return tuple(entries)
+        return self._possible[key]
 
-    def bounds(self, key: str, *, dry: bool = False) -> tuple[tuple[float, float], ...]:
+    def bounds(self, key: str) -> tuple[tuple[float, float], ...]:
         """Return smallest and largest value of a quantity that every world has, for each vehicle, pair or world.
 
-        ``dry``: friction does not limit capacities. A rate that nobody declares is the largest that can be declared.
+        Capacities are those on the road. A rate that nobody declares is the largest that can be declared.
         """
-        ranges = [world_values(member, member.ends) for member in self.members or (self,)]
         at_once = np.full((2, self.vehicles), RULES[key].high)
-        each = [(values if dry else on_road(values)).get(key, at_once) for values in ranges]
+        each = [world_values(member, member.ends).get(key, at_once) for member in self.members or (self,)]
         lows, highs = np.min(each, axis=0)[0], np.max(each, axis=0)[1]
         return tuple(zip(lows.tolist(), highs.tolist(), strict=True))
 
@@ -457,11 +329,8 @@ class Scenario(FileModel):
     def content(self, without: Sequence[str] = ()) -> dict[str, Any]:
         """Return every value, defaults too, as plain data, except the keys ``without``; of members without words."""
         content = self.model_dump(mode="json", exclude=set(without))
-        if self.mixture is not None and self.members:
-            content["mixture"] = [
-                {"weight": entry.weight, "scenario": member.model_dump(mode="json", exclude=set(WORDS))}
-                for entry, member in zip(self.mixture, self.members, strict=True)
-            ]
+        for entry, member in zip(content.get("mixture", ()), self.members, strict=False):
+            entry["scenario"] = member.content(WORDS)
         return content
 
     def replace(self, **changes: Any) -> Scenario:
@@ -476,33 +345,16 @@ class Scenario(FileModel):
 
         A learner that is not listed brakes fully. Raises ``InvalidInput`` for an unknown vehicle, or one listed twice.
         """
-        if isinstance(learners, str):
-            raise InvalidInput(f"learners: {learners!r}: must be a list of vehicles, for instance [{learners!r}]")
-        chosen = [self._vehicle_name(learner) for learner in learners]
+        if isinstance(learners, str) or not isinstance(learners, Iterable):
+            raise InvalidInput(f"learners = {learners!r}: must be a list of vehicles, for instance ['vehicle_2']")
+        numbered: dict[Any, str] = dict(enumerate(self.vehicle_names))
+        chosen = [str(each if isinstance(each, bool) else numbered.get(each, each)) for each in learners]
+        if unknown := [name for name in chosen if name not in self.vehicle_names]:
+            raise unknown_name("vehicle", unknown[0], self.vehicle_names)
         if twice := {name for name in chosen if chosen.count(name) > 1}:
             raise InvalidInput(f"learners: {', '.join(sorted(twice))} is listed twice")
         stay = {name: "full_brake" if role == LEARNER else role for name, role in self.roles.items()}
         return self.replace(roles={**stay, **dict.fromkeys(chosen, LEARNER)})
-
-    def _vehicle_name(self, vehicle: str | int) -> str:
-        if isinstance(vehicle, str):
-            if vehicle not in self.vehicle_names:
-                raise unknown_name("vehicle", vehicle, self.vehicle_names)
-            return vehicle
-        if isinstance(vehicle, bool) or not isinstance(vehicle, int | np.integer) or not 0 <= vehicle < self.vehicles:
-            raise InvalidInput(
-                f"learners: {vehicle!r}: must be the name of a vehicle (vehicle_1 ... vehicle_{self.vehicles}) or its"
-                f" index (0 ... {self.vehicles - 1})"
-            )
-        return self.vehicle_names[vehicle]
-
-
-def _is_tabled(data: Mapping[str, Any], key: str) -> bool:
-    """Return whether the table has a column of the quantity for every vehicle, pair or world."""
-    table, rule = data.get("table"), RULES[key]
-    if table is None or "vehicles" not in data or not rule.column:
-        return False
-    return all(rule.column_of(i) in table.columns for i in range(rule.count(data["vehicles"])))
 
 
 def _build(scenario: Scenario, document: Document) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
-import math
-from dataclasses import dataclass, field as data_field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from operator import not_
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -15,38 +15,28 @@ from numpy.typing import NDArray
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.files.model import UNSHOWN, FileModel, require, suggestion
+from ethbrake_marl.files.model import UNSHOWN, refuse, require, suggestion
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.motion.layout import Floats
-from ethbrake_marl.worlds.quantity import Number, Numbers, pick
-from ethbrake_marl.worlds.rules import RECORDING
+from ethbrake_marl.worlds.quantity import Number, Numbers, Part, pick, positive
+from ethbrake_marl.worlds.rules import RECORDING, RULES, Entry
 
 SIZE_LIMIT = 64 << 20  # bytes of a CSV file
-MOST_NUMBERS = 100_000  # numbers of a table: every copy of the scenario holds it
-MOST_CHARACTERS = 200  # of a recording's name
-WEIGHT = "weight"  # column of ``rows_text``
 
-_NAME = f"recording must be a text of 1 to {MOST_CHARACTERS} printable characters, such as 'drive_1.csv: 2-3-4'"
-
-Column = Annotated[str, Field(pattern=r"^[a-z_]+(_[0-9]+)?[a-z0-9_]*$", max_length=64)]
 Cell = Annotated[
     Annotated[Number, Tag("#number")] | Annotated[str, Tag("#text")],
     Discriminator(lambda value: "#text" if isinstance(value, str) else "#number"),
 ]
-Row = Annotated[tuple[Cell, ...], Field(strict=False, min_length=1)]
+Row = Annotated[tuple[Cell, ...], Field(strict=False)]
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class TableColumn:
     """A column of a table, which is drawn like a distribution."""
 
-    name: str
-    rows: NDArray[Any] = data_field(compare=False)  # value of each row; texts in the column ``recording``
-    weights: Floats = data_field(compare=False)  # of each row
-
-    def __repr__(self) -> str:
-        return f"column {self.name} of the table"
+    rows: NDArray[Any]  # value of each row; texts in the column ``recording``
+    weights: Floats  # of each row
 
     @property
     def support(self) -> tuple[float, float]:
@@ -56,7 +46,7 @@ class TableColumn:
         return self.rows[pick(self.weights, u)]
 
 
-class Table(FileModel):
+class Table(Part):
     """The key ``table`` of a scenario. A scenario file may name a CSV file with the rows.
 
     Rows with the same text in the column ``recording`` come from the same vehicles in the same recording, so they are
@@ -66,11 +56,11 @@ class Table(FileModel):
     file: str = Field(
         default="", exclude_if=not_, description="path of a CSV file with a header, relative to the scenario's folder"
     )
-    columns: Annotated[tuple[Column, ...], Field(strict=False, min_length=1)] = Field(
+    columns: Annotated[tuple[str, ...], Field(strict=False, min_length=1)] = Field(
         description="names of the columns, or of the columns of the file that are used: gap_1_m, speed_2_mps, ...;"
         " the column recording has texts that name the recording and the vehicles of a row"
     )
-    weights: str | Annotated[Numbers, Field()] | None = Field(
+    weights: str | Numbers | None = Field(
         default=None,
         exclude_if=not_,
         description="how likely each row is: a list with one number per row, or the name of a column of the file",
@@ -85,35 +75,39 @@ class Table(FileModel):
         require(not (self.file and self.rows), ("file",), self.file, both)
         read = "must be given as lists here; only load_scenario reads the rows from a file"
         require(self.rows is not None and not isinstance(self.weights, str), ("rows",), UNSHOWN, read)
-        rows = self.rows or ()
-        for k, row in enumerate(rows):
+        for k, row in enumerate(self.rows or ()):
             right = f"has {len(row)} values; must have one for each of the {len(self.columns)} columns"
             require(len(row) == len(self.columns), ("rows", k), UNSHOWN, right)
-            for c, (name, cell) in enumerate(zip(self.columns, row, strict=True)):
-                good = _names(cell) if name == RECORDING else not isinstance(cell, str)
-                require(good, ("rows", k, c), cell, _NAME if name == RECORDING else f"{name} must be a number")
-        numbers = len(rows) * sum(name != RECORDING for name in self.columns)
-        most = f"has {numbers:,} numbers; must have at most {MOST_NUMBERS:,}"
-        require(numbers <= MOST_NUMBERS, ("rows",), UNSHOWN, most)
-        twice = [name for name in self.columns if self.columns.count(name) > 1]
-        require(not twice, ("columns",), twice[:1], "must not list a column twice")
+        require(len({*self.columns}) == len(self.columns), ("columns",), self.columns, "must not list a column twice")
         require(self.columns != (RECORDING,), ("columns",), self.columns, "must also have a column of numbers")
         if isinstance(self.weights, tuple):
-            fits = f"must be {len(rows)} numbers, one per row, all above 0 and with a finite sum"
-            good = len(self.weights) == len(rows) and min(self.weights) > 0.0 and math.isfinite(sum(self.weights))
+            fits = f"must be {len(self.rows or ())} numbers, one per row, all above 0 and with a finite sum"
+            good = len(self.weights) == len(self.rows or ()) and positive(self.weights)
             require(good, ("weights",), UNSHOWN, fits)
         return self
+
+    def check_cells(self, known: Mapping[str, Entry]) -> None:
+        """Raise, in a pydantic validator, the error for a column that is not ``known``, or a bad cell."""
+        hint = f"known: {', '.join((*known, RECORDING))}"
+        for c, name in enumerate(self.columns):
+            rule = RULES[known[name][0]] if name in known else None
+            unknown = f"unknown column; {suggestion(name, known) or hint}"
+            require(rule is not None or name == RECORDING, ("columns",), name, unknown)
+            right = f"{name} must be {rule.interval if rule else 'a printable text, such as drive_1.csv: 2-3-4'}"
+            for k, cell in enumerate(row[c] for row in self.rows or ()):
+                if isinstance(cell, str):
+                    good = rule is None and cell.isprintable() and cell.strip() == cell != ""
+                else:
+                    good = rule is not None and rule.allows(cell, cell)
+                if not good:
+                    refuse(("rows", k, c), cell, right)
 
     def column_values(self) -> dict[str, TableColumn]:
         """Return the columns by name, ``recording`` among them."""
         rows = self.rows or ()
         weights = np.asarray(self.weights if isinstance(self.weights, tuple) else (1.0,) * len(rows))
         columns = zip(self.columns, zip(*rows, strict=True), strict=True)
-        return {name: TableColumn(name, np.array(column), weights) for name, column in columns}
-
-
-def _names(cell: float | str) -> bool:
-    return isinstance(cell, str) and 0 < len(cell) <= MOST_CHARACTERS and cell.isprintable() and cell == cell.strip()
+        return {name: TableColumn(np.array(column), weights) for name, column in columns}
 
 
 class CsvFile(NamedTuple):
@@ -127,14 +121,13 @@ class CsvFile(NamedTuple):
     @classmethod
     def read(cls, path: Path) -> CsvFile:
         """Read a file. Raises ``InvalidInput`` if it is no CSV file, or has no header or no row."""
-        rows, lines, begins = list[list[str]](), list[int](), 1
+        rows, lines = list[list[str]](), [1]
         data = read_plain(path, SIZE_LIMIT)
         try:
             reader = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
             for row in reader:
                 rows.append(row)
-                lines.append(begins)
-                begins = reader.line_num + 1
+                lines.append(reader.line_num + 1)
         except (csv.Error, ValueError) as error:
             raise InvalidInput(f"{path}: cannot be read as CSV: {error}") from None
         while rows and not rows[-1]:
@@ -143,27 +136,25 @@ class CsvFile(NamedTuple):
             raise InvalidInput(f"{path}, line 1: must name the columns, for instance gap_1_m,gap_2_m,speed_1_mps,...")
         if len(rows) == 1:
             raise InvalidInput(f"{path}: has a header but no rows; add one row per world")
-        return cls(path, [name.strip() for name in rows[0]], rows[1:], lines[1 : len(rows)])
+        return cls(path, [name.strip() for name in rows[0]], rows[1:], lines[1:])
 
     def cells(self, columns: list[str]) -> list[list[float | str]]:
         """Return the ``columns`` of each row: numbers, and texts in the column ``recording``."""
-        places = [self.header.index(name) for name in columns]
         cells = []
-        for row, line in zip(self.rows, self.lines, strict=True):
+        for row, line in zip(self.rows, self.lines, strict=False):
             if len(row) != len(self.header):
                 raise InvalidInput(
                     f"{self.path}, line {line}: has {len(row)} values, but the header has {len(self.header)} columns"
                 )
-            cells.append([self._cell(row[c], line, name) for c, name in zip(places, columns, strict=True)])
+            texts = dict(zip(self.header, row, strict=True))
+            cells.append([self._cell(texts[name].strip(), line, name) for name in columns])
         return cells
 
     def _cell(self, text: str, line: int, column: str) -> float | str:
-        if column == RECORDING:
-            return text.strip()
-        number = parse_numeral(text.strip())
-        if number is None:
+        number = parse_numeral(text)
+        if number is None and column != RECORDING:
             raise InvalidInput(f"{self.path}, line {line}, column {column}: {text!r:.60} is not a number")
-        return number
+        return text if number is None or column == RECORDING else number
 
 
 def read_rows(path: Path, columns: object, weights: object) -> dict[str, Any]:
@@ -185,15 +176,3 @@ def read_rows(path: Path, columns: object, weights: object) -> dict[str, Any]:
     cells = file.cells(names)
     rows = {"rows": [row[: len(columns)] for row in cells]}
     return rows if weights is None else {**rows, "weights": [row[-1] for row in cells]}
-
-
-def rows_text(table: Table) -> str:
-    """Return the rows of a table as CSV text; weights of rows stand in the column ``weight``."""
-    rows = [list(row) for row in table.rows or ()]
-    header = list(table.columns)
-    if isinstance(table.weights, tuple):
-        header.append(WEIGHT)
-        rows = [[*row, weight] for row, weight in zip(rows, table.weights, strict=True)]
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([header, *rows])
-    return text.getvalue()

@@ -13,16 +13,35 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, Discriminator, Field, Tag, ValidationInfo, field_validator
 
-from ethbrake_marl.files.model import NAME_PATTERN, UNSHOWN, FileModel, require, suggestion
-from ethbrake_marl.files.yaml import YamlPath
-from ethbrake_marl.motion.layout import Floats, Ints
+from ethbrake_marl.files.model import NAME_PATTERN, UNSHOWN, require, suggestion
+from ethbrake_marl.motion.layout import Bools, Floats, Ints
 from ethbrake_marl.worlds.channel import Equipage
-from ethbrake_marl.worlds.quantity import LEAVE_OUT, Quantity, Uniform, WithLoad, pick, support, values
-from ethbrake_marl.worlds.rules import OF_A_TYPE, RULES
+from ethbrake_marl.worlds.quantity import ONE_OR_EACH, Pair, Part, Quantity, Uniform, pick, support, values
+from ethbrake_marl.worlds.rules import OF_A_TYPE, RULES, USUAL, check_count
 
 ANY = "any"  # every type, in proportion to its weight
 
 Weight = Annotated[float, Field(gt=0.0, le=1e9, allow_inf_nan=False)]
+
+
+class WithLoad(Part):
+    """``{with_load: [empty, full]}``: ``empty + (full - empty) load``, plus a value that ``spread`` draws."""
+
+    with_load: Pair = Field(description="[empty, full]: value of an empty vehicle, value of a full vehicle")
+    spread: Quantity = Field(
+        default=0.0, exclude_if=not_, description="distribution around 0 of a random amount that is added to the value"
+    )
+
+    @property
+    def support(self) -> tuple[float, float]:
+        low, high = support(self.spread)
+        return min(self.with_load) + low, max(self.with_load) + high
+
+    def value(self, load: Floats, u: Floats) -> Floats:
+        """Return the values of vehicles with a ``load`` in [0, 1]; ``u`` draws the spread."""
+        empty, full = self.with_load
+        moved = np.clip(empty + (full - empty) * load, min(self.with_load), max(self.with_load))
+        return moved if self.spread == 0.0 else moved + values(self.spread, u)
 
 
 def _tag(value: object) -> str:
@@ -32,24 +51,25 @@ def _tag(value: object) -> str:
 TypeQuantity = Annotated[Annotated[Quantity, Tag("#one")] | Annotated[WithLoad, Tag("#with_load")], Discriminator(_tag)]
 
 
-class VehicleType(FileModel):
+def _own(key: str) -> Any:
+    """Return the field of a quantity that a type may declare."""
+    return Field(default=None, exclude_if=None if key in USUAL else not_, description=RULES[key].meaning)
+
+
+class VehicleType(Part):
     """A vehicle type. What it does not declare, the scenario declares outside ``vehicle_types``."""
 
     weight: Weight = Field(default=1.0, description="how likely this type is, relative to the other types")
     load: Quantity = Field(
         default_factory=lambda: Uniform(uniform=(0.0, 1.0)), description="load, as a fraction of the full load, 0 to 1"
     )
-    braking_capacity_mps2: TypeQuantity | None = Field(default=None, description=RULES["braking_capacity_mps2"].meaning)
-    driving_capacity_mps2: TypeQuantity | None = Field(default=None, description=RULES["driving_capacity_mps2"].meaning)
-    mass_t: TypeQuantity | None = Field(default=None, description=RULES["mass_t"].meaning)
-    latency_s: TypeQuantity | None = Field(default=None, description=RULES["latency_s"].meaning)
-    speed_limit_mps: TypeQuantity | None = Field(default=None, description=RULES["speed_limit_mps"].meaning)
-    brake_rate_mps3: TypeQuantity | None = Field(
-        default=None, exclude_if=not_, description=RULES["brake_rate_mps3"].meaning
-    )
-    release_rate_mps3: TypeQuantity | None = Field(
-        default=None, exclude_if=not_, description=RULES["release_rate_mps3"].meaning
-    )
+    braking_capacity_mps2: TypeQuantity | None = _own("braking_capacity_mps2")
+    driving_capacity_mps2: TypeQuantity | None = _own("driving_capacity_mps2")
+    mass_t: TypeQuantity | None = _own("mass_t")
+    latency_s: TypeQuantity | None = _own("latency_s")
+    speed_limit_mps: TypeQuantity | None = _own("speed_limit_mps")
+    brake_rate_mps3: TypeQuantity | None = _own("brake_rate_mps3")
+    release_rate_mps3: TypeQuantity | None = _own("release_rate_mps3")
     v2x: Equipage | None = Field(
         default=None, exclude_if=not_, description="V2X equipment of this type; by default sending and receiving"
     )
@@ -57,9 +77,7 @@ class VehicleType(FileModel):
     @field_validator(*OF_A_TYPE)
     @classmethod
     def _in_range(cls, value: Any, info: ValidationInfo) -> Any:
-        require(value is not None, (), value, LEAVE_OUT)
-        rule = RULES[str(info.field_name)]
-        require(rule.allows(*support(value)), (), value, f"must be {rule.interval}")
+        RULES[str(info.field_name)].check(value)
         return value
 
     @field_validator("load")
@@ -78,30 +96,26 @@ def _check_names(kinds: dict[str, VehicleType]) -> dict[str, VehicleType]:
 TypeName = Annotated[str, Field(pattern=NAME_PATTERN)]
 VehicleTypes = Annotated[dict[TypeName, VehicleType], Field(min_length=1), AfterValidator(_check_names)]
 
-TypesHere = str | dict[str, Weight]  # possible types of one vehicle: a type, ``any``, or a weight per type
+# possible types of one vehicle: a type, ``any``, or a weight per type
+TypesHere = str | Annotated[dict[str, Weight], Field(min_length=1)]
 Types = Annotated[
-    Annotated[TypesHere, Tag("#one")]
-    | Annotated[tuple[TypesHere, ...], Field(strict=False, min_length=1), Tag("#each")],
-    Discriminator(lambda value: "#each" if isinstance(value, list | tuple) else "#one"),
+    Annotated[TypesHere, Tag("#one")] | Annotated[tuple[TypesHere, ...], Field(strict=False), Tag("#each")], ONE_OR_EACH
 ]
 
 
 def check_types(types: Any, kinds: Mapping[str, VehicleType] | None, vehicles: int) -> None:
     """Raise, in a pydantic validator, the error for an entry of the key ``types`` that names no declared type."""
-    if kinds is None:
-        require(False, (), types, "can be used only with the key vehicle_types, which declares the types")
-        return
-    listed = isinstance(types, tuple)
-    right = f"has {len(types)} entries; must have {vehicles}, one per vehicle, or be a single entry for all"
-    require(not listed or len(types) == vehicles, (), UNSHOWN, right)
-    for index, entry in enumerate(types if listed else (types,)):
-        at: YamlPath = (index,) if listed else ()
-        names = [entry] if isinstance(entry, str) else list(entry)
-        require(len(names) > 0, at, entry, "must name at least one vehicle type")
-        for name in names:
-            hint = suggestion(name, kinds) or f"known: {', '.join(kinds)}"
-            known = name in kinds or (name == ANY and isinstance(entry, str))
-            require(known, at, entry, f"unknown vehicle type {name}; {hint}")
+    require(
+        kinds is not None, ("types",), types, "can be used only with the key vehicle_types, which declares the types"
+    )
+    check_count(types, vehicles, "vehicle", ("types",))
+    known = [*(kinds or {}), ANY]
+    for index, entry in enumerate(types if isinstance(types, tuple) else (types,)):
+        for name in [entry] if isinstance(entry, str) else entry:
+            hint = suggestion(name, known) or f"known: {', '.join(known)}"
+            at = ("types", index) if isinstance(types, tuple) else ("types",)
+            good = name in known and (name != ANY or isinstance(entry, str))
+            require(good, at, entry, f"unknown vehicle type {name}; {hint}")
 
 
 class TypesOfLine:
@@ -111,23 +125,20 @@ class TypesOfLine:
         self.names, self.kinds = tuple(kinds), tuple(kinds.values())
         each = types if isinstance(types, tuple) else (types or ANY,) * vehicles
         self.weights = np.array([[_weight(kinds, name, here) for name in kinds] for here in each])  # [N, types]
-
-    def possible(self, vehicle: int) -> list[int]:
-        """Return the possible types of a vehicle (from 0)."""
-        return np.flatnonzero(self.weights[vehicle] > 0.0).tolist()
+        self.possible: Bools = self.weights > 0.0  # [N, types]
 
     def draw(self, u: Floats) -> tuple[Ints, Floats]:
         """Return type and load of every vehicle, [n, N] each, for uniform numbers ``u`` [n, N, PER_TYPE]."""
         types, load = np.zeros(u.shape[:2], np.int64), np.zeros(u.shape[:2])
         for i, weights in enumerate(self.weights):
             types[:, i] = pick(weights, u[:, i, 0])
-            for kind in self.possible(i):
+            for kind in np.flatnonzero(self.possible[i]):
                 rows = types[:, i] == kind
                 load[rows, i] = values(self.kinds[kind].load, u[rows, i, 1])
         return types, load
 
 
-def _weight(kinds: Mapping[str, VehicleType], name: str, here: TypesHere) -> float:
+def _weight(kinds: Mapping[str, VehicleType], name: str, here: Any) -> float:
     if isinstance(here, str):
         return kinds[name].weight if here == ANY else float(here == name)
-    return here.get(name, 0.0)
+    return float(here.get(name, 0.0))

@@ -72,7 +72,7 @@ def test_presets_of_ones_own() -> None:
         register_preset("test-lossy", {"preset": "nominal"})
     with refused("preset 'Lossy': the name must be 1 to 64 characters"):
         register_preset("Lossy", {})
-    with refused("preset 'y': settings = 3: must be a mapping such as {'lost': 0.1}"):
+    with refused("preset 'y': must be a mapping such as {'lost': 0.1}"):
         register_preset("y", 3)  # type: ignore[arg-type]
     with refused("preset 'y': los: unknown key; did you mean lost?"):
         register_preset("y", {"los": 1})

@@ -36,7 +36,9 @@ def test_state__is_filled_in_with_what_is_fixed(scenario: Any, state: Any, expec
     assert worlds.clock[:, 5].tolist() == [-1.0]
 
 
-@pytest.mark.parametrize("name", ["paper-random", "realistic-mixed-buildup", "paper-random-obstacle"])
+@pytest.mark.parametrize(
+    "name", ["paper-random", "realistic-mixed-buildup", "paper-random-obstacle", "paper-random-preference"]
+)
 def test_table_of_what_was_drawn__is_the_same_worlds(name: str) -> None:
     scenario = load_scenario(name)
     drawn = scenario.draw(50, 3)
@@ -54,7 +56,7 @@ def test_table__may_be_a_data_frame() -> None:
     assert bits(worlds_from_table(PAPER, {name: frame[name] for name in COLUMNS})) == expected
     assert bits(worlds_from_table(PAPER, pyarrow.table(COLUMNS))) == expected
     other = {**COLUMNS, "gap_1_m": frame["gap_1_m"], "gap_2_m": frame["gap_2_m"].sort_index()}
-    with refused("initial states: columns 'gap_1_m' and 'gap_2_m' have different pandas indexes; give them the same"):
+    with refused("initial states: columns have different pandas indexes; give them the same"):
         worlds_from_table(PAPER, other)
     with refused("initial states = 3: must be a mapping from columns to lists of numbers, a data frame or a"):
         worlds_from_table(PAPER, 3)

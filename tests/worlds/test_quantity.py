@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given, strategies as st
 
 from ethbrake_marl.worlds.counters import numbers_of
-from ethbrake_marl.worlds.quantity import Choice, LogNormal, LogUniform, Normal, Uniform, WithLoad, support, values
+from ethbrake_marl.worlds.quantity import Choice, LogNormal, LogUniform, Normal, Uniform, support, values
 from ethbrake_marl.worlds.rules import NEWS, RULES, TYPES
+from ethbrake_marl.worlds.vehicle_types import WithLoad
 
 near = pytest.approx
 ALMOST_ONE = 1.0 - 2.0**-53

@@ -82,13 +82,13 @@ GIVEN: dict[str, Callable[[], object]] = {
     "initial states: all columns must be lists of the same length; they have the shapes gap_1_m [],": lambda: (
         worlds_from_table(PAPER, COLUMNS | {"gap_1_m": 1})
     ),
-    "initial states: gap_1_m = ['1', '2', '3']: is not a number; must be a number or a list of numbers": lambda: (
+    "initial states: gap_1_m = ['1', '2', '3']: must be a number or a list of numbers; no booleans, texts": lambda: (
         worlds_from_table(PAPER, COLUMNS | {"gap_1_m": ["1", "2", "3"]})
     ),
-    "initial states: gap_1_m = [True, True, True]: is a boolean; must be a number or a list": lambda: worlds_from_table(
-        PAPER, COLUMNS | {"gap_1_m": [True, True, True]}
+    "initial states: gap_1_m = [True, 2, 3]: must be a number or a list of numbers; no booleans, texts": lambda: (
+        worlds_from_table(PAPER, COLUMNS | {"gap_1_m": [True, 2, 3]})
     ),
-    "initial states: gap_1_m = [[1], [2, 3]]: has inner lists of different lengths; must be a number or a": lambda: (
+    "initial states: gap_1_m = [[1], [2, 3]]: must be a number or a list of numbers: setting an array": lambda: (
         worlds_from_table(PAPER, COLUMNS | {"gap_1_m": [[1], [2, 3]]})
     ),
     "initial states, row 1, column speed_2_mps = nan: must be finite and in [0, 200] m/s (metres": lambda: (
@@ -117,7 +117,7 @@ GIVEN: dict[str, Callable[[], object]] = {
     "initial_state: gaps_m[1] = -7: must be finite and in [0, 10000] m (metres)": lambda: worlds_from_state(
         PAPER, {"gaps_m": [7, -7], "speeds_mps": 20}
     ),
-    "initial_state: gaps_m = True: is a boolean; must be a number or a list of numbers": lambda: worlds_from_state(
+    "initial_state: gaps_m = True: must be a number or a list of numbers; no booleans": lambda: worlds_from_state(
         PAPER, {"gaps_m": True, "speeds_mps": 20}
     ),
     "initial_state = [7, 7]: must be a mapping such as {'gaps_m': [7, 7]}": lambda: worlds_from_state(PAPER, [7, 7]),

@@ -1,0 +1,136 @@
+"""What one vehicle believes: the state as its messages and sensors tell it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.messages.links import (
+    AT,
+    INTENT,
+    NAME,
+    NUMBER,
+    P_ACCELERATION,
+    P_BRAKING,
+    P_INTENT,
+    P_LATENCY,
+    P_MASS,
+    P_PLACE,
+    P_SPEED,
+    PIECES,
+    Memory,
+    estimated,
+    newest,
+)
+from ethbrake_marl.motion.layout import (
+    BRAKE_RATE,
+    BRAKING,
+    DRIVING,
+    FORCE,
+    LATENCY,
+    MASS,
+    OWN_LATENCY,
+    RELEASE_RATE,
+    SPEED,
+    Bools,
+    Floats,
+)
+
+LINE_PIECES = {SPEED: P_SPEED, FORCE: P_ACCELERATION}  # row of `State.line` -> the piece that it is
+CAR_PIECES = {
+    BRAKING: P_BRAKING,
+    DRIVING: P_BRAKING,
+    BRAKE_RATE: P_BRAKING,
+    RELEASE_RATE: P_BRAKING,
+    LATENCY: P_LATENCY,
+    OWN_LATENCY: P_LATENCY,
+    MASS: P_MASS,
+}
+LOOK_AHEAD = ("place", "speed", "braking_capacity", "latency", "mass")  # pieces that a simulation of the others needs
+
+
+def known_pieces(state: State, observer: int) -> Bools:
+    """Return whether the body ``observer`` knows each of ``PIECES`` of each body, [n, N + 1, PIECES].
+
+    It knows what the other's messages contain, the intent only once a message has come; and place, speed and
+    acceleration of a neighbour in sight. Of itself and of the obstacle it knows everything.
+    """
+    memory: Memory = state.memories[NAME]
+    time = state.time_s[:, np.newaxis]
+    known = state.know[:, observer] <= time
+    if memory.is_periodic:
+        known &= memory.news[:, AT, observer] >= 0.0
+    pieces = memory.contents.copy()
+    pieces[:, :, P_INTENT] &= (memory.links[:, NUMBER, observer] > 0.0) | (memory.heard_s[:, observer] <= time)
+    pieces[:, :, [P_PLACE, P_SPEED, P_ACCELERATION]] |= (memory.seen_s[:, observer] <= time)[:, :, np.newaxis]
+    pieces &= known[:, :, np.newaxis]
+    pieces[:, [0, observer]] = True
+    return pieces
+
+
+def believed(state: State, observer: int) -> State:
+    """Return the state as the body ``observer`` believes it. What it does not know is NaN, but for gaps.
+
+    Old news is moved on to the present (``links.estimate_worlds``). ``know`` is infinite for a body of which it knows
+    nothing. ``wanted`` holds the newest intents. Gaps add up to the distances of bodies with a known place.
+    """
+    known = known_pieces(state, observer)
+    news = newest(state, observer)
+    line, car = estimated(state, observer, known, news), state.car.copy()
+    for rows, array in ((LINE_PIECES, line), (CAR_PIECES, car)):
+        for row, piece in rows.items():
+            array[:, row][~known[:, :, piece]] = np.nan
+    wanted = np.where(known[:, :, P_INTENT], news[:, INTENT], np.nan)
+    wanted[:, [0, observer]] = state.wanted[:, [0, observer]]
+    return state._replace(
+        line=line, car=car, know=_known_if(state, observer, np.asarray(known.any(axis=2))), wanted=wanted
+    )
+
+
+def believed_whole(state: State, observer: int) -> State:
+    """Return what the body ``observer`` believes of bodies that it can predict. To it, the others are not known.
+
+    It can predict a body of which it knows all pieces but the intent.
+    """
+    known = known_pieces(state, observer)
+    line, whole = estimated(state, observer, known, newest(state, observer)), known[:, :, :P_INTENT].all(axis=2)
+    return state._replace(line=line, know=_known_if(state, observer, np.asarray(whole)))
+
+
+def _known_if(state: State, observer: int, holds: Bools) -> Floats:
+    know = state.know.copy()
+    know[:, observer][~holds] = np.inf
+    return know
+
+
+def ages_s(state: State) -> Floats:
+    """Return the age of the newest sample that i has of j, [n, N + 1, N + 1] s; infinite: it has none.
+
+    Without periodic messages it is 0: what is known is the present state. i uses it from ``state.know`` on.
+    """
+    memory: Memory = state.memories[NAME]
+    if not memory.is_periodic:
+        return np.zeros(state.know.shape)
+    at = memory.news[:, AT]
+    ages = np.where(at >= 0.0, state.time_s[:, np.newaxis, np.newaxis] - at, np.inf)
+    ages[:, np.arange(ages.shape[1]), np.arange(ages.shape[1])] = 0.0
+    return ages
+
+
+def require_pieces(state: State, observers: Sequence[int], who: str, needs: Sequence[str] = LOOK_AHEAD) -> None:
+    """Raise ``InvalidInput`` if messages lack a piece that ``who``, who drives ``observers``, needs of the others.
+
+    One that drives several vehicles needs messages of them, too.
+    """
+    for sender in range(1, state.vehicles + 1) if NAME in state.memories else ():
+        contents = state.memories[NAME].contents[:, sender]
+        missing = [piece for piece in needs if not contents[:, PIECES.index(piece)].all()]
+        if missing and tuple(observers) != (sender,):
+            raise InvalidInput(
+                f"{who}: messages of vehicle_{sender} do not contain its {missing[0]} (key v2x.tells), but"
+                f" {', '.join(needs)} of the other vehicles are needed; add them to v2x.tells, or use a policy"
+                " without shield and search, which needs only its observation"
+            )

@@ -1,0 +1,159 @@
+"""How a scenario declares messages: the keys ``persistence`` and ``tells`` of ``v2x``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.messages.game import GameWithMessages
+from ethbrake_marl.extensions.messages.links import (
+    CHANNEL_COLUMNS,
+    DELAY,
+    KEY,
+    LOSS_BEGINS,
+    LOSS_ENDS,
+    PERIOD,
+    PIECES,
+    Memory,
+    samples_kept,
+    silent,
+)
+from ethbrake_marl.files.model import UNSHOWN, require, suggestion
+from ethbrake_marl.motion.layout import Bools, Floats
+from ethbrake_marl.worlds.channel import PER_LINK, V2X, Equipped
+from ethbrake_marl.worlds.counters import Numbers
+from ethbrake_marl.worlds.rules import NEWS, OF_WORLD
+from ethbrake_marl.worlds.scenario import Scenario
+
+LATER_LOSSES = (5,)  # stream of the numbers that decide which messages after the first are lost
+MOST_SAMPLES = 1_000  # that a vehicle may keep for delayed messages
+USUAL = PIECES[:-1]  # what a message contains unless the scenario says otherwise
+_LISTED = {"type": "array", "items": {"enum": list(PIECES)}, "uniqueItems": True}
+
+
+class Messages:
+    """The extension that the keys declare."""
+
+    name = "messages"
+    keys = ("persistence", "tells")
+    schemas: Mapping[str, dict[str, Any]] = {
+        "persistence": {
+            "description": "what a receiver knows after the first message: first: always the present state of the"
+            " sender; periodic: the state in the newest message that arrived",
+            "enum": ["first", "periodic"],
+        },
+        "tells": {
+            "description": "contents of messages, for all vehicles or by vehicle name: place, speed, acceleration,"
+            " braking_capacity, latency, mass, intent; by default all but intent",
+            "anyOf": [_LISTED, {"type": "object", "minProperties": 1, "additionalProperties": _LISTED}],
+        },
+    }
+
+    def read(self, key: str, value: Any) -> Any:
+        """Return the value of a key; lists of pieces in the order of ``PIECES``."""
+        if key == "persistence":
+            require(value in ("first", "periodic"), (key,), value, "must be first or periodic")
+            return value
+        right = f"must be a list of items from {', '.join(PIECES)}, or a mapping from vehicle names to such lists"
+        by_name = isinstance(value, Mapping)
+        require(isinstance(value, list | tuple) or (by_name and len(value) > 0), (key,), value, right)
+        read = {}
+        for name, listed in value.items() if by_name else [("", value)]:
+            at = (key, name) if by_name else (key,)
+            require(isinstance(name, str) and isinstance(listed, list | tuple), at, listed, right)
+            for k, piece in enumerate(listed):
+                hint = suggestion(piece, PIECES) if isinstance(piece, str) else ""
+                require(piece in PIECES, (*at, k), piece, f"{hint}; known: {', '.join(PIECES)}".removeprefix("; "))
+            require(len(set(listed)) == len(listed), at, listed, "must not list an item twice")
+            read[name] = [piece for piece in PIECES if piece in listed]
+        return read if by_name else read[""]
+
+    def uses(self, v2x: V2X) -> tuple[str, ...]:
+        """Return the keys that later messages use; refuse keys that have no effect."""
+        channel, tells = v2x.channel, _value(v2x, "tells")
+        right = "needs a channel with separate messages; use a preset that generates messages, such as nominal"
+        sent = channel.hears != "none" and channel.timing != "latency"
+        require(sent or not _is_periodic(v2x), ("persistence",), "periodic", right)
+        right = "has no effect, because hears: none means that no vehicle gets messages; leave it out"
+        require(tells is None or channel.hears != "none", ("tells",), tells, right)
+        return ("message_period_s", "loss_begins", "loss_ends") if _is_periodic(v2x) else ()
+
+    def is_random(self, v2x: V2X) -> bool:
+        """Return whether messages after the first may be lost."""
+        return _is_periodic(v2x) and v2x.channel.loss_begins > 0.0
+
+    def check(self, scenario: Scenario) -> None:
+        """Refuse contents of unknown or silent vehicles, and a delay of too many time steps."""
+        v2x, tells = scenario.v2x, _value(scenario.v2x, "tells")
+        for name in tells if isinstance(tells, Mapping) else ():
+            right = f"unknown vehicle; this scenario has vehicle_1 ... vehicle_{scenario.vehicles}"
+            require(name in scenario.vehicle_names, ("v2x", "tells", name), UNSHOWN, right)
+            equipage = (v2x.vehicles or {}).get(name)
+            right = f"has no effect, because {name} sends no messages (v2x.vehicles); leave it out"
+            require(equipage is None or equipage.sends, ("v2x", "tells", name), UNSHOWN, right)
+        kept = _kept(scenario)
+        right = (
+            f"a message takes {kept - 3} time steps; at most {MOST_SAMPLES - 3} are possible, so shorten the delay of"
+            " messages or lengthen time_step_s"
+        )
+        require(kept <= MOST_SAMPLES, ("v2x",), v2x, right)
+
+    def check_alike(self, where: str, first: Scenario, other: Scenario) -> None:
+        """Raise ``InvalidInput`` unless both scenarios keep as many samples."""
+        if _kept(first) != _kept(other):
+            raise InvalidInput(
+                f"{where}: v2x.persistence, and the delay of periodic messages, must be the same in all scenarios of"
+                f" the mixture, but {first.name} and {other.name} differ; to use one v2x for all, write it next to the"
+                " key mixture"
+            )
+
+    def at_alert(self, scenario: Scenario, numbers: Numbers, equipped: Equipped, n: int) -> Memory:
+        """Return the memory of n worlds at the alert."""
+        N, v2x, of = scenario.vehicles, scenario.v2x, scenario.v2x.channel
+        heard, seen = of.heard_and_seen(numbers(PER_LINK * N * N, NEWS), equipped)
+        channel: Floats = np.zeros((n, CHANNEL_COLUMNS))
+        if _is_periodic(v2x):
+            channel[:, PERIOD], channel[:, DELAY] = of.message_period_s, _delay_s(v2x)
+            channel[:, LOSS_BEGINS], channel[:, LOSS_ENDS] = of.loss_begins, of.loss_ends
+            channel[:, KEY] = numbers(OF_WORLD, LATER_LOSSES)[:, 0] * 2.0**53
+        return silent(_contents(scenario), heard, seen, channel, _kept(scenario))
+
+    def game(self, game: Game) -> Game:
+        """Return the game with messages."""
+        return GameWithMessages.of(game)
+
+
+def _value(v2x: V2X, key: str) -> Any:
+    return (v2x.model_extra or {}).get(key)
+
+
+def _is_periodic(v2x: V2X) -> bool:
+    return bool(_value(v2x, "persistence") == "periodic")
+
+
+def _delay_s(v2x: V2X) -> float:
+    channel = v2x.channel
+    on_the_way = channel.radio_s + channel.processing_s + channel.actuation_s
+    return channel.link_latency_s if channel.timing == "fixed" else on_the_way
+
+
+def _kept(scenario: Scenario) -> int:
+    return samples_kept(_delay_s(scenario.v2x), scenario.time_step_s) if _is_periodic(scenario.v2x) else 0
+
+
+def _contents(scenario: Scenario) -> Bools:
+    """Return whether messages of each vehicle contain each piece, [N, PIECES]."""
+    tells = _value(scenario.v2x, "tells")
+    each = (
+        tells
+        if isinstance(tells, Mapping)
+        else dict.fromkeys(scenario.vehicle_names, USUAL if tells is None else tells)
+    )
+    return np.array([[piece in each.get(name, USUAL) for piece in PIECES] for name in scenario.vehicle_names])
+
+
+MESSAGES = Messages()

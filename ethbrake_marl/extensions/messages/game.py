@@ -1,0 +1,167 @@
+"""A game with messages: vehicles observe, and scripts act on, what they believe."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.episode.features import GROUPS, Own, side_of
+from ethbrake_marl.episode.game import Game, Script
+from ethbrake_marl.episode.observe import Observations, Plan, View
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.step import Step
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.messages.belief import ages_s, believed, believed_whole, known_pieces, require_pieces
+from ethbrake_marl.extensions.messages.links import (
+    NAME,
+    P_ACCELERATION,
+    P_BRAKING,
+    P_LATENCY,
+    P_MASS,
+    P_PLACE,
+    P_SPEED,
+    PIECES,
+    Memory,
+    after_step,
+    begun,
+)
+from ethbrake_marl.motion.layout import Bools, Floats, Ints
+
+STOPS = [P_PLACE, P_SPEED, P_BRAKING, P_LATENCY]
+NEEDS = {  # feature of a neighbour -> pieces without which it reads 0
+    "gap": [P_PLACE],
+    "closing_speed": [P_SPEED],
+    "acceleration": [P_ACCELERATION],
+    "braking_capacity": [P_BRAKING],
+    "mass": [P_MASS],
+    "latency_left": [P_LATENCY],
+    "stopping_margin": STOPS,
+    "fitting_deceleration": STOPS,
+}
+
+
+class GameWithMessages(Game):
+    """A game whose states hold the ``Memory`` of messages."""
+
+    __slots__ = ()
+
+    @classmethod
+    def of(cls, game: Game) -> GameWithMessages:
+        """Return the game with vehicles and scripts that believe what messages and sensors tell them."""
+        views = tuple(BelievedView(view) for view in game.views)
+        return cls(*game._replace(views=views, scripts={i: Believer(script) for i, script in game.scripts.items()}))
+
+    def first_decision(self, alert: State) -> State:
+        """Return the episodes at their first decision, with what has been received by then."""
+        state = super().first_decision(alert)
+        if not state.memories[NAME].is_periodic:
+            return state
+        return _remembering(state, begun(alert, state.time_s, self.rules.time_step_s))
+
+    def follow(self, state: State, actions: Floats, *, donate: bool = False) -> tuple[State, Step]:
+        """Return the state after one step, and what the step did. The memory of ``state`` is not reused."""
+        after, step = super().follow(state, actions)
+        return believed_after(state, after), step
+
+    def own_infos(self, state: State) -> dict[str, Any]:
+        """Return the infos of messages, and those of the shield.
+
+        ``known_from_s_vehicle_2`` is the time from which a vehicle acts on news of Vehicle 2 (s), ``age_s_vehicle_2``
+        the age of its newest news with periodic messages (s); infinite: never, none.
+        """
+        infos = super().own_infos(state)
+        reports = {"known_from_s": state.know}
+        if state.memories[NAME].is_periodic:
+            reports["age_s"] = ages_s(state)
+        for name, values in reports.items():
+            infos |= {f"{name}_vehicle_{j}": values[:, 1:, j] for j in range(1, values.shape[2])}
+        return infos
+
+
+def believed_after(before: State, after: State) -> State:
+    """Return the state after a step with the memory of what arrived in it."""
+    return _remembering(after, after_step(before, after)) if before.memories[NAME].is_periodic else after
+
+
+def _remembering(state: State, memory: Memory) -> State:
+    return state._replace(memories={**state.memories, NAME: memory})
+
+
+class BelievedView(View):
+    """A view of what the observer believes. A feature reads 0 if it needs a piece that the observer does not know.
+
+    Groups of other packages see a body only if the observer knows all pieces but its intent.
+    """
+
+    def __init__(self, view: View) -> None:
+        super().__init__(view.names)
+        columns = np.arange(len(self.names))
+        far = np.array([name.partition(".")[0] in GROUPS for name in self.names])
+        self.parts = [
+            (kind([self.names[c] for c in columns[rows]]), columns[rows], belief)
+            for kind, rows, belief in ((PieceView, ~far, believed), (View, far, believed_whole))
+            if rows.any()
+        ]
+        split = [name.partition(".") for name in self.names]
+        self.needs = [
+            (column, offset, NEEDS[last])
+            for column, (side, _, last) in enumerate(split)
+            if (offset := side_of(side)) is not None and last in NEEDS
+        ]
+
+    def observe(self, state: State, observers: Ints, time_step_s: float) -> Observations:
+        """Return the observations of the bodies ``observers`` (1: Vehicle 1), [n, observers, F]."""
+        seen = np.empty((state.n, len(observers), len(self.names)), np.float32)
+        for o, body in enumerate(observers.tolist()):
+            known = known_pieces(state, body)
+            for view, columns, belief in self.parts:
+                seen[:, o, columns] = view.observe(belief(state, body), np.array([body]), time_step_s)[:, 0]
+            for column, offset, pieces in self.needs:
+                if 0 < body + offset < known.shape[1]:
+                    seen[~known[:, body + offset, pieces].all(axis=1), o, column] = 0.0
+        return seen
+
+
+class PieceView(View):
+    """A view in which a neighbour's feature that is NaN, for lack of a piece, has the value of an unknown neighbour."""
+
+    @cached_property
+    def plan(self) -> Plan:
+        """How this view is computed."""
+        plan = View(self.names).plan
+        return plan._replace(own=tuple((c, _or_unknown(own), offset, known) for c, own, offset, known in plan.own))
+
+
+def _or_unknown(own: Own) -> Own:
+    def function(state: State, body: int, other: int) -> Floats:
+        value = np.asarray(own.function(state, body, other))
+        return np.where(np.isnan(value) & _is_partly_known(state, other), own.unknown, value)
+
+    return own if own.of == "own" else own._replace(function=function)
+
+
+def _is_partly_known(state: State, other: int) -> Bools:
+    parts = (state.line[:, :, other], state.car[:, :, other], state.wanted[:, [other]])
+    return np.asarray(np.isnan(np.concatenate(parts, axis=1)).any(axis=1))
+
+
+class Believer:
+    """A script that acts on what its vehicle believes."""
+
+    def __init__(self, script: Script) -> None:
+        self.script = script
+
+    def begin(self, alert: State, body: int) -> Any:
+        """Return the script's memory for new episodes."""
+        return self.script.begin(believed(alert, body), body)
+
+    def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
+        """Return the commands [n] m/s2 and the new memory. Raises ``InvalidInput`` for a script that needs more."""
+        commands, memory = self.script.act(believed(state, body), memory, body)
+        if not np.isfinite(commands).all():
+            who = f"script of vehicle_{body}"
+            require_pieces(state, [body], who, PIECES[:-1])
+            raise InvalidInput(f"{who}: its command is not finite; it must use only what vehicle_{body} knows")
+        return commands, memory

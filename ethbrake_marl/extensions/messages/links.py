@@ -1,0 +1,280 @@
+"""What goes over the links: samples of all vehicles, which message arrives when, and where its sender may be now.
+
+A vehicle samples itself at the alert and at every decision, also at those before the first one. On each link a message
+is sent once per period, and used after a delay; it contains the newest sample of its sender. A link is good or bad
+(Gilbert-Elliott model): with each message after the first, a good link turns bad with probability p, and a bad one good
+with probability r. What is sent over a bad link is lost. A neighbour in sight is measured at every decision.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.episode.state import TIME, State
+from ethbrake_marl.episode.step import advance_worlds, failure
+from ethbrake_marl.motion.compiling import kernel, large
+from ethbrake_marl.motion.drive import solo
+from ethbrake_marl.motion.forces import ROUNDING_S
+from ethbrake_marl.motion.layout import (
+    BRAKE_RATE,
+    FAR_M,
+    FORCE,
+    GAP,
+    HIT,
+    LATENCY,
+    LIMIT,
+    OWN_LATENCY,
+    RELEASE_RATE,
+    SPEED,
+    Bools,
+    Floats,
+    scratch_for,
+)
+
+NAME = "messages"  # of the memory in `State.memories`
+
+PIECES = ("place", "speed", "acceleration", "braking_capacity", "latency", "mass", "intent")  # parts of a message
+P_PLACE, P_SPEED, P_ACCELERATION, P_BRAKING, P_LATENCY, P_MASS, P_INTENT = range(len(PIECES))
+
+# rows of a sample: one body at one moment
+AT = 0  # time of the sample (s); infinite: there is none
+PLACE = 1  # of its front (m along the road; 0 is the front of Vehicle 1 at the alert, lengths of vehicles not counted)
+SAMPLE_SPEED = 2  # m/s
+SAMPLE_FORCE = 3  # m/s2
+OBSTACLE_HIT = 4  # 1 once Vehicle 1 has hit the obstacle
+INTENT = 5  # command chosen at the last decision (m/s2); the rows before it can be measured
+SAMPLE_ROWS = 6
+
+# columns of `Memory.channel`
+PERIOD = 0  # time between two messages of a link (s); 0: what is known is always the present state
+DELAY = 1  # time from sending a message to its use (s)
+LOSS_BEGINS = 2  # p
+LOSS_ENDS = 3  # r
+KEY = 4  # whole number below 2^53 that decides which messages are lost
+CHANNEL_COLUMNS = 5
+
+# rows of `Memory.links`
+SENT = 0  # time at which the next message is sent (s); infinite: none
+NUMBER = 1  # its number; message 0 always arrives
+BAD = 2  # 1 while the link is bad
+LINK_ROWS = 3
+
+POST_M = 1e6  # gap to a post ahead of the line, out of reach; what the gap loses is the way of Vehicle 1
+ON_GRID = 1e-9  # two moments that are closer are the same (s)
+
+
+class Memory(NamedTuple):
+    """What the vehicles of n worlds have sent and received. In arrays of links, [.., i, j] is what i receives of j."""
+
+    contents: Bools  # [n, N + 1, PIECES] whether messages of a body contain the piece
+    heard_s: Floats  # [n, N + 1, N + 1] when the first message can be used (s); infinite: never
+    seen_s: Floats  # [n, N + 1, N + 1] when i begins to measure j (s); infinite: never
+    channel: Floats  # [n, CHANNEL_COLUMNS]
+    links: Floats  # [n, LINK_ROWS, N + 1, N + 1]
+    news: Floats  # [n, SAMPLE_ROWS, N + 1, N + 1] the newest sample received; AT below 0: none
+    samples: Floats  # [n, L, SAMPLE_ROWS, N + 1] the last L samples, newest first; L is 0 without periodic messages
+
+    @property
+    def is_periodic(self) -> bool:
+        """Whether what is known may be old."""
+        return self.samples.shape[1] > 0
+
+
+def samples_kept(delay_s: float, time_step_s: float) -> int:
+    """Return how many samples must be kept so that every message in time contains one: those of a delay, and three."""
+    return math.ceil(delay_s / time_step_s - ON_GRID) + 3
+
+
+def silent(contents: Bools, heard_s: Floats, seen_s: Floats, channel: Floats, kept: int) -> Memory:
+    """Return the memory at the alert, before anything is sent. ``contents`` is [N, PIECES], times are [n, N, N]."""
+    n, N = heard_s.shape[:2]
+    whole = np.ones((n, N + 1, len(PIECES)), np.bool_)
+    whole[:, 1:] = contents
+    heard, seen = np.full((2, n, N + 1, N + 1), np.inf)
+    others = ~np.eye(N, dtype=np.bool_)
+    heard[:, 1:, 1:], seen[:, 1:, 1:] = np.where(others, heard_s, np.inf), np.where(others, seen_s, np.inf)
+    links, news = np.zeros((n, LINK_ROWS, N + 1, N + 1)), np.zeros((n, SAMPLE_ROWS, N + 1, N + 1))
+    samples = np.zeros((n, kept, SAMPLE_ROWS, N + 1))
+    links[:, SENT], news[:, AT], samples[:, :, AT] = heard - channel[:, DELAY, np.newaxis, np.newaxis], -1.0, np.inf
+    return Memory(whole, heard, seen, channel, links, news, samples)
+
+
+def present(state: State) -> Floats:
+    """Return the sample of all bodies now, [n, SAMPLE_ROWS, N + 1]; places are relative to Vehicle 1.
+
+    The intent of a vehicle is its last command. Before it knows of the alert, it has none: 0.
+    """
+    sample = np.zeros((state.n, SAMPLE_ROWS, state.vehicles + 1))
+    latency, time = state.car[:, LATENCY], state.time_s[:, np.newaxis]
+    waits = (latency > state.car[:, OWN_LATENCY]) & ~((latency <= 0.0) | (latency < time - ROUNDING_S))
+    sample[:, AT], sample[:, SAMPLE_SPEED], sample[:, SAMPLE_FORCE] = time, state.line[:, SPEED], state.line[:, FORCE]
+    sample[:, OBSTACLE_HIT], sample[:, INTENT] = state.line[:, HIT, :1], np.where(waits, 0.0, state.wanted)
+    sample[:, PLACE, 0], sample[:, PLACE, 2:] = state.line[:, GAP, 0], -np.cumsum(state.gaps_m, axis=1)
+    return sample
+
+
+def begun(alert: State, start_s: Floats, time_step_s: float) -> Memory:
+    """Return the memory at the first decision, ``start_s`` [n]: with what has been received since the alert.
+
+    ``alert.wanted`` is commanded until then.
+    """
+    memory, line = _own(alert.memories[NAME]), alert.line.copy()
+    force = np.where(alert.car[:, LATENCY] <= 0.0, alert.wanted, 0.0)
+    rate = np.where(force < line[:, FORCE], alert.car[:, BRAKE_RATE], alert.car[:, RELEASE_RATE])
+    line[:, FORCE] = np.where(np.isinf(rate), force, line[:, FORCE])
+    memory.samples[:, 0, PLACE, 0] = line[:, GAP, 0]
+    state = alert._replace(line=line)
+    _sample(memory, state, np.zeros(alert.n), np.ones(alert.n, np.bool_))
+    steps = np.ceil(start_s / time_step_s - 1e-6)
+    for left in range(int(steps.max()) - 1, -1, -1):
+        rows = steps > left
+        state, way = _advanced(state, np.where(rows, start_s - left * time_step_s, state.time_s))
+        _sample(memory, state, way, rows)
+    return memory
+
+
+def after_step(before: State, after: State) -> Memory:
+    """Return the memory after a step."""
+    memory = _own(before.memories[NAME])
+    _, way = _advanced(before._replace(wanted=after.wanted), after.time_s)
+    _sample(memory, after, way, after.time_s > before.time_s)
+    return memory
+
+
+def _own(memory: Memory) -> Memory:
+    return memory._replace(links=memory.links.copy(), news=memory.news.copy(), samples=memory.samples.copy())
+
+
+def _advanced(state: State, until_s: Floats) -> tuple[State, Floats]:
+    """Return the state at ``until_s`` [n], and the way of Vehicle 1, [n] m: what the gap to a post ahead loses."""
+    line, clock = state.line.copy(), state.clock.copy()
+    line[line[:, GAP, 0] >= FAR_M, GAP, 0] = POST_M
+    way = line[:, GAP, 0].copy()
+    failed = advance_worlds(line, state.car, state.time_s.copy(), until_s, state.wanted, scratch_for(line.shape[2]))
+    if failed >= 0:
+        raise failure(state, failed, state.time_s[failed], until_s[failed])
+    clock[:, TIME] = until_s
+    way -= line[:, GAP, 0]
+    return state._replace(line=line, clock=clock), way
+
+
+def _sample(memory: Memory, state: State, way_m: Floats, rows: Bools) -> None:
+    """Add the sample of the worlds ``rows`` now, ``way_m`` after the last one, and receive what arrives; in place."""
+    sample, samples = present(state), memory.samples
+    sample[:, PLACE, 1:] += (samples[:, 0, PLACE, 1] + way_m)[:, np.newaxis]
+    sample[:, PLACE, 0] = samples[:, 0, PLACE, 0]
+    samples[rows, 1:] = samples[rows, :-1]
+    samples[rows, 0] = sample[rows]
+    receive_worlds(rows, state.time_s.copy(), memory.channel, memory.seen_s, samples, memory.links, memory.news)
+
+
+def newest(state: State, observer: int) -> Floats:
+    """Return the newest sample of each body that the observer has, [n, SAMPLE_ROWS, N + 1]."""
+    memory: Memory = state.memories[NAME]
+    if not memory.is_periodic:
+        return present(state)
+    news = memory.news[:, :, observer].copy()
+    news[:, :, observer], news[:, PLACE, 0] = memory.samples[:, 0, :, observer], memory.samples[:, 0, PLACE, 0]
+    return news
+
+
+def estimated(state: State, observer: int, known: Bools, news: Floats) -> Floats:
+    """Return the lines as the observer estimates them from what it knows (``estimate_worlds``)."""
+    line, bodies, aged = state.line.copy(), known.shape[1], state.memories[NAME].is_periodic
+    working = np.empty(bodies), np.empty(bodies, np.bool_)
+    estimate_worlds(observer, state.time_s.copy(), state.car[:, LIMIT].copy(), known, news, aged, line, *working)
+    return line
+
+
+@large
+def receive_worlds(rows, time, channel, seen, samples, links, news):
+    """Receive all messages that can be used by ``time``, and measure who is in sight, in the worlds ``rows``."""
+    bodies = news.shape[3]
+    for k in range(len(rows)):
+        for link in range(bodies * bodies if rows[k] else 0):
+            i, j = link // bodies, link % bodies
+            while links[k, SENT, i, j] + channel[k, DELAY] <= time[k] + ON_GRID:
+                number, bad = links[k, NUMBER, i, j], links[k, BAD, i, j] == 1.0
+                if number > 0.0:
+                    u = chance(channel[k, KEY], (i - 1) * (bodies - 1) + j - 1, number)
+                    bad = u >= channel[k, LOSS_ENDS] if bad else u < channel[k, LOSS_BEGINS]
+                if not bad:
+                    take_sample(samples[k], news[k], i, j, links[k, SENT, i, j], SAMPLE_ROWS)
+                links[k, BAD, i, j] = 1.0 if bad else 0.0
+                links[k, NUMBER, i, j] += 1.0
+                links[k, SENT, i, j] += channel[k, PERIOD]
+            if seen[k, i, j] <= time[k]:
+                take_sample(samples[k], news[k], i, j, time[k], INTENT)
+
+
+@kernel
+def take_sample(samples, news, i, j, sent, rows):
+    """Let i receive the newest sample of j that is not after ``sent`` (s): all its rows, or those that are measured."""
+    for s in range(samples.shape[0]):
+        if samples[s, AT, j] <= sent + ON_GRID:
+            for row in range(rows):
+                news[row, i, j] = samples[s, row, j]
+            return
+
+
+@kernel
+def chance(key, link, number):
+    """Return the number in [0, 1) that decides whether message ``number`` of a link is lost: a SplitMix64 hash."""
+    z = np.uint64(key) ^ (np.uint64(link + 1) * np.uint64(0x9E3779B97F4A7C15))
+    z ^= np.uint64(number + 1.0) * np.uint64(0xD1342543DE82EF95)
+    for _ in range(2):
+        z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        z ^= z >> np.uint64(31)
+    return float(z >> np.uint64(11)) * 2.0**-53
+
+
+@kernel
+def moved_on(speed, force, limit, duration):
+    """Return a vehicle's speed (m/s) and way (m) after ``duration`` (s) without contact, under a constant force.
+
+    One that moves backward brakes until it is at rest, whatever the sign of its force.
+    """
+    if speed >= 0.0:
+        after, way, _ = solo(speed, force, 0.0, limit, duration)
+        return after, way
+    force = abs(force)
+    braking = min(duration, -speed / force) if force > 0.0 else duration
+    return min(speed + force * braking, 0.0), (speed + 0.5 * force * braking) * braking
+
+
+@large
+def estimate_worlds(observer, time, limit, known, news, aged, line, place, fresh):
+    """Write lines as the body ``observer`` estimates them to ``line``, which holds the true ones.
+
+    From the newest sample of each body, ``news`` [n, SAMPLE_ROWS, N + 1], it goes on with the same force and without
+    contact. Between two samples of now the gap is the true one. A place that is not ``known`` [n, N + 1, PIECES] is
+    that of the next body towards the observer, a speed or force 0. If news may be old (``aged``), the observer knows
+    of no impact between others.
+    """
+    bodies = line.shape[2]
+    for k in range(len(time)):
+        place[observer], fresh[observer] = news[k, PLACE, observer], True
+        for way in (-1, 1):
+            j = observer + way
+            while 0 < j < bodies:
+                age = time[k] - news[k, AT, j]
+                force = news[k, SAMPLE_FORCE, j] if known[k, j, P_ACCELERATION] else 0.0
+                speed, passed = 0.0, 0.0
+                if known[k, j, P_SPEED]:
+                    speed, passed = moved_on(news[k, SAMPLE_SPEED, j], force, limit[k, j], age)
+                place[j] = news[k, PLACE, j] + passed if known[k, j, P_PLACE] else place[j - way]
+                fresh[j] = known[k, j, P_PLACE] and age <= 0.0
+                line[k, SPEED, j], line[k, FORCE, j] = speed, force
+                j += way
+        for p in range(1, bodies - 1):
+            if not (fresh[p] and fresh[p + 1]):
+                line[k, GAP, p] = max(place[p] - place[p + 1], 0.0)
+            if aged and p != observer and p + 1 != observer:
+                line[k, HIT, p] = 0.0
+        if observer > 1:
+            line[k, GAP, 0] = max(news[k, PLACE, 0] - place[1], 0.0) if known[k, 1, P_PLACE] else FAR_M
+            line[k, HIT, 0] = news[k, OBSTACLE_HIT, 1]
