@@ -101,7 +101,7 @@ class TrainingJob:
     def attempt(self) -> str:
         """Start or continue the training run until it ends. Return "", or the reason if the training run fails.
 
-        A finished run fails if its results are damaged. Raises ``KeyboardInterrupt`` if Ctrl-C stopped the training run.
+        A finished run with damaged results fails too. Raises ``KeyboardInterrupt`` if Ctrl-C stopped the training run.
         """
         try:
             if self.steps_left() and not self.finish():
@@ -114,7 +114,8 @@ class TrainingJob:
     def result(self) -> dict[str, float]:
         """Return the evaluation of the saved policy, the best one in the finished training run.
 
-        The entries are ``steps``, ``harm`` (the quantity that the saved policy has least) and the measures. Raises ``InvalidInput`` if they cannot be read.
+        The entries are ``steps``, ``harm`` (the quantity that the saved policy has least) and the measures. Raises
+        ``InvalidInput`` if they cannot be read.
         """
         try:
             return self._result()
