@@ -39,6 +39,8 @@ def read_jobs(args: argparse.Namespace) -> list[TrainingJob]:
         jobs.append(TrainingJob(training, args.output.absolute() / name, settings.texts))
     if not jobs or len({job.folder for job in jobs}) < len(jobs):
         raise InvalidInput("a sweep needs at least one seed, and each scenario and each recipe only once")
+    if args.jobs is not None and args.jobs < 1:
+        raise InvalidInput(f"--jobs {args.jobs}: must be 1 or more")
     return jobs
 
 
@@ -55,7 +57,7 @@ def sweep(args: argparse.Namespace) -> int:
             failed += bool(reason)
             recipe, scenario = job.training.recipe, job.training.scenario
             about = {"run": job.folder.name, "scenario": scenario.name, "recipe": recipe.name, "seed": recipe.seed}
-            rows.append({**about, **({} if reason else job.result()), "reason": reason})
+            rows.append({**about, "reason": reason, **({} if reason else job.result())})
             print(f"{len(rows)} of {len(jobs)}: {job.folder.name}: {reason or 'finished'}", flush=True)
         write_file(args.output / "results.csv", csv_text(rows).encode())
     return failed

@@ -42,6 +42,8 @@ def read_search(text: str) -> tuple[str, BaseDistribution]:
 def tune(args: argparse.Namespace) -> None:
     """Train until ``--trials`` trials have ended, and write ``trials.csv``."""
     space, loaded = dict(map(read_search, args.search)), load_recipe(args.recipe)
+    if min(args.jobs, args.trials) < 1 or len(space) < len(args.search):
+        raise InvalidInput("--jobs and --trials must be 1 or more, and --search must name each key only once")
     settings = read_settings(args.set, [loaded])
     scenario, recipe = load_runnable(args.scenario, settings.scenario), settings.change(loaded)
 
@@ -55,8 +57,12 @@ def tune(args: argparse.Namespace) -> None:
             job({key: value})
     question = {"training": job({}).training.content(), "search": args.search, "jobs": args.jobs}
     with StudyFolder(args.output, "a tuning", question, writes=("trials.csv",)).work():
-        storage = JournalStorage(JournalFileBackend(str(args.output / "optuna.log")))
-        study = optuna.create_study(storage=storage, study_name="tuning", load_if_exists=True)
+        log = args.output / "optuna.log"
+        try:
+            storage = JournalStorage(JournalFileBackend(str(log)))
+            study = optuna.create_study(storage=storage, study_name="tuning", load_if_exists=True)
+        except (ValueError, KeyError) as error:
+            raise InvalidInput(f"{log}: is damaged ({error}); delete it, and finished trials are kept") from None
         while (ended := sum(each.state.is_finished() for each in study.trials)) < args.trials:
             while (number := len(study.trials)) < min(args.trials, (ended // args.jobs + 1) * args.jobs):
                 study.sampler = optuna.samplers.TPESampler(seed=number, constant_liar=True)

@@ -29,6 +29,8 @@ CAR_M, LEAST_CARS = (2.5, 8.0), 1 / 3
 # speeds. The time to the next row may be too long for this check.
 CHECK_S = 1.0
 
+LATEST = 2.0**53  # times, and numbers of ticks, below this are exact
+
 OFF = 0.05  # largest accepted distance of a time from a tick, in ticks
 
 
@@ -76,8 +78,11 @@ def read_recording(file: Path, entry: Format, every_s: float, progress: Callable
     """
     source = open_source(file, entry)
     first = [quantity for quantity in ("time", "location") if quantity in source.at]
-    moments = (each["time"].unique() for each in read_columns(source, entry, first, progress))
-    times = np.unique(np.concatenate([np.empty(0), *moments]))
+    moments = [np.empty(0)]
+    for piece in read_columns(source, entry, first, progress):
+        source.refuse(abs(piece["time"]) > LATEST, "time", piece["time"], "must be between -2^53 and 2^53")
+        moments.append(piece["time"].unique())
+    times = np.unique(np.concatenate(moments))
     if not len(times):
         right = f" except those from {' and '.join(entry.streets)}, which have crossings" * bool(entry.streets)
         raise InvalidInput(f"{file}: contains no rows of data{right}")
@@ -89,6 +94,8 @@ def read_recording(file: Path, entry: Format, every_s: float, progress: Callable
     for piece in read_columns(source, entry, list(source.at), progress):
         ticks = (piece["time"] - times[0]) * entry.ticks
         whole = ticks.round()
+        right = f"is more than 2^53 steps of {1 / entry.hertz:g} s after the first time"
+        source.refuse(whole > LATEST, "time", piece["time"], right)
         right = f"must be a multiple of {1 / entry.hertz:g} s after the first time"
         source.refuse(abs(ticks - whole) > OFF, "time", piece["time"], right)
         pieces.append(piece.assign(tick=whole.astype("int64"))[np.isin(whole % stride, (0, near % stride))])

@@ -36,17 +36,17 @@ def watch_command(
     The film shows the road to scale, the commands, the impacts and the harm. A PNG file shows three moments: the alert,
     the hardest impact, and the end.
     """
-    # imported here, because matplotlib takes a second to load and most commands do not draw
     from ethbrake_marl.extensions.report.film import check_film, film
 
     with Out(force=force) as out:
         out.check(output)
         check_film(output.suffix.lower())
+        what = "pictures" if output.suffix.lower() == ".png" else "film"
         task = read_task(scenario, settings)
         worlds = task.scenario.sample(1, seed, first=world).worlds
         named = make_drivers(agents, task).items()
         titled = {f"{name}: world {world} of {task.scenario.name}": agent for name, agent in named}
-        out.write(output, film(worlds, titled, output.suffix.lower(), scenario=task.scenario), what="film")
+        out.write(output, film(worlds, titled, output.suffix.lower(), scenario=task.scenario), what=what)
 
 
 WATCH = Part(watch_command, epilog=example("watch --agents full_brake,e_v2x_bm --world 3 --output both.gif"))

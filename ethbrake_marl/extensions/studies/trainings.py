@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from ethbrake_marl.errors import EthBrakeError, InvalidInput
+from ethbrake_marl.errors import EthBrakeError, InvalidInput, plain_text
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.parallel import run_each
@@ -101,11 +101,12 @@ class TrainingJob:
     def attempt(self) -> str:
         """Start or continue the training run until it ends. Return "", or the reason if the training run fails.
 
-        Raises ``KeyboardInterrupt`` if Ctrl-C stopped the training run.
+        A finished run with damaged results fails too. Raises ``KeyboardInterrupt`` if Ctrl-C stopped the training run.
         """
         try:
             if self.steps_left() and not self.finish():
                 raise KeyboardInterrupt
+            self.result()
         except EthBrakeError as error:
             return str(error)
         return ""
@@ -113,9 +114,21 @@ class TrainingJob:
     def result(self) -> dict[str, float]:
         """Return the evaluation of the saved policy, the best one in the finished training run.
 
-        The entries are ``steps``, ``harm`` (the quantity that the saved policy has least) and the measures.
+        The entries are ``steps``, ``harm`` (the quantity that the saved policy has least) and the measures. Raises
+        ``InvalidInput`` if they cannot be read.
         """
+        try:
+            return self._result()
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            progress = RunDirectory(self.folder).progress
+            raise InvalidInput(
+                f"{progress}: is damaged ({plain_text(str(error))}); delete the run's folder to train again"
+            ) from None
+
+    def _result(self) -> dict[str, float]:
         measured = [row for row in RunDirectory(self.folder).rows() if row.get("eval/total_harm")]
+        if not measured:
+            raise ValueError("it contains no evaluation")
         harm = RunDirectory.chosen_by(measured, self.training.recipe.reward.harm_count, "eval/")
         best = min(measured, key=lambda row: float(row[harm]))
         measures = ("first_impact_harm", "total_harm", "collision_rate")

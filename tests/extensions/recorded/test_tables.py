@@ -155,6 +155,11 @@ WRONG = {
         one_more("d", 1.0, "E1_0", 150.0, "5 m", 20.0),
         "line 17, column l: must be a finite number, but is '5 m'",
     ),
+    "late": (one_more("d", 1e308, "E1_0", 150.0, 5, 20.0), r"line 17, column t: 1e\+308 must be between -2\^53 and"),
+    "too late": (
+        [*one_more("d", 1.0001, "E1_0", 150.0, 5, 20.0), ("d", 1e15, "E1_0", 150.0, 5, 20.0)],
+        r"line 18, column t: 1e\+15 is more than 2\^53 steps of 0.0001 s after the first time",
+    ),
     "time": (
         one_more("d", 0.625, "E1_0", 150.0, 5, 20.0),
         "every = 0.8 s: the time between the moments that are read must be a multiple of 0.125 s",

@@ -88,6 +88,9 @@ def test_run__that_fails_is_a_row_with_its_reason(recipe: str, run: Run, tmp_pat
         ((*SWEEP, "ppp"), "'ppo'"),
         ((*SWEEP, "ppo", "ppo"), "only once"),
         ((*SWEEP, "ppo", "--set", "gama=1"), "gamma"),
+        ((*SWEEP, "ppo", "--jobs", "0"), "--jobs 0: must be 1 or more"),
+        ((*TUNE, "ppo", "--jobs", "0"), "--jobs and --trials must be 1 or more"),
+        ((*TUNE, "ppo", "--search", "gamma=0.9..1", "gamma=0.5/0.6"), "each key only once"),
         ((*TUNE, "ppo", "--search", "gamma=0.9"), "KEY=LOW..HIGH"),
         ((*TUNE, "ppo", "--search", "gamma=3..1"), "low <= high"),
         ((*TUNE, "ppo", "--search", "n_epochs=0..4"), "n_epochs"),
@@ -107,3 +110,33 @@ def test_tune__other_settings_in_its_folder_are_refused(recipe: str, run: Run, t
     script, *options = TUNE
     assert run(script, *options, recipe, "--trials", "1", "--output", tmp_path) == 0
     assert run(script, *options, recipe, "--set", "gae_lambda=0.5", "--output", tmp_path) == 2
+
+
+def test_sweep__damaged_results_of_a_finished_run_are_a_row_with_its_reason(
+    recipe: str, run: Run, tmp_path: Path
+) -> None:
+    script, *options = (*SWEEP, recipe, "--output", tmp_path)
+    assert run(script, *options) == 0
+    before = (tmp_path / "results.csv").read_text().splitlines()
+    (progress,) = tmp_path.glob("*-seed0-*/progress.csv")
+    head, *rows = progress.read_bytes().splitlines(keepends=True)
+    for damaged in (head, b"\xff\xfe", head + rows[-1].replace(b".", b"x")):
+        progress.write_bytes(damaged)
+        assert run(script, *options) == 1
+        now = (tmp_path / "results.csv").read_text().splitlines()
+        assert f"{progress}: is damaged (" in now[1] and "delete the run's folder" in now[1]
+        assert (now[0], now[2]) == (before[0], before[2])
+
+
+def test_tune__damaged_file_of_trials_is_one_error_and_can_be_deleted(
+    recipe: str, run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    script, *options = (*TUNE, recipe, "--trials", "1", "--output", tmp_path)
+    assert run(script, *options) == 0
+    before, log = results(tmp_path), tmp_path / "optuna.log"
+    for damaged in (b"\x81", log.read_bytes()[:-5] + b"\n{}\n", b"{}\n{}\n"):
+        log.write_bytes(damaged)
+        assert run(script, *options) == 2
+        assert f"{log}: is damaged (" in capsys.readouterr().err
+    log.unlink()
+    assert run(script, *options) == 0 and results(tmp_path) == before
