@@ -90,7 +90,7 @@ def rewards() -> list[Any]:
 @pytest.mark.parametrize("reward", rewards(), ids=str)
 @pytest.mark.parametrize("name", ["paper-random-obstacle", "cooperation-3-pair", "paper-random-buildup"])
 def test_rewards__are_those_of_the_first_edition(name: str, reward: Any) -> None:
-    counted = game_of(name, reward=reward)[1].rewarding.params.counted
+    counted = game_of(name, reward=reward)[1].rewarding.counted
     vector = ["harm_1", "harm_3", "pair_1_2", "obstacle", *counted]
     engine, game, state = both(name, 8, reward=reward, reward_vector=vector)
     rng = np.random.default_rng(1)
