@@ -28,7 +28,7 @@ def test_change__says_who_is_worse_off_and_by_how_much() -> None:
     assert (step["from"], step["to"], step["algorithm"]) == ("cooperation-0-sensors", "cooperation-1-front", "ppo")
     for count in ("first", "total"):
         change = step[count]
-        assert change["difference"]["mean"] == pytest.approx((0 - 4 + 1 + 0) / 4)
-        assert [each["mean"] for each in change["vehicles"]] == pytest.approx([-0.25, -1.25, 0.75])
-        assert change["worse_off"]["mean"] == 0.5  # worlds 0 and 2
+        assert change["difference"]["value"] == pytest.approx((0 - 4 + 1 + 0) / 4)
+        assert [each["value"] for each in change["vehicles"]] == pytest.approx([-0.25, -1.25, 0.75])
+        assert change["worse_off"]["value"] == 0.5  # worlds 0 and 2
         assert change["worse_off_vehicles"] == [0.0, 0.25, 0.25]
