@@ -4,12 +4,15 @@ from tests.test_same_bits import PACKAGE, SQUARES, TRAINED, calls_in
 
 SEARCHED = "a search, whose finds are written down as numbers"
 ROUNDED = "degrees to a direction; what is made of it is rounded to millimetres"
+DRAWN = "corners of a star in a picture, in half pixels"
 REMAINS = {
     ("learners/rollout_classification_model.py", "**"): TRAINED,
     ("learners/scout.py", "np.exp"): TRAINED,
     ("learners/vine_model.py", "**"): TRAINED,
     ("recorded/states.py", "np.cos"): ROUNDED,
     ("recorded/states.py", "np.sin"): ROUNDED,
+    ("rendering/picture.py", "math.cos"): DRAWN,
+    ("rendering/picture.py", "math.sin"): DRAWN,
     ("report/player.py", "**"): SQUARES,
     ("reproduction/trajectories.py", "**"): SQUARES,
     ("studies/falsification.py", "**"): SEARCHED,

@@ -175,7 +175,7 @@ def whole_road(state: State, row: int) -> tuple[float, float]:
     speeds, braking = state.speeds_mps[row], state.braking_capacity_mps2[row]
     behind = np.concatenate([[0.0], np.cumsum(state.gaps_m[row])])
     late = np.clip(state.latency_s[row] - state.time_s[row], 0.0, LATE_S)
-    ways = speeds * late + speeds**2 / (2.0 * braking) - behind
+    ways = speeds * late + speeds * speeds / (2.0 * braking) - behind
     left = -float(behind[-1]) - state.vehicles * BODY_M - BEHIND_M
     right = min(float(ways.max()), float(state.obstacle_gap_m[row])) + AHEAD_M
     return left, max(right, left + LEAST_WIDTH_M)
