@@ -96,7 +96,8 @@ OPTIONS: list[Any] = [
     {"initial_state": {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}},
     {"initial_state": {"gaps_m": [5, 6], "speeds_mps": 20, "mass_t": [1, 2, 3], "latency_s": [0, 0.2, 0.4]}},
     {"initial_state": {"gaps_m": [0, 0], "speeds_mps": [0, 0, 0]}},
-    {"initial_state": {"gaps_m": [-1, 7], "speeds_mps": 20}}, {"initial_state": {"gap_m": [7, 7]}}, {"initial_state": {"speeds_mps": 20}}, 5, {},
+    {"initial_state": {"gaps_m": [-1, 7], "speeds_mps": 20}}, {"initial_state": {"gap_m": [7, 7]}},
+    {"initial_state": {"speeds_mps": 20}}, 5, {},
     {"initial_state": {"gaps_m": 7}, "listed_world": {"seed": 1, "number": 1}},
 ]  # fmt: skip
 
