@@ -52,8 +52,7 @@ def numbers_of(seed: int, channel: str, attempt: int, index: Ints) -> Numbers:
         if count > len(index):
             integers = integers[index - first]
         integers >>= np.uint64(11)
-        u: Floats = integers.astype(np.float64)
-        u *= 2.0**-53
+        u: Floats = integers * 2.0**-53
         return u
 
     return numbers
