@@ -310,7 +310,7 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
 
     """
     worlds.refuse_build_up("avoidability")
-    check_covered(worlds, vehicle, scripts)
+    _check_covered(worlds, vehicle, scripts)
     v = worlds.vehicles
     onset = np.maximum(v.latency_s - worlds.time_s[:, None], 0.0)
     out = np.empty((worlds.n, RESULT_WIDTH))
@@ -328,7 +328,7 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
     return Avoidability(reason, out[:, MARGIN].copy(), switch, command)
 
 
-def check_covered(worlds: Worlds, vehicle: int, scripts: Mapping[int, str] | None) -> None:
+def _check_covered(worlds: Worlds, vehicle: int, scripts: Mapping[int, str] | None) -> None:
     """Raise ``InvalidInput`` for worlds that ``avoidability`` does not cover. Brake build-up is not checked."""
     # An obstacle that Vehicle 1 does not reach under full braking has no effect: only a push could bring Vehicle 1
     # there, and a push begins with an impact.
