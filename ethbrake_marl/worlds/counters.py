@@ -52,7 +52,6 @@ def numbers_of(seed: int, channel: str, attempt: int, index: Ints) -> Numbers:
         if count > len(index):
             integers = integers[index - first]
         integers >>= np.uint64(11)
-        u: Floats = integers * 2.0**-53
-        return u
+        return np.multiply(integers, 2.0**-53, dtype=np.float64)
 
     return numbers

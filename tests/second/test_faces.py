@@ -11,7 +11,7 @@ from ethbrake_marl.envs.gymnasium import EthBrakeEnv as FirstEnv
 from ethbrake_marl.envs.vector import EthBrakeVectorEnv as FirstVectorEnv
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.faces.gymnasium import EthBrakeEnv
-from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
+from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv, raw_env
 from ethbrake_marl.faces.sb3 import make_sb3_vec_env
 from ethbrake_marl.faces.vector import EthBrakeVectorEnv
 from ethbrake_marl.worlds.catalogue import load_scenario
@@ -57,6 +57,22 @@ def test_parallel_env__is_like_the_first(name: str, settings: dict[str, Any]) ->
         same(name, new.step(actions), old.step(actions))
         assert new.agents == old.agents
     same(name, new.reset(), old.reset())
+
+
+@pytest.mark.parametrize("name", ["paper-random", "cooperation-4-five"])
+def test_agents_in_turn__are_like_the_first(name: str) -> None:
+    old, new = eb.raw_env(name, agents="learners"), raw_env(name, agents="learners")
+    rng = np.random.default_rng(3)
+    old.reset(seed=3)
+    new.reset(seed=3)
+    for agent in old.agent_iter():
+        assert new.agent_selection == agent
+        found, expected = new.last(), old.last()
+        same(name, found, expected)
+        action = None if any(expected[2:4]) else draws(rng, 1)
+        old.step(action)
+        new.step(action)
+    assert new.agents == []
 
 
 @pytest.mark.parametrize(("name", "mode", "settings"), in_turn(ALONE, MODES, VECTOR))
