@@ -147,8 +147,10 @@ def potential(rules: Rules, state: State) -> Floats:
     """
     learners = rules.learners.tolist()
     rounds = 1 if len(learners) == 1 else 2
+    further = state.line.copy()
+    further[:, [FIRST, TOTAL]] = 0.0
     count = "total" if rules.total else "first"
-    return state.harm(count) - descend(state, learners, BRAKING_SHARES, rounds, rules.horizon_s, count)[1]
+    return -descend(state._replace(line=further), learners, BRAKING_SHARES, rounds, rules.horizon_s, count)[1]
 
 
 class Shaping(NamedTuple):

@@ -42,8 +42,6 @@ def same(name: str, found: Any, expected: Any, place: str = "") -> None:
             same(name, one.tolist(), other.tolist(), place)
         elif builds_up(name) and one.dtype.kind == "f":
             np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9, err_msg=place)
-        elif "shaping" in place:  # the harm of a look ahead is added up in another order
-            np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-11, err_msg=place)
         else:
             assert one.shape == other.shape and ((one == other) | ((one != one) & (other != other))).all(), place
 
