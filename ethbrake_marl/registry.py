@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from threading import RLock
 from typing import Any, TypeVar
 
 from ethbrake_marl.errors import (
@@ -29,6 +30,7 @@ from ethbrake_marl.errors import (
 )
 
 OURS = "ethbrake-marl"  # name of this distribution
+_LOCK = RLock()  # one thread at a time loads parts; their modules may look up others
 _VERSIONS: dict[str, str] = {}  # distribution -> version of the other packages whose parts this process has loaded
 
 T = TypeVar("T")
@@ -134,15 +136,16 @@ class Registry(Mapping[str, T]):
                 f"{self.kind} {name!r} is defined by several installed packages, {' and '.join(givers)};"
                 " uninstall all but one of them"
             )
-        if name in self.loaded or name in self._loading:
-            return [name]
-        if not candidates:
-            raise self.unknown(name)
-        self._loading.add(name)
-        try:
-            return self._load(name, candidates[0])
-        finally:
-            self._loading.discard(name)
+        with _LOCK:
+            if name in self.loaded or name in self._loading:  # by this thread
+                return [name]
+            if not candidates:
+                raise self.unknown(name)
+            self._loading.add(name)
+            try:
+                return self._load(name, candidates[0])
+            finally:
+                self._loading.discard(name)
 
     def _load(self, name: str, point: EntryPoint) -> list[str]:
         where = f"{self.kind} {name!r}, {point.value} of the installed package {giver(point)}"

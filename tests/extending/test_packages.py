@@ -3,6 +3,7 @@
 import json
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -91,6 +92,13 @@ def test_entry_point__is_loaded_when_its_name_is_used(install: Install, capsys: 
     scenario = eb.load_scenario("paper-random").replace(objective="front-first", roles={"vehicle_2": "gentle"})
     assert eb.make_engine(scenario, 3).scenario.objective == "front-first"
     assert run_command(["hi", "you"]) == 0 and capsys.readouterr().out == "hello you\n"
+
+
+def test_entry_point__is_loaded_once_by_several_threads(install: Install) -> None:
+    install("hills", f"import time\ntime.sleep(0.3)\n{HILLS}", agents=AGENTS)
+    with ThreadPoolExecutor(4) as pool:
+        made = [pool.submit(eb.make_agent, "gentle:0.8") for _ in range(4)]
+    assert [each.result().share for each in made] == [0.8] * 4  # type: ignore[union-attr]
 
 
 def test_entry_point__that_fails_is_named_and_breaks_nothing_else(
@@ -187,3 +195,4 @@ def test_scenario_recipe_and_bundle__run_no_file_that_they_name(tmp_path: Path) 
         with pytest.raises(InvalidInput):
             use()
     assert [path.name for path in tmp_path.iterdir()] == ["evil.py"]
+
