@@ -195,4 +195,3 @@ def test_scenario_recipe_and_bundle__run_no_file_that_they_name(tmp_path: Path) 
         with pytest.raises(InvalidInput):
             use()
     assert [path.name for path in tmp_path.iterdir()] == ["evil.py"]
-
