@@ -72,6 +72,10 @@ class Kind(NamedTuple):
     weights: Callable[[Floats, int, tuple[float, ...]], Floats] | None = None  # (car, vehicle, numbers) -> [n, N]; sums
     function: Callable[[Harm, int], Floats] | None = None  # of a registered objective
 
+    def __reduce__(self) -> tuple[Callable[[str], Kind], tuple[str]]:
+        """Pickle the name: functions need not be picklable."""
+        return _kind, (self.form.partition(":")[0],)
+
 
 class Objective(NamedTuple):
     """An objective as it is written, such as ``social:45``."""
@@ -93,6 +97,10 @@ class Objective(NamedTuple):
             )
         weights = self.kind.weights(car, vehicle, self.numbers)
         return np.broadcast_to(weights, (len(car), car.shape[2] - 1)).astype(np.float64)
+
+
+def _kind(name: str) -> Kind:
+    return OBJECTIVES[name]
 
 
 @lru_cache(maxsize=256)

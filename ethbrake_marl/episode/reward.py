@@ -207,8 +207,8 @@ class Rewarding(NamedTuple):
         rules = Rules(learners, *times, params.harm if whole else 0.0, params.terminal, total)
         settings = params.ttc_scale_s, params.safety_buffer_m, params.target_gap_m, params.distance_slope_per_m
         functions: dict[str, TermFunction] = {
-            "collision": lambda before, step, after: collision(step, params.k_energy),
-            "risk": lambda before, step, after: risk(after, *settings),
+            "collision": partial(collision, params.k_energy),
+            "risk": partial(risk, settings),
             "jerk": jerk,
             **{name: TERMS[name].value for name in params.terms},
         }

@@ -197,18 +197,37 @@ def step(
     decision. Raises ``InvalidInput`` for a bad action. ``state`` does not change, unless its memory is donated.
     """
     line, car, clock, know, wanted, memories = state
-    if not donate:
-        line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
+    shape = len(clock), len(rules.learners)
+    if not isinstance(actions, np.ndarray) or actions.shape != shape or actions.dtype.kind not in "fiu":
+        raise InvalidInput(f"actions = {actions!r:.60}: must be an array of numbers with the shape {shape}")
+    actions = actions.astype(np.float64, copy=False)
+    commands = {}
     if scripts:
         memories = dict(memories)
         for i, script in scripts.items():
-            wanted[:, i], memories[i] = script.act(state, memories[i], i)
+            commands[i], memories[i] = asked(script, state, memories[i], i)
+    if not donate:
+        line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
+    for i, command_mps2 in commands.items():
+        wanted[:, i] = command_mps2
     reward, out = np.empty((len(clock), wanted.shape[1] - 1)), np.empty((OUT_ROWS, len(clock)))
     failed = step_worlds(line, car, clock, wanted, actions, scratch_for(wanted.shape[1]), out, reward, *rules)
     if failed >= 0:
         _check_actions(rules, actions[failed])
         raise failure(state, failed, state.time_s[failed], clock[failed, TIME])
     return State(line, car, clock, know, wanted, memories), Step(reward, out, rules.time_step_s)
+
+
+def asked(script: Any, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
+    """Return the commands of a script, [n] m/s2, and its new memory. Raises ``InvalidInput`` for bad commands."""
+    given, memory = script.act(state, memory, body)
+    commands = np.asarray(given)
+    if commands.shape != (state.n,) or commands.dtype.kind not in "fiu" or not np.isfinite(commands).all():
+        raise InvalidInput(
+            f"script of vehicle_{body}: its commands are {given!r:.60}; must be finite numbers of the shape"
+            f" ({state.n},), in m/s2"
+        )
+    return commands, memory
 
 
 def _check_actions(rules: Rules, actions: Floats) -> None:

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -113,7 +114,7 @@ BUILT_IN = {  # name -> (unit, meaning)
 }
 
 
-def collision(step: Step, k_energy: float) -> Floats:
+def collision(k_energy: float, before: State, step: Step, after: State) -> Floats:
     """Return the term collision, [n]."""
     return -k_energy * step.total_harm
 
@@ -124,10 +125,9 @@ def jerk(before: State, step: Step, after: State) -> Floats:
     return -rate * rate
 
 
-def risk(
-    after: State, ttc_scale_s: float, safety_buffer_m: float, target_gap_m: float, distance_slope_per_m: float
-) -> Floats:
+def risk(settings: tuple[float, float, float, float], before: State, step: Step, after: State) -> Floats:
     """Return the term risk, [n, N]; tau, d_safe, d_target and k_d are the settings, in this order."""
+    ttc_scale_s, safety_buffer_m, target_gap_m, distance_slope_per_m = settings
     closing = after.speeds_mps[:, 1:] - after.speeds_mps[:, :-1]
     room = np.maximum(after.gaps_m - safety_buffer_m, 0.0)
     approaching = closing > 0.0
@@ -174,7 +174,11 @@ class Shaping(NamedTuple):
 
 def objective_term(objectives: Sequence[Objective], count: str) -> TermFunction:
     """Return the term harm of vehicles with objectives, [n, N]."""
-    return lambda before, step, after: -amounts(objectives, before, after, count)
+    return partial(_objective_term, objectives, count)
+
+
+def _objective_term(objectives: Sequence[Objective], count: str, before: State, step: Step, after: State) -> Floats:
+    return -amounts(objectives, before, after, count)
 
 
 def component(name: str, vehicles: int, count: str) -> TermFunction | None:
@@ -182,17 +186,21 @@ def component(name: str, vehicles: int, count: str) -> TermFunction | None:
     row = TOTAL if count == "total" else FIRST
     for k in range(vehicles):
         if name == f"harm_{k + 1}":
-            return lambda before, step, after: 0.0 - _borne(before, after, row, count)[:, k]
+            return partial(_borne, k, row, count)
     pairs = {"obstacle": 0, **{f"pair_{p}_{p + 1}": p for p in range(1, vehicles)}}
     if name not in pairs:
         return None
-    return lambda before, step, after: 0.0 - (after.line[:, row, pairs[name]] - before.line[:, row, pairs[name]])
+    return partial(_of_pair, pairs[name], row)
 
 
-def _borne(before: State, after: State, row: int, count: str) -> Floats:
+def _borne(vehicle: int, row: int, count: str, before: State, step: Step, after: State) -> Floats:
     since = after.line.copy()
     since[:, row] -= before.line[:, row]
-    return after._replace(line=since).borne_harm(count)
+    return 0.0 - after._replace(line=since).borne_harm(count)[:, vehicle]
+
+
+def _of_pair(pair: int, row: int, before: State, step: Step, after: State) -> Floats:
+    return 0.0 - (after.line[:, row, pair] - before.line[:, row, pair])
 
 
 def components_of(vector: Any, counted: Sequence[str], vehicles: int) -> tuple[str, ...]:

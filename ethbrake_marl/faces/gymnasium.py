@@ -124,7 +124,8 @@ class EthBrakeEnv(OneLearner, gymnasium.Env[NDArray[Any], NDArray[Any]]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observations, Any]:
         """Start an episode; see ``EthBrakeParallelEnv.reset``."""
         self.episode = self._restart(1, seed, options, ("initial_state", "listed_world"))
-        super().reset(seed=self.stream.seed if seed is None and self._np_random is None else seed)
+        goes_on = seed is None and self._np_random is not None
+        super().reset(seed=None if goes_on else self.stream.seed)
         self._running = True
         if self.renderer is not None:
             self.renderer.began(self.episode)

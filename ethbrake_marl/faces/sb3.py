@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -226,7 +227,8 @@ class EthBrakeVecEnv(VecEnv):
 
     def _optional_worlds(self) -> State | None:
         """Return the worlds of ``set_options``; None: there are none."""
-        options = [checked_options(row, OPTIONS[:1]) for row in self._options]
+        given = [checked_options(row, OPTIONS[:1]) for row in self._options]
+        options = [{name: row[name] for name in OPTIONS[:1] if name in row} for row in given]
         if not any(options):
             return None
         L = len(self.learners)
@@ -243,18 +245,23 @@ class EthBrakeVecEnv(VecEnv):
         """Return what a restored environment needs, between two steps, as arrays and numbers."""
         return {
             "state": [each.copy() for each in self.episode[:5]],
-            "memories": {str(name): memory for name, memory in self.episode.memories.items()},
+            "memories": {str(name): copy.deepcopy(memory) for name, memory in self.episode.memories.items()},
             "rows": [self._return.copy(), self._steps.copy(), self._begun.copy()],
             "stream": [self.stream.seed, self.stream.next],
         }
 
     def restore(self, saved: dict[str, Any]) -> None:
-        """Go on from a ``snapshot``."""
+        """Go on from a ``snapshot``, which can be restored again."""
+        saved = copy.deepcopy(saved)
         memories = {int(name) if name.isdigit() else name: memory for name, memory in saved["memories"].items()}
         line, car, clock, know, wanted = saved["state"]
         self.episode = State(line, car, clock, know, wanted, memories)
         self._return, self._steps, self._begun = saved["rows"]
         self.stream.seed, self.stream.next = saved["stream"]
+
+    def render(self, mode: str | None = None) -> Any:
+        """Return the texts of all worlds (``ansi``), or one picture of all of them."""
+        return self.get_images() if self.render_mode == "ansi" else super().render(mode)
 
     def get_images(self) -> list[Any]:
         """Return a picture of each world."""

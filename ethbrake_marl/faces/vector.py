@@ -79,7 +79,8 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         rows = self._rows_to_reset(options)
         if rows.all():
             self.episode = self._restart(self.num_envs, seed, options, OPTIONS)
-            super().reset(seed=self.stream.seed if seed is None and self._np_random is None else seed)
+            goes_on = seed is None and self._np_random is not None
+            super().reset(seed=None if goes_on else self.stream.seed)
         else:
             asked = [name for name in OPTIONS[:2] if name in (options or {})] + ["seed"] * (seed is not None)
             if asked or not hasattr(self, "episode"):

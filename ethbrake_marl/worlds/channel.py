@@ -215,7 +215,7 @@ class V2X(Part):
         default=None, description="fixed delay from every sender to every receiver, instead of a random one"
     )
     lost: Share | None = Field(default=None, description="share of links (not of vehicles) on which no message arrives")
-    message_period_s: Annotated[Seconds, Field(gt=0.0)] | None = Field(
+    message_period_s: Annotated[Seconds, Field(ge=1e-3)] | None = Field(
         default=None, description="T, time between two messages of a sender"
     )
     loss_begins: Share | None = Field(

@@ -12,7 +12,9 @@ from ethbrake_marl.episode.game import Game, Script
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.reward import Reward, Rewarding
 from ethbrake_marl.episode.state import State
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.worlds.catalogue import load_scenario
+from ethbrake_marl.worlds.roles import LEARNER, deceleration_of
 from ethbrake_marl.worlds.scenario import Scenario
 
 AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping is the content of a scenario file
@@ -61,6 +63,7 @@ def game_of(
     if observation is not None:
         now = {name: view.names for name, view in zip(loaded.vehicle_names, views_of(loaded), strict=True)}
         loaded = loaded.replace(observation={**now, **observation} if isinstance(observation, Mapping) else observation)
+    _check_roles(loaded, scripts or {})
     bodies = np.array(loaded.learners, np.int64)
     rewarding, rules = Rewarding.of(
         reward, loaded.objective, loaded.vehicles, bodies, (loaded.time_step_s, loaded.horizon_s), reward_vector
@@ -70,6 +73,17 @@ def game_of(
     for extension in (loaded.members or (loaded,))[0].v2x.extensions:  # members of a mixture have the same
         game = extension.game(game)
     return loaded, game
+
+
+def _check_roles(scenario: Scenario, scripts: Mapping[int, Script]) -> None:
+    """Raise ``InvalidInput`` for a vehicle whose role is an agent that nobody has given."""
+    for body, name in enumerate(scenario.vehicle_names, 1):
+        role = scenario.roles[name]
+        if body not in scripts and role not in (LEARNER, "full_brake", "coast") and deceleration_of(role) is None:
+            raise InvalidInput(
+                f"scenario {scenario.name!r}: roles.{name} = {role}: is an agent, which must be given as"
+                f" scripts={{{body}: ...}}; by themselves vehicles play {LEARNER}, full_brake, coast or constant:a"
+            )
 
 
 def views_of(scenario: Scenario) -> tuple[View, ...]:
