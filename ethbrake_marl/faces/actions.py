@@ -26,7 +26,11 @@ def checked_actions(actions: ArrayLike, shape: tuple[int, ...], whose: str, coun
     Index k of ``count`` stands for ``(2 k - count + 1) / (count - 1)``. Raises ``InvalidInput`` for a wrong shape, for
     what is not a number, and for a wrong index. The step refuses numbers outside [-1, 1].
     """
-    given, masked = np.asarray(actions), isinstance(actions, np.ma.MaskedArray) and np.ma.is_masked(actions)
+    try:
+        given = np.asarray(actions)
+    except ValueError:  # lists of different lengths
+        given = np.empty(0, object)
+    masked = isinstance(actions, np.ma.MaskedArray) and np.ma.is_masked(actions)
     if given.dtype.kind not in "fiu" or masked:
         right = "a number in [-1, 1]" if count is None else f"an index from 0 to {count - 1}"
         raise InvalidInput(f"action of {whose}: {actions!r:.60}: must be {right}")

@@ -100,6 +100,7 @@ class EthBrakeVecEnv(VecEnv):
         self.actions, self.render_mode = actions, render_mode
         self.stream = Stream(scenario, game)
         self.stream.seed = chosen_seed(seed)
+        self._next_seed: int | None = None
         self._given: Any = None
         rows = n * len(self.learners)
         self._return, self._steps, self._begun = np.zeros(rows), np.zeros(rows, np.int64), np.zeros(0)
@@ -126,8 +127,8 @@ class EthBrakeVecEnv(VecEnv):
 
     def seed(self, seed: int | None = None) -> Sequence[int]:
         """Set the seed of the worlds for the next reset. All rows share one stream of worlds."""
-        self.stream.seed, self.stream.next = chosen_seed(seed), 0
-        return [self.stream.seed] * self.num_envs
+        self._next_seed = chosen_seed(seed)
+        return [self._next_seed] * self.num_envs
 
     def reset(self) -> Observations:
         """Start an episode in every world: the next ones, or those of ``set_options``."""
@@ -135,6 +136,8 @@ class EthBrakeVecEnv(VecEnv):
             worlds = self._optional_worlds()
         finally:
             self._reset_options()
+        if self._next_seed is not None:
+            self.stream.seed, self.stream.next, self._next_seed = self._next_seed, 0, None
         self.episode = self.stream.draw(self.n) if worlds is None else self.game.begin(worlds)
         self._return[:], self._steps[:] = 0.0, 0
         self._begun = numbers(self.episode, self.learners)
@@ -144,7 +147,7 @@ class EthBrakeVecEnv(VecEnv):
 
     def step_async(self, actions: Any) -> None:
         """Store the actions of the next step, [rows, 1]."""
-        self._given = np.array(actions)
+        self._given = np.array(actions, subok=True)  # a mask is refused, not lost
 
     def step_wait(self) -> tuple[Observations, Any, Bools, list[dict[str, Any]]]:
         """Advance every world by one time step; where an episode ends, the next one begins in the same rows."""

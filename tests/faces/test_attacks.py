@@ -86,6 +86,31 @@ def test_running_episode__can_be_pickled(settings: dict[str, Any]) -> None:
         assert np.array_equal(one[1], two[1])
 
 
+def test_seed__counts_from_the_next_reset() -> None:
+    environment = make_sb3_vec_env("paper-random", 2, seed=1, step_infos=True)
+    first = environment.reset().copy()
+    environment.seed(9)
+    *_, infos = environment.step(np.full((2, 1), -0.3))
+    assert {info["world_seed"] for info in infos} == {1}
+    assert not np.array_equal(environment.reset(), first)
+    assert {info["world_seed"] for info in environment.step(np.full((2, 1), -0.3))[3]} == {9}
+
+
+@pytest.mark.parametrize(
+    "action", [[[0.1], [0.1, 0.2]], np.ma.masked_array([[0.1], [0.2]], [[True], [False]])], ids=str
+)
+def test_action_that_is_no_array_of_numbers__is_refused(action: Any) -> None:
+    many = EthBrakeVectorEnv(2)
+    many.reset(seed=1)
+    with pytest.raises(InvalidInput, match="must be a number in"):
+        many.step(action)
+    if isinstance(action, np.ma.MaskedArray):
+        rows = make_sb3_vec_env("paper-random", 2, seed=1)
+        rows.reset()
+        with pytest.raises(InvalidInput, match="must be a number in"):
+            rows.step(action)
+
+
 def test_small_ways_to_ask() -> None:
     for face in (EthBrakeEnv(), EthBrakeVectorEnv(2)):
         one, two = face.reset(seed=np.int64(9))[0], face.reset(seed=9)[0]
