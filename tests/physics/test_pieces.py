@@ -4,6 +4,7 @@ import numpy as np
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.making import make_agent
+from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.evaluation import trial
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.state import make_worlds
@@ -110,3 +111,11 @@ def test_predictions__are_what_is_done() -> None:
 def check_predicted(agent: str) -> None:
     found = harm(SOFT, agent)
     assert np.allclose(found.first_impact_harm, found.predicted_harm, rtol=1e-9, atol=1e-9)
+
+
+def test_identity__of_worlds_tells_their_profiles_apart() -> None:
+    found = [
+        profile_problem(front({"profile": pieces}).sample(3, 7).worlds, [1], horizon_s=8.0).identity
+        for pieces in ([[0, 3], [1, 5]], [[0, 3], [1, 4]], [[0, 3], [2, 5]])
+    ]
+    assert len({int(one) for each in found for one in each}) == 9
