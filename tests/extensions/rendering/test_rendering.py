@@ -126,6 +126,12 @@ def test_many_worlds__have_the_picture_of_each() -> None:
         assert np.array_equal(rows.get_images()[k], single.render())
 
 
+def test_sb3__renders_texts() -> None:
+    environment = make_sb3_vec_env("paper-random", 2, seed=1, render_mode="ansi")
+    environment.reset()
+    assert [text.split()[0] for text in environment.render()] == ["paper-random"] * 2
+
+
 def test_many_worlds__begin_anew_row_by_row() -> None:
     many = EthBrakeVectorEnv(4, render_mode="ansi", autoreset_mode="SameStep")
     many.reset(seed=5)
