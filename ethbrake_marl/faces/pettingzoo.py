@@ -42,7 +42,7 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, Any]):  # type: ignore[
 
     Args:
         scenario: a shipped name, the path of a YAML file, the content of one, or a ``Scenario``.
-        render_mode: a mode of the extension ``rendering``; None: no pictures.
+        render_mode: a mode of ``metadata["render_modes"]``; None: no pictures.
         learners: vehicles that learn, by name or number (0 = front); None: the scenario's.
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
         observation: features that every vehicle observes, or vehicle -> features; None: the scenario's.

@@ -49,6 +49,6 @@ def make_renderer(environment: Any, mode: str | None) -> Renderer | None:
     if mode is None:
         return None
     if not isinstance(mode, str) or mode not in RENDERERS:
-        known = ", ".join(RENDERERS) or "none: the extension rendering is not installed"
+        known = ", ".join(RENDERERS) or "none, because no installed package draws"
         raise InvalidInput(f"render_mode = {mode!r}: must be None or one of: {known}")
     return RENDERERS[mode](environment)

@@ -50,8 +50,9 @@ def make_sb3_vec_env(
     - ``horizon_is_end``: report an episode at the horizon as ended, not as truncated: the harm after the horizon is not
       counted, so a bootstrapped estimate of it could grow without limit.
     - ``appended``: numbers after each observation: the learner's ``number`` in its world, from 0, or the full
-    ``state``. - ``step_infos``: infos at every step, not only at the last one. - ``render_mode``: ``rgb_array`` of the
-    extension ``rendering``, or None.
+      ``state``.
+    - ``step_infos``: infos at every step, not only at the last one.
+    - ``render_mode``: ``ansi`` or ``rgb_array``; None: no pictures.
 
     >>> import ethbrake_marl as eb
     >>> eb.make_sb3_vec_env("paper-random", 4, seed=7).reset().shape

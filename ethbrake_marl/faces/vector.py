@@ -33,7 +33,7 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         num_envs: number of worlds.
         scenario: as in ``EthBrakeParallelEnv``; so are ``learners``, ``reward``, ``observation``, ``actions`` and
             ``reward_vector``.
-        render_mode: a mode of the extension ``rendering``; ``render`` returns one picture per world.
+        render_mode: a mode of ``metadata["render_modes"]``; ``render`` returns one picture per world.
         autoreset_mode: Gymnasium's: ``NextStep`` (the step after an episode's last one starts the next episode, ignores
             the action and rewards 0), ``SameStep``, or ``Disabled``.
         max_episode_steps: number of steps after which an episode is truncated; None: the horizon alone.
