@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
-from ethbrake_marl.envs.rendering import COLOURS, vehicle_colour
 from ethbrake_marl.extensions.report.style import DASHES, GREY, add_caption, new_figure, style_axes, write_picture
-from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.first_edition.envs.rendering import COLOURS, vehicle_colour
+from ethbrake_marl.first_edition.scenario.schema import Scenario
 
 FOLDER = Path(__file__).parent / "figures"
 SEED = 7

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ethbrake_marl.physics.state import Ints, Worlds
-from ethbrake_marl.scenario.sample import Sample
-from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.first_edition.physics.state import Ints, Worlds
+from ethbrake_marl.first_edition.scenario.sample import Sample
+from ethbrake_marl.first_edition.scenario.schema import Scenario
 
 
 def plant(worlds: Worlds, rows: list[int]) -> Worlds:

@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
-from ethbrake_marl.engine.profiles import profile_problem
-from ethbrake_marl.engine.stream import FailedWorld
-from ethbrake_marl.envs.making import make_engine
 from ethbrake_marl.errors import PhysicsError
-from ethbrake_marl.physics.advance import advance
-from ethbrake_marl.physics.forecast import forecast
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.shields.certify import Backup, certify
-from ethbrake_marl.shields.running import begin_running
-from ethbrake_marl.shields.step import StepShield
+from ethbrake_marl.first_edition.agents.e_v2x_bm.coupled import optimise_coupled
+from ethbrake_marl.first_edition.engine.profiles import profile_problem
+from ethbrake_marl.first_edition.engine.stream import FailedWorld
+from ethbrake_marl.first_edition.envs.making import make_engine
+from ethbrake_marl.first_edition.physics.advance import advance
+from ethbrake_marl.first_edition.physics.forecast import forecast
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.shields.certify import Backup, certify
+from ethbrake_marl.first_edition.shields.running import begin_running
+from ethbrake_marl.first_edition.shields.step import StepShield
 from tests.failing_worlds import planted_list
 
 PAPER = load_scenario("paper-random")

@@ -10,19 +10,19 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import ethbrake_marl as eb
-from ethbrake_marl.envs.making import make_engine
-from ethbrake_marl.game.actions import action_to_command, checked_action, command_to_action
-from ethbrake_marl.game.harm import Ledger, empty_ledger, split
-from ethbrake_marl.game.measures import BUILT_IN
-from ethbrake_marl.game.objectives import STANDARD, objective_harm, objectives_of, scored
-from ethbrake_marl.game.rewards import REWARDS, RewardParams, WithoutEffect, reward_params
-from ethbrake_marl.game.step_outcome import StepOutcome
-from ethbrake_marl.physics.advance import advance
-from ethbrake_marl.physics.forecast import forecast
-from ethbrake_marl.physics.left_out import Impacts
-from ethbrake_marl.physics.state import Floats, Worlds, make_worlds
+from ethbrake_marl.first_edition.envs.making import make_engine
+from ethbrake_marl.first_edition.game.actions import action_to_command, checked_action, command_to_action
+from ethbrake_marl.first_edition.game.harm import Ledger, empty_ledger, split
+from ethbrake_marl.first_edition.game.measures import BUILT_IN
+from ethbrake_marl.first_edition.game.objectives import STANDARD, objective_harm, objectives_of, scored
+from ethbrake_marl.first_edition.game.rewards import REWARDS, RewardParams, WithoutEffect, reward_params
+from ethbrake_marl.first_edition.game.step_outcome import StepOutcome
+from ethbrake_marl.first_edition.physics.advance import advance
+from ethbrake_marl.first_edition.physics.forecast import forecast
+from ethbrake_marl.first_edition.physics.left_out import Impacts
+from ethbrake_marl.first_edition.physics.state import Floats, Worlds, make_worlds
 from tests.contract.interfaces import CRASH, REST
-from tests.physics.random_worlds import driving_lines, line
+from tests.first_edition.physics.random_worlds import driving_lines, line
 from tests.reference.tolerances import EPS
 
 # ---------------------------------------------------------------- shares

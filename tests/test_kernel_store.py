@@ -18,9 +18,9 @@ import pytest
 
 import ethbrake_marl
 from ethbrake_marl import kernel_store
+from ethbrake_marl.first_edition.physics import jit
+from ethbrake_marl.first_edition.physics.jit import digest_of_sources, keep_kernel, kernel_sources, load_kernel
 from ethbrake_marl.kernel_store import cache_folder
-from ethbrake_marl.physics import jit
-from ethbrake_marl.physics.jit import digest_of_sources, keep_kernel, kernel_sources, load_kernel
 
 needs_compiler = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="compilation is switched off")
 PACKAGE = Path(ethbrake_marl.__file__).parent
@@ -184,8 +184,8 @@ import os, time
 import numpy as np
 from pathlib import Path
 from numba.core import event
-from ethbrake_marl.physics.impact import pool
-from ethbrake_marl.physics.rows import ROW
+from ethbrake_marl.first_edition.physics.impact import pool
+from ethbrake_marl.first_edition.physics.rows import ROW
 
 class Count(event.Listener):
     names = []

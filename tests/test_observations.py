@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.game.contact_features import FORECAST_S
-from ethbrake_marl.game.features import GROUPS
-from ethbrake_marl.game.observations import ObservationSpec, choose_observation, observe
-from tests.physics.random_worlds import line
+from ethbrake_marl.first_edition.game.contact_features import FORECAST_S
+from ethbrake_marl.first_edition.game.features import GROUPS
+from ethbrake_marl.first_edition.game.observations import ObservationSpec, choose_observation, observe
+from tests.first_edition.physics.random_worlds import line
 
 near = pytest.approx
 SPEC = ObservationSpec(front=2, rear=1)

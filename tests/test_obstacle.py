@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.driving import drive
-from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
-from ethbrake_marl.agents.making import make_agent
-from ethbrake_marl.engine.profiles import profile_problem
-from ethbrake_marl.game.harm import empty_ledger
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.tables import worlds_from_state
-from ethbrake_marl.shields.drivers import ShieldedDriver
+from ethbrake_marl.first_edition.agents.driving import drive
+from ethbrake_marl.first_edition.agents.e_v2x_bm.coupled import optimise_coupled
+from ethbrake_marl.first_edition.agents.making import make_agent
+from ethbrake_marl.first_edition.engine.profiles import profile_problem
+from ethbrake_marl.first_edition.game.harm import empty_ledger
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.scenario.tables import worlds_from_state
+from ethbrake_marl.first_edition.shields.drivers import ShieldedDriver
 from tests.refused import refused
 
 ALL = load_scenario("cooperation-4-all")

@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, naming_extras
-from ethbrake_marl.game.observed import observation_for
-from ethbrake_marl.policies.network_spec import NetworkSpec
-from ethbrake_marl.policies.policy import Policy
-from ethbrake_marl.training.recipe import load_recipe
-from ethbrake_marl.training.recipes import PpoRecipe
-from ethbrake_marl.training.run_folder import RunDirectory
-from ethbrake_marl.training.training import Training
+from ethbrake_marl.first_edition.game.observed import observation_for
+from ethbrake_marl.first_edition.policies.network_spec import NetworkSpec
+from ethbrake_marl.first_edition.policies.policy import Policy
+from ethbrake_marl.first_edition.training.recipe import load_recipe
+from ethbrake_marl.first_edition.training.recipes import PpoRecipe
+from ethbrake_marl.first_edition.training.run_folder import RunDirectory
+from ethbrake_marl.first_edition.training.training import Training
 
 
 def train(scenario: str, recipe: str, steps: int, seed: int, output: Path) -> None:
@@ -48,7 +48,7 @@ def train_mappo(recipe: PpoRecipe, scenario: eb.Scenario, directory: Path, algor
     the result. The learning rate keeps its initial value, because BenchMARL has no schedule. There are no checkpoints
     and no evaluations during the training.
     """
-    from ethbrake_marl.training.random_state import own_random_state
+    from ethbrake_marl.first_edition.training.random_state import own_random_state
 
     recipe = recipe.replace(scheme="centralised")
     if recipe.observation is not None:

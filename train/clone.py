@@ -25,8 +25,8 @@ from torch import Tensor, nn
 import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.files.store import new_folder
-from ethbrake_marl.policies.network_spec import NetworkSpec
-from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.first_edition.policies.network_spec import NetworkSpec
+from ethbrake_marl.first_edition.policies.policy import Policy
 
 HIDDEN = (128, 128)
 EPOCHS, BATCH, LEARNING_RATE = 20, 512, 1e-3

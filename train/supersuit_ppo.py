@@ -24,11 +24,11 @@ from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
 import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.files.store import new_folder
-from ethbrake_marl.game.rewards import reward_params
-from ethbrake_marl.policies.network_spec import NetworkSpec
-from ethbrake_marl.policies.policy import Policy
-from ethbrake_marl.training.networks import tensors_of
-from ethbrake_marl.training.training import Training
+from ethbrake_marl.first_edition.game.rewards import reward_params
+from ethbrake_marl.first_edition.policies.network_spec import NetworkSpec
+from ethbrake_marl.first_edition.policies.policy import Policy
+from ethbrake_marl.first_edition.training.networks import tensors_of
+from ethbrake_marl.first_edition.training.training import Training
 
 # 1. What to train: as in train/ppo.yaml, with smaller networks.
 

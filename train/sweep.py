@@ -16,13 +16,13 @@ from itertools import product
 from pathlib import Path
 
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
-from ethbrake_marl.evaluation import load_runnable
 from ethbrake_marl.extensions.studies.folder import StudyFolder
 from ethbrake_marl.extensions.studies.trainings import TrainingJob
 from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.store import write_file
+from ethbrake_marl.first_edition.evaluation import load_runnable
+from ethbrake_marl.first_edition.training import Training, load_recipe, read_settings
 from ethbrake_marl.parallel import run_each
-from ethbrake_marl.training import Training, load_recipe, read_settings
 
 # 1. What to train. All names and settings are checked before the first training run begins.
 

@@ -19,11 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.spec import split_specs
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.identity import result_identity
-from ethbrake_marl.evaluation.lineup import make_agents
-from ethbrake_marl.evaluation.trial import load_runnable
 from ethbrake_marl.extensions.search.best_harm import fold_episodes, search_list, task_problem
 from ethbrake_marl.extensions.search.limits import Unproven, prove, unproven_because
 from ethbrake_marl.extensions.search.regret import Between
@@ -31,12 +27,16 @@ from ethbrake_marl.extensions.search.shipped import shipped_tables
 from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.files.store import check_target
-from ethbrake_marl.game.harm import HARM_COUNTS
-from ethbrake_marl.physics.left_out import leaving_out_failed
-from ethbrake_marl.physics.state import Ints, Worlds
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.training.settings import read_settings
+from ethbrake_marl.first_edition.agents.spec import split_specs
+from ethbrake_marl.first_edition.evaluation.identity import result_identity
+from ethbrake_marl.first_edition.evaluation.lineup import make_agents
+from ethbrake_marl.first_edition.evaluation.trial import load_runnable
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS
+from ethbrake_marl.first_edition.physics.left_out import leaving_out_failed
+from ethbrake_marl.first_edition.physics.state import Ints, Worlds
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.scenario.task import Task
+from ethbrake_marl.first_edition.training.settings import read_settings
 
 
 def main(words: list[str]) -> None:

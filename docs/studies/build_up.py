@@ -10,8 +10,8 @@ import warnings
 import numpy as np
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.making import make_agent
-from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.first_edition.agents.making import make_agent
+from ethbrake_marl.first_edition.physics.advance import advance
 
 WORLDS, SEARCHED, SEED = 1_000, 400, 7
 BASE = eb.load_scenario("paper-random")

@@ -17,10 +17,10 @@ from ethbrake_marl.extensions.report.seed_curves import seed_curves
 from ethbrake_marl.extensions.report.style import write_picture
 from ethbrake_marl.extensions.reproduction.learning_curves import AXES, LearningCurves
 from ethbrake_marl.extensions.search.best_harm import best_harm
-from ethbrake_marl.game.harm import HarmCount
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
-from ethbrake_marl.training.run_folder import RunDirectory
+from ethbrake_marl.first_edition.game.harm import HarmCount
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.training.recipe import TrainingRecipe, load_recipe
+from ethbrake_marl.first_edition.training.run_folder import RunDirectory
 
 TESTS: dict[str, HarmCount] = {
     "paper-random": "first",

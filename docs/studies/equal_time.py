@@ -14,15 +14,15 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ethbrake_marl.agents.protocol import Driver
-from ethbrake_marl.evaluation.lineup import make_lineup
-from ethbrake_marl.evaluation.outcome import Outcome
-from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.evaluation.statistics import paired_difference
 from ethbrake_marl.extensions.studies.machine import this_machine
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.sample import Sample
-from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.first_edition.agents.protocol import Driver
+from ethbrake_marl.first_edition.evaluation.lineup import make_lineup
+from ethbrake_marl.first_edition.evaluation.outcome import Outcome
+from ethbrake_marl.first_edition.evaluation.rollout import evaluate
+from ethbrake_marl.first_edition.evaluation.statistics import paired_difference
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.scenario.sample import Sample
+from ethbrake_marl.first_edition.scenario.schema import Scenario
 
 AGENTS = (
     "ppo+search", "ppo", "universal", "full_brake+search", "e_v2x_bm",

@@ -20,8 +20,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation.seeds import mean_over_seeds
-from ethbrake_marl.evaluation.statistics import mean, rate
 from ethbrake_marl.extensions.cooperation import (
     Equilibrium,
     best_joint_harm,
@@ -31,9 +29,11 @@ from ethbrake_marl.extensions.cooperation import (
 )
 from ethbrake_marl.extensions.cooperation.levels import STANDARD
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.training.recipe import Scheme
-from ethbrake_marl.training.team import load_team
+from ethbrake_marl.first_edition.evaluation.seeds import mean_over_seeds
+from ethbrake_marl.first_edition.evaluation.statistics import mean, rate
+from ethbrake_marl.first_edition.physics.state import Floats
+from ethbrake_marl.first_edition.training.recipe import Scheme
+from ethbrake_marl.first_edition.training.team import load_team
 
 LEVELS = [name for name in STANDARD if eb.load_scenario(name).learners]
 WORLDS, SEED, BUDGET, ROUNDS, JOINT_BUDGET = 200, 6005, 10_000, 20, 50_000

@@ -23,10 +23,10 @@ from typing import NamedTuple
 import numpy as np
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation.seeds import mean_over_seeds
 from ethbrake_marl.files.sheet import Column
-from ethbrake_marl.physics.messages import USUAL_PIECES
-from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.first_edition.evaluation.seeds import mean_over_seeds
+from ethbrake_marl.first_edition.physics.messages import USUAL_PIECES
+from ethbrake_marl.first_edition.physics.state import Floats
 
 LINES = {  # line of vehicles -> scenario, channel
     "`paper-random`": ("paper-random", {"preset": "paper"}),

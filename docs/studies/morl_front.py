@@ -34,7 +34,7 @@ from morl_baselines.multi_policy.capql.capql import CAPQL
 
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.studies.machine import this_machine
-from ethbrake_marl.game.harm import HARM_COUNTS
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS
 
 SCENARIO, WORLDS, SEED, PARTS = "paper-random", 2000, 990201, 5
 WEIGHTS = [(i / PARTS, j / PARTS, (PARTS - i - j) / PARTS) for i in range(PARTS + 1) for j in range(PARTS + 1 - i)]

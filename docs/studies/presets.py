@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from ethbrake_marl import load_scenario
-from ethbrake_marl.scenario.channel import PRESETS
+from ethbrake_marl.first_edition.scenario.channel import PRESETS
 
 base = load_scenario("cooperation-2-paper")
 for preset in PRESETS[1:]:

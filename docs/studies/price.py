@@ -14,15 +14,15 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from ethbrake_marl.agents.making import make_agent
-from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.evaluation.statistics import mean, paired_difference, rate
 from ethbrake_marl.extensions.report.style import GREY, add_caption, new_figure, series_style, style_axes, write_picture
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.channel import CHANNELS
-from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.first_edition.agents.making import make_agent
+from ethbrake_marl.first_edition.evaluation.evaluation import Evaluation
+from ethbrake_marl.first_edition.evaluation.rollout import evaluate
+from ethbrake_marl.first_edition.evaluation.statistics import mean, paired_difference, rate
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.scenario.channel import CHANNELS
+from ethbrake_marl.first_edition.scenario.schema import Scenario
 
 SCENARIO, WORLDS, SEED = "cooperation-2-paper", 1000, 7
 PRESETS = ("paper", "clear", "nominal", "congested", "blocked", "sensors-only")

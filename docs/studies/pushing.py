@@ -15,8 +15,8 @@ import torch
 from stable_baselines3 import PPO
 
 import ethbrake_marl as eb
-from ethbrake_marl.game.step_outcome import StepOutcome
-from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.first_edition.game.step_outcome import StepOutcome
+from ethbrake_marl.first_edition.physics.state import Floats
 
 SHAPED = {"harm": 0.05, "shaping": 0.05, "shaping_discount": 0.99}
 BLOCKS = {  # program -> scenario, parallel worlds, reward

@@ -15,16 +15,16 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.figure import Figure
 
-from ethbrake_marl.agents.making import make_agent
-from ethbrake_marl.engine.memory import ask_script, begin_script
-from ethbrake_marl.evaluation.identity import result_versions, scenario_sha256, worlds_sha256
 from ethbrake_marl.extensions.report.style import GREY, add_caption, new_figure, series_style, style_axes, write_picture
-from ethbrake_marl.game.harm import empty_ledger
-from ethbrake_marl.physics.advance import advance
-from ethbrake_marl.physics.left_out import ImpactRows, Impacts
-from ethbrake_marl.physics.paper_map import advance_sampled
-from ethbrake_marl.physics.state import Bools, Floats, Worlds
-from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.agents.making import make_agent
+from ethbrake_marl.first_edition.engine.memory import ask_script, begin_script
+from ethbrake_marl.first_edition.evaluation.identity import result_versions, scenario_sha256, worlds_sha256
+from ethbrake_marl.first_edition.game.harm import empty_ledger
+from ethbrake_marl.first_edition.physics.advance import advance
+from ethbrake_marl.first_edition.physics.left_out import ImpactRows, Impacts
+from ethbrake_marl.first_edition.physics.paper_map import advance_sampled
+from ethbrake_marl.first_edition.physics.state import Bools, Floats, Worlds
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
 
 SCENARIO, WORLDS, SEED, VEHICLE = "paper-random", 2000, 7, 1
 STEPS_S = (0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)

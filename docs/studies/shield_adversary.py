@@ -20,10 +20,10 @@ def train(N: int, steps: int) -> str:
     import torch
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecEnvWrapper
-
-    from ethbrake_marl.envs.sb3 import make_sb3_vec_env
-    from ethbrake_marl.shields.sb3 import ShieldedVecEnv
     from tests.shield.attacks import line
+
+    from ethbrake_marl.first_edition.envs.sb3 import make_sb3_vec_env
+    from ethbrake_marl.first_edition.shields.sb3 import ShieldedVecEnv
 
     class PaidForHarm(VecEnvWrapper):
         def reset(self):

@@ -11,14 +11,14 @@ import time
 
 import numpy as np
 
-from ethbrake_marl.agents.driving import episode_engine
-from ethbrake_marl.evaluation.lineup import make_agents
 from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.shields.certify import certify
-from ethbrake_marl.shields.drivers import ShieldedDriver
-from ethbrake_marl.shields.step import StepShield
+from ethbrake_marl.first_edition.agents.driving import episode_engine
+from ethbrake_marl.first_edition.evaluation.lineup import make_agents
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.shields.certify import certify
+from ethbrake_marl.first_edition.shields.drivers import ShieldedDriver
+from ethbrake_marl.first_edition.shields.step import StepShield
 
 SCENARIO = load_scenario("paper-random")
 

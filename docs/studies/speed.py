@@ -22,18 +22,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
-from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
-from ethbrake_marl.envs.making import make_engine
-from ethbrake_marl.envs.pettingzoo import parallel_env
 from ethbrake_marl.extensions.studies.machine import this_machine
 from ethbrake_marl.files.sheet import Column, Sheet
-from ethbrake_marl.game.harm import empty_ledger
-from ethbrake_marl.physics.advance import advance
-from ethbrake_marl.physics.forecast import forecast
-from ethbrake_marl.physics.jit import compiled
-from ethbrake_marl.physics.state import Floats, Worlds
-from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.agents.e_v2x_bm.coupled import optimise_coupled
+from ethbrake_marl.first_edition.agents.e_v2x_bm.pairwise import optimise_pairwise
+from ethbrake_marl.first_edition.envs.making import make_engine
+from ethbrake_marl.first_edition.envs.pettingzoo import parallel_env
+from ethbrake_marl.first_edition.game.harm import empty_ledger
+from ethbrake_marl.first_edition.physics.advance import advance
+from ethbrake_marl.first_edition.physics.forecast import forecast
+from ethbrake_marl.first_edition.physics.jit import compiled
+from ethbrake_marl.first_edition.physics.state import Floats, Worlds
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
 
 SCENARIO = "paper-random"
 SEED = 7

@@ -34,9 +34,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.evaluation.seeds import interquartile_mean
 from ethbrake_marl.extensions.report.style import (
     GREY,
     TITLES,
@@ -50,10 +48,12 @@ from ethbrake_marl.extensions.report.style import (
 from ethbrake_marl.extensions.search.best_harm import search_list
 from ethbrake_marl.extensions.studies.machine import this_machine
 from ethbrake_marl.files.store import write_file
-from ethbrake_marl.game.harm import HARM_COUNTS
-from ethbrake_marl.training.fixed_list import drive_list
-from ethbrake_marl.training.random_state import own_random_state
-from ethbrake_marl.training.team import load_team
+from ethbrake_marl.first_edition.agents.protocol import Team
+from ethbrake_marl.first_edition.evaluation.seeds import interquartile_mean
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS
+from ethbrake_marl.first_edition.training.fixed_list import drive_list
+from ethbrake_marl.first_edition.training.random_state import own_random_state
+from ethbrake_marl.first_edition.training.team import load_team
 
 ALGORITHMS = {  # name -> label, and estimated decisions per processor second for the first short training
     "ippo": ("IPPO (`train/ippo.py`)", 16_000),

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.report.style import add_caption, name_axes, new_panels, series_style, write_picture
-from ethbrake_marl.game.harm import HARM_COUNTS
-from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS
+from ethbrake_marl.first_edition.scenario.schema import Scenario
 
 WORLDS, SEED = 2000, 7
 GAPS_S = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.4)

@@ -159,7 +159,7 @@ def _kernel_cache() -> tuple[bool, str]:
 
 
 def _scenarios() -> tuple[bool, str]:
-    from ethbrake_marl.scenario.catalogue import list_scenarios, shipped_folder
+    from ethbrake_marl.first_edition.scenario.catalogue import list_scenarios, shipped_folder
 
     shipped = [entry for entry in list_scenarios() if entry.shipped]
     return len(shipped) > 0, f"{len(shipped)} in {shipped_folder()}"
@@ -172,8 +172,8 @@ def _golden_impact() -> tuple[bool, str]:
     """
     import numpy as np
 
-    from ethbrake_marl.physics.advance import advance
-    from ethbrake_marl.physics.state import make_worlds
+    from ethbrake_marl.first_edition.physics.advance import advance
+    from ethbrake_marl.first_edition.physics.state import make_worlds
 
     world = make_worlds(
         [8.0], [0.0, 10.0], braking_capacity_mps2=5.0, driving_capacity_mps2=5.0, latency_s=0.0, mass_t=5.0,
@@ -192,8 +192,8 @@ def _golden_baseline() -> tuple[bool, str]:
     """
     import numpy as np
 
-    from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
-    from ethbrake_marl.physics.state import make_worlds
+    from ethbrake_marl.first_edition.agents.e_v2x_bm.pairwise import optimise_pairwise
+    from ethbrake_marl.first_edition.physics.state import make_worlds
 
     capacity = np.array([6.0, 7.0, 6.0])
     world = make_worlds(

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from ethbrake_marl import evaluation, scenario as scenarios, training
 from ethbrake_marl.cli.command import (
     AgentsOption,
     ForceOption,
@@ -25,12 +24,13 @@ from ethbrake_marl.cli.pages import page_of
 from ethbrake_marl.errors import InvalidInput, need
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.files.store import check_folder, write_output
+from ethbrake_marl.first_edition import evaluation, scenario as scenarios, training
 
 if TYPE_CHECKING:
-    from ethbrake_marl.physics.left_out import LeftOutRows
-    from ethbrake_marl.scenario.sample import Sample
-    from ethbrake_marl.scenario.task import Task
-    from ethbrake_marl.training.settings import Settings
+    from ethbrake_marl.first_edition.physics.left_out import LeftOutRows
+    from ethbrake_marl.first_edition.scenario.sample import Sample
+    from ethbrake_marl.first_edition.scenario.task import Task
+    from ethbrake_marl.first_edition.training.settings import Settings
 
 # default number of worlds of each scenario in a group; best known harms exist for these worlds of `benchmark`
 GROUP_EPISODES = 400
@@ -53,7 +53,7 @@ def read_task(scenario: str, settings: Sequence[str] | None) -> Task:
 
 
 def _task_of(scenario: str, chosen_settings: Settings) -> Task:
-    from ethbrake_marl.scenario.task import Task
+    from ethbrake_marl.first_edition.scenario.task import Task
 
     chosen = evaluation.load_runnable(scenario, chosen_settings.scenario, drives="some")
     return Task(chosen, chosen.learners, chosen_settings.harm_count)
@@ -99,10 +99,10 @@ def evaluate_command(
     harm_count=total, agents minimise total harm instead of first-impact harm. --set measures=injury,my_file.py:worst
     adds these measures to the results.
     """
-    from ethbrake_marl.agents.spec import split_specs
+    from ethbrake_marl.first_edition.agents.spec import split_specs
 
     with Out(as_json=as_json, force=force) as out:
-        from ethbrake_marl.game.harm import HARM_COUNTS  # loads numba, which help does not need
+        from ethbrake_marl.first_edition.game.harm import HARM_COUNTS  # loads numba, which help does not need
 
         _check_outputs(out, output, per_world, report=report)
         write_page = page_of("evaluation", "--report") if report else None

@@ -10,13 +10,13 @@ from typing import Annotated, Any
 
 import typer
 
-from ethbrake_marl import evaluation, scenario as scenarios, training
 from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, SeedOption, SettingsOption, example
 from ethbrake_marl.cli.pages import page_of
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.files.yaml import flow_text
+from ethbrake_marl.first_edition import evaluation, scenario as scenarios, training
 
 TRIED_WORLDS = 200  # number of worlds in which `scenario validate` tries a scenario
 
@@ -168,8 +168,8 @@ def scenario_explain(scenario: NameArgument, as_json: JsonOption = False) -> Non
 
 def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
     """Yield sentences that describe the scenario; some may be empty."""
-    from ethbrake_marl.agents.making import find_entry
-    from ethbrake_marl.game.objectives import OBJECTIVES
+    from ethbrake_marl.first_edition.agents.making import find_entry
+    from ethbrake_marl.first_edition.game.objectives import OBJECTIVES
 
     yield f"{scenario.name}: {scenario.title or 'no title'}. {scenario.description}".rstrip()
     learners = ", ".join(scenario.vehicle_names[i] for i in scenario.learners) or "nobody"
@@ -308,9 +308,9 @@ def scenario_parts(as_json: JsonOption = False) -> None:
     Lists features of observations, V2X presets, objectives, training algorithms, recipes, and measures. A reward is a
     weighted sum of measures.
     """
-    from ethbrake_marl.game.features import FEATURES
-    from ethbrake_marl.game.measures import MEASURES
-    from ethbrake_marl.game.objectives import OBJECTIVES
+    from ethbrake_marl.first_edition.game.features import FEATURES
+    from ethbrake_marl.first_edition.game.measures import MEASURES
+    from ethbrake_marl.first_edition.game.objectives import OBJECTIVES
 
     features = FEATURES.usable().items()
     own = [name if entry.of == "own" else f"front_K.{name}, rear_K.{name}" for name, entry in features]
@@ -401,8 +401,8 @@ def agent_list(as_json: JsonOption = False) -> None:
     comes before a shield, as in full_brake+search+step.
     """
     with Out(as_json=as_json) as out:
-        from ethbrake_marl.agents.protocol import Knowledge
-        from ethbrake_marl.agents.registry import agent_entries, agents_refused
+        from ethbrake_marl.first_edition.agents.protocol import Knowledge
+        from ethbrake_marl.first_edition.agents.registry import agent_entries, agents_refused
 
         content, rows = [], []
         for entry in agent_entries():
@@ -436,7 +436,7 @@ def agent_export(
     extra `export` installs.
     """
     with Out(force=force) as out:
-        from ethbrake_marl.policies.shipped import load_named_policy
+        from ethbrake_marl.first_edition.policies.shipped import load_named_policy
 
         out.check(onnx)
         out.write(onnx, load_named_policy(policy).to_onnx(), what="written")

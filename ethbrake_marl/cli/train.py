@@ -9,7 +9,6 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
-from ethbrake_marl import evaluation, scenario as scenarios, training
 from ethbrake_marl.cli.command import (
     ForceOption,
     JsonOption,
@@ -21,6 +20,7 @@ from ethbrake_marl.cli.command import (
 )
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.sheet import Column, Sheet
+from ethbrake_marl.first_edition import evaluation, scenario as scenarios, training
 from ethbrake_marl.progress import Progress
 
 REMAINS = (
@@ -85,8 +85,8 @@ def run_command(
     """
     with Out(as_json=as_json, force=force, remains=REMAINS) as out:
         # torch takes seconds to load, here and in the other commands that learn
-        from ethbrake_marl.training.experiment import HYBRID, SHIELDED_TEAM, run_experiment
-        from ethbrake_marl.training.progress import objective_in_words
+        from ethbrake_marl.first_edition.training.experiment import HYBRID, SHIELDED_TEAM, run_experiment
+        from ethbrake_marl.first_edition.training.progress import objective_in_words
 
         plan = training.load_recipe(recipe or quickest())
         changes = training.read_settings(settings, [plan])
@@ -156,7 +156,7 @@ def train_command(
             help="With --resume: continue even if the run used other package versions; numbers may differ.",
         ),
     ] = False,
-    schema: schema_option("ethbrake_marl.training", "TrainingRecipe", "recipe") = False,  # type: ignore[valid-type]  # built by a function
+    schema: schema_option("ethbrake_marl.first_edition.training", "TrainingRecipe", "recipe") = False,  # type: ignore[valid-type]  # built by a function
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -210,8 +210,8 @@ def _show(out: Out, result: training.TrainResult, scenario: str | None = None) -
 
     Also prints the command that evaluates the agent in ``scenario`` (name or path); None: the scenario of the training.
     """
-    from ethbrake_marl.training.fixed_list import measure_full_braking
-    from ethbrake_marl.training.progress import objective_in_words
+    from ethbrake_marl.first_edition.training.fixed_list import measure_full_braking
+    from ethbrake_marl.first_edition.training.progress import objective_in_words
 
     plan, run = result.training.recipe, training.RunDirectory(result.directory)
     columns = [

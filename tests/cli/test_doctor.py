@@ -6,11 +6,11 @@ from unittest.mock import Mock
 import pytest
 from packaging.requirements import Requirement
 
-from ethbrake_marl.agents.e_v2x_bm import pairwise
 from ethbrake_marl.cli import doctor
 from ethbrake_marl.cli.doctor import Check, diagnose
-from ethbrake_marl.physics import advance as advance_module
-from ethbrake_marl.scenario import catalogue
+from ethbrake_marl.first_edition.agents.e_v2x_bm import pairwise
+from ethbrake_marl.first_edition.physics import advance as advance_module
+from ethbrake_marl.first_edition.scenario import catalogue
 from tests.fixtures.commands import Command, told_json
 
 

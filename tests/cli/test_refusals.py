@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from ethbrake_marl.scenario.catalogue import new_scenario_text
+from ethbrake_marl.first_edition.scenario.catalogue import new_scenario_text
 from tests.fixtures.commands import Refuse
 
 USAGE = [

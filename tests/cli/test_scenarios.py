@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.scenario.catalogue import load_scenario, shipped_folder
-from ethbrake_marl.scenario.tables import read_worlds
-from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario, shipped_folder
+from ethbrake_marl.first_edition.scenario.tables import read_worlds
+from ethbrake_marl.first_edition.training.recipe import TrainingRecipe, load_recipe
 from tests.fixtures.commands import Answer, Command, check_refused, told_json
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -71,7 +71,7 @@ def test_run__interrupted_twice_stops_at_once_and_keeps_the_policy(ethbrake, tin
 
 def test_run__failed_says_so_in_its_status(ethbrake, tiny_recipe, tmp_path, monkeypatch) -> None:
     broken = Mock(side_effect=RuntimeError("no space left"))
-    monkeypatch.setattr("ethbrake_marl.training.experiment.write_results", broken)
+    monkeypatch.setattr("ethbrake_marl.first_edition.training.experiment.write_results", broken)
     with pytest.raises(RuntimeError, match="no space left"):
         ethbrake("run", "--recipe", tiny_recipe, "--episodes", "20", "--output", tmp_path / "failed")
     status, stage, reason = status_of(tmp_path / "failed", "status", "stage", "reason")

@@ -10,19 +10,19 @@ import pytest
 from scipy.stats import ttest_ind
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import registry
-from ethbrake_marl.agents.making import make_agent
-from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.agents.registry import Entry
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.comparison import compare_results
-from ethbrake_marl.evaluation.lineup import make_lineup
-from ethbrake_marl.evaluation.per_world import read_result, write_per_world
-from ethbrake_marl.evaluation.statistics import mean, paired_difference, unpaired_difference
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.tables import read_worlds
+from ethbrake_marl.first_edition.agents import registry
+from ethbrake_marl.first_edition.agents.making import make_agent
+from ethbrake_marl.first_edition.agents.protocol import Team
+from ethbrake_marl.first_edition.agents.registry import Entry
+from ethbrake_marl.first_edition.evaluation.comparison import compare_results
+from ethbrake_marl.first_edition.evaluation.lineup import make_lineup
+from ethbrake_marl.first_edition.evaluation.per_world import read_result, write_per_world
+from ethbrake_marl.first_edition.evaluation.statistics import mean, paired_difference, unpaired_difference
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.scenario.tables import read_worlds
 from tests.fixtures.commands import Command, check_refused, rows_of, told_json
 
 SCENARIO = load_scenario("paper-random")
@@ -71,7 +71,9 @@ def test_standards__full_braking_passes_as_published_and_is_struck_by_a_follower
 
 
 def test_evaluate__one_agent_that_cannot_drive_is_refused_before_another_works(ethbrake, monkeypatch) -> None:
-    monkeypatch.setattr("ethbrake_marl.evaluation.chunks.evaluate_held", lambda *args, **kwargs: pytest.fail("worked"))
+    monkeypatch.setattr(
+        "ethbrake_marl.first_edition.evaluation.chunks.evaluate_held", lambda *args, **kwargs: pytest.fail("worked")
+    )
     refused = ethbrake("evaluate", "--agents", "e_v2x_bm,constant:99", "--episodes", "5")
     check_refused(refused, "agent 'constant:99': brakes harder than the braking capacity of 7 m/s2")
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ethbrake_marl as eb
-from ethbrake_marl.envs.gymnasium import EthBrakeEnv
-from ethbrake_marl.envs.pettingzoo import EthBrakeParallelEnv, InTurns
-from ethbrake_marl.envs.vector import EthBrakeVectorEnv
+from ethbrake_marl.first_edition.envs.gymnasium import EthBrakeEnv
+from ethbrake_marl.first_edition.envs.pettingzoo import EthBrakeParallelEnv, InTurns
+from ethbrake_marl.first_edition.envs.vector import EthBrakeVectorEnv
 
 Array = NDArray[Any]
 Wrap = Callable[[Any], Any]

@@ -15,17 +15,17 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.env_util import make_vec_env
 
 import ethbrake_marl as eb
-from ethbrake_marl.envs.gymnasium import EthBrakeEnv
-from ethbrake_marl.envs.pettingzoo import env, parallel_env
-from ethbrake_marl.envs.rendering import HEIGHT, WIDTH
-from ethbrake_marl.envs.viewer import Viewer
+from ethbrake_marl.first_edition.envs.gymnasium import EthBrakeEnv
+from ethbrake_marl.first_edition.envs.pettingzoo import env, parallel_env
+from ethbrake_marl.first_edition.envs.rendering import HEIGHT, WIDTH
+from ethbrake_marl.first_edition.envs.viewer import Viewer
 from tests.contract.interfaces import FIVE, LEVELS, PAPER, REST, SCENARIOS, line
 
 pytestmark = pytest.mark.filterwarnings(
     "error",
     # PettingZoo's checkers pass {"options": 1} on purpose; asking for a warning here is our own rule.
-    "ignore:reset. options has the unknown keys options:ethbrake_marl.envs.making.UnknownResetOption",
-    "ignore::ethbrake_marl.envs.making.IgnoredAction",  # they act for all agents
+    "ignore:reset. options has the unknown keys options:ethbrake_marl.first_edition.envs.making.UnknownResetOption",
+    "ignore::ethbrake_marl.first_edition.envs.making.IgnoredAction",  # they act for all agents
     "ignore:.*is different from the unwrapped version",  # a shield is: that is its use
 )
 ANY_START = PAPER.replace(early_impacts="keep")
@@ -99,6 +99,6 @@ def test_stable_baselines3__makes_it_by_its_id() -> None:
 
 def test_old_gymnasium_spec__is_made():
     spec = gymnasium.make("EthBrake-v1", scenario="paper-random").spec
-    old = spec.to_json().replace("ethbrake_marl.envs.gymnasium:", "ethbrake_marl.envs:")
+    old = spec.to_json().replace("ethbrake_marl.first_edition.envs.gymnasium:", "ethbrake_marl.first_edition.envs:")
     assert old != spec.to_json()
     assert gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(old)).reset(seed=1)[0].shape

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.envs.making import UnknownResetOption
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.fields import QUANTITY
-from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.first_edition.envs.making import UnknownResetOption
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.scenario.fields import QUANTITY
+from ethbrake_marl.first_edition.scenario.schema import Scenario
 from tests.contract.interfaces import (
     BARE,
     BATCHED,
@@ -34,7 +34,7 @@ from tests.contract.interfaces import (
     rows_of,
 )
 
-pytestmark = pytest.mark.filterwarnings("ignore::ethbrake_marl.shields.MovingAtHorizon")
+pytestmark = pytest.mark.filterwarnings("ignore::ethbrake_marl.first_edition.shields.MovingAtHorizon")
 each_interface = pytest.mark.parametrize("name", INTERFACES)
 each_bare = pytest.mark.parametrize("name", BARE)
 each_scenario = pytest.mark.parametrize(

@@ -21,7 +21,7 @@ A module imports only from its own folder or from folders that this page lists b
 `make lint` checks this. The following command makes this page from the code:
 `python -m tests.docs.layout`.
 
-## Where to look
+## Where to look (paths in `first_edition/`)
 
 | question | file |
 |---|---|
@@ -30,7 +30,7 @@ A module imports only from its own folder or from folders that this page lists b
 | Where does a number in a table come from? | `evaluation/`: `measure_sets.py` (columns), `outcome.py`, `rollout.py` |
 | Why did the shield replace an action? | `shields/certify.py`, `decide_world`; the proof is in `shields/step.py` |
 | What is a reward term? | `game/`: `step_outcome.py` (formulas), `rewards.py` (weights), `measures.py` (names) |
-| Which agents are there? | `pyproject.toml`, `agents/scripts.py`; [add one](../extend.md#an-agent) |
+| Which agents are there? | `pyproject.toml`, `first_edition/agents/scripts.py`; [add one](../extend.md#an-agent) |
 | What can a scenario file say? | `scenario/declared.py` (keys), `fields.py` (values); [scenarios](../scenarios.md) |
 | How does a training run? | `training/session.py`, `train`; algorithms in `ppo.py` and `sac.py` |
 | How do I add a column to every evaluation? | [a set of measures](../extend.md#a-set-of-measures) |
@@ -75,10 +75,11 @@ def arrows() -> dict[str, set[str]]:
     return found
 
 
-def layers(contract: int) -> list[list[str]]:
-    """The layers of a contract of import-linter, from the top down."""
+def layers(folder: str) -> list[list[str]]:
+    """The layers of a folder of the package in the contracts of import-linter, from the top down."""
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["importlinter"]["contracts"]
-    return [layer.split(" | ") for layer in contracts[contract]["layers"]]
+    (contract,) = (each for each in contracts if each.get("containers") == [folder])
+    return [layer.split(" | ") for layer in contract["layers"]]
 
 
 def table(rooms: list[list[str]], inside: str, uses: dict[str, set[str]]) -> list[str]:
@@ -98,10 +99,10 @@ def table(rooms: list[list[str]], inside: str, uses: dict[str, set[str]]) -> lis
 
 def page() -> str:
     uses = arrows()
-    core = [[room for room in layer if not room.startswith("__")] for layer in layers(0)]
+    core = [[room for room in layer if not room.startswith("__")] for layer in layers("ethbrake_marl")]
     core = [[room for room in layer if room != "extensions"] for layer in core]
     drawing = [" · ".join(layer) for layer in core if layer]
-    extensions = layers(1)
+    extensions = layers("ethbrake_marl.extensions")
     beside = [" · ".join(layer) for layer in extensions]
     return "\n".join(
         [

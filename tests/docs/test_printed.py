@@ -11,10 +11,10 @@ import pytest
 import yaml
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_harm
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.scenario.catalogue import load_scenario, new_scenario_text
-from ethbrake_marl.scenario.tables import worlds_from_table
+from ethbrake_marl.first_edition.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_harm
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario, new_scenario_text
+from ethbrake_marl.first_edition.scenario.tables import worlds_from_table
 from tests.docs.printed import BLOCK, PICTURES, ROOT, TABLES, missing_figures, pictures, rows, tables
 from tests.docs.site import DOCS, load
 from tests.programmes.libraries import harm_of_programs

@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
-from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS
 from ethbrake_marl.extensions.report.style import picture_bytes
 from ethbrake_marl.extensions.reproduction import strategies, tables as tables_module, verdicts
 from ethbrake_marl.extensions.reproduction.folder import Reproduction
 from ethbrake_marl.extensions.reproduction.making import choose_items
 from ethbrake_marl.extensions.reproduction.strategies import FULL_BRAKE, NAMES
-from ethbrake_marl.game.harm import HARM_COUNTS
-from ethbrake_marl.game.objectives import scored
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.tables import worlds_from_table
+from ethbrake_marl.first_edition.agents.e_v2x_bm.pairwise import optimise_pairwise
+from ethbrake_marl.first_edition.evaluation.lineup import make_lineup
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS
+from ethbrake_marl.first_edition.game.objectives import scored
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.scenario.tables import worlds_from_table
 from tests.docs.printed import rows as table_of
 from tests.docs.site import DOCS, load
 

@@ -13,15 +13,15 @@ import yaml
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.statistics import mean
-from ethbrake_marl.game.measures import REPORTED
-from ethbrake_marl.game.objectives import standard_objectives
-from ethbrake_marl.game.observations import observe
-from ethbrake_marl.game.step_outcome import StepOutcome
-from ethbrake_marl.scenario.catalogue import new_scenario_text
-from ethbrake_marl.scenario.channel import CHANNELS
+from ethbrake_marl.first_edition.evaluation.statistics import mean
+from ethbrake_marl.first_edition.game.measures import REPORTED
+from ethbrake_marl.first_edition.game.objectives import standard_objectives
+from ethbrake_marl.first_edition.game.observations import observe
+from ethbrake_marl.first_edition.game.step_outcome import StepOutcome
+from ethbrake_marl.first_edition.scenario.catalogue import new_scenario_text
+from ethbrake_marl.first_edition.scenario.channel import CHANNELS
 from tests.contract.interfaces import BARE
-from tests.learning.tiny import TINY_PPO
+from tests.first_edition.learning.tiny import TINY_PPO
 
 near = pytest.approx
 PAPER = eb.load_scenario("paper-random")

@@ -20,7 +20,7 @@ import numpy as np
 import typer
 
 import ethbrake_marl as eb
-from ethbrake_marl.training.recipes import PpoRecipe
+from ethbrake_marl.first_edition.training.recipes import PpoRecipe
 
 
 class Gentle:
@@ -68,7 +68,7 @@ class PatientRecipe(PpoRecipe):
 WORST = eb.Part(worst, unit="m/s")
 CALM = eb.Part(calm, unit="m/s2", by="step")
 URGENCY = eb.Part(urgency, unit="m/s", scale=10.0, low=0.0, high=4.0)
-PATIENT = eb.Part(PatientRecipe, "ethbrake_marl.training.ppo:Ppo")
+PATIENT = eb.Part(PatientRecipe, "ethbrake_marl.first_edition.training.ppo:Ppo")
 
 
 def hello(name: str, loud: bool = False) -> None:

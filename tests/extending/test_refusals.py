@@ -9,8 +9,8 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import AlreadyExists, UnknownName
-from ethbrake_marl.game.features import FEATURES
-from ethbrake_marl.game.rewards import reward_params
+from ethbrake_marl.first_edition.game.features import FEATURES
+from ethbrake_marl.first_edition.game.rewards import reward_params
 from tests.fixtures.policies import make_policy
 from tests.refused import refused
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.evaluation.own_measures import load_measures
+from ethbrake_marl.first_edition.engine.engine import Engine
+from ethbrake_marl.first_edition.evaluation.own_measures import load_measures
 from tests.contract.interfaces import CRASH
-from tests.learning.tiny import TINY_PPO
+from tests.first_edition.learning.tiny import TINY_PPO
 from tests.refused import refused
 
 PAPER = eb.load_scenario("paper-random")

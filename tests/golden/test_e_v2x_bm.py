@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_harm
-from ethbrake_marl.physics.state import Worlds, make_worlds
+from ethbrake_marl.first_edition.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_harm
+from ethbrake_marl.first_edition.physics.state import Worlds, make_worlds
 
 
 def paper_world(gaps_m: tuple[float, ...], speeds_mps: tuple[float, ...], tau2: float, tau3: float) -> Worlds:

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.evaluation.identity import worlds_sha256
-from ethbrake_marl.game.harm import empty_ledger
-from ethbrake_marl.physics.advance import advance
-from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
-from ethbrake_marl.shields.step import StepShield
-from tests.physics.random_worlds import Draws, driving_lines
-from tests.shield.attacks import line
+from ethbrake_marl.first_edition.evaluation.identity import worlds_sha256
+from ethbrake_marl.first_edition.game.harm import empty_ledger
+from ethbrake_marl.first_edition.physics.advance import advance
+from ethbrake_marl.first_edition.physics.state import Floats
+from ethbrake_marl.first_edition.scenario.catalogue import list_scenarios, load_scenario
+from ethbrake_marl.first_edition.shields.step import StepShield
+from tests.first_edition.physics.random_worlds import Draws, driving_lines
+from tests.first_edition.shield.attacks import line
 
 GOLDEN = Path(__file__).with_name("physics_worlds.json")
 LINES = {  # by name: vehicles and worlds

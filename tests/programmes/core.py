@@ -50,7 +50,7 @@ SMALL = (
 def cases(given: Given) -> Cases:
     with tempfile.TemporaryDirectory(prefix="ethbrake-core-") as folder:
         if given.each:
-            extensions = [name for layer in layers(1) for name in layer]
+            extensions = [name for layer in layers("ethbrake_marl.extensions") for name in layer]
             for name in extensions:
                 gone = users_of(name)
                 copy = copy_without(gone, Path(folder) / name)

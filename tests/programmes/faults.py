@@ -423,7 +423,7 @@ class Copy:
 
 def _digests(self: Copy, pipe: int) -> None:
     """In a child: what kernels of each file are named by, as long as no kernel changes."""
-    from ethbrake_marl.physics.jit import digest_of_sources
+    from ethbrake_marl.first_edition.physics.jit import digest_of_sources
 
     found = {str(file): digest_of_sources(file) for file in sorted((self.folder / PACKAGE.name).rglob("*.py"))}
     os.write(pipe, json.dumps(found).encode())
@@ -436,7 +436,7 @@ def _run(self: Copy, pipe: int, tests: list[str], compiled: bool, own_kernels: b
     numba.config.DISABLE_JIT = not compiled
     os.environ["NUMBA_DISABLE_JIT"] = str(int(not compiled))
     if compiled and not own_kernels:
-        from ethbrake_marl.physics import jit
+        from ethbrake_marl.first_edition.physics import jit
 
         jit.digest_of_sources = cache(lambda source: self.digests.get(str(source), ""))
     plugin = Listener(tests, None if compiled else EACH_S, pipe)

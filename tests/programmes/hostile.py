@@ -31,10 +31,10 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.extensions.search.best_harm import best_harm
 from ethbrake_marl.extensions.search.tables import BestHarmTable, table_bytes
-from ethbrake_marl.policies.shipped import shipped_policies
-from ethbrake_marl.scenario.tables import read_worlds
-from ethbrake_marl.training.session import train
-from tests.learning.tiny import LINKS, OUTSIDE, PRECIOUS, link_out
+from ethbrake_marl.first_edition.policies.shipped import shipped_policies
+from ethbrake_marl.first_edition.scenario.tables import read_worlds
+from ethbrake_marl.first_edition.training.session import train
+from tests.first_edition.learning.tiny import LINKS, OUTSIDE, PRECIOUS, link_out
 from tests.programmes import Cases, Given, Told
 
 CPU_LIMIT_S, WALL_LIMIT_S = 10, 90.0

@@ -15,13 +15,12 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.errors import PhysicsError
-from ethbrake_marl.game.harm import split
-from ethbrake_marl.physics.advance import advance
-from ethbrake_marl.physics.left_out import Impacts
-from ethbrake_marl.physics.state import Floats, Ints, Worlds, make_worlds
-from tests.golden.test_golden import GOLDEN, figures
-from tests.physics.manufacture import Case, manufactured, pressed, stored
-from tests.physics.random_worlds import (
+from ethbrake_marl.first_edition.game.harm import split
+from ethbrake_marl.first_edition.physics.advance import advance
+from ethbrake_marl.first_edition.physics.left_out import Impacts
+from ethbrake_marl.first_edition.physics.state import Floats, Ints, Worlds, make_worlds
+from tests.first_edition.physics.manufacture import Case, manufactured, pressed, stored
+from tests.first_edition.physics.random_worlds import (
     HARMS,
     HORIZON_S,
     Batch,
@@ -43,16 +42,23 @@ from tests.physics.random_worlds import (
     thrown_lines,
     touching_lines,
 )
-from tests.physics.segments import Scan, random_segments, scan
-from tests.physics.test_build_up import by_small_steps, played, random_lines, random_pieces
-from tests.physics.test_one_physics import (
+from tests.first_edition.physics.segments import Scan, random_segments, scan
+from tests.first_edition.physics.test_build_up import by_small_steps, played, random_lines, random_pieces
+from tests.first_edition.physics.test_one_physics import (
     KINDS,
     advanced,
     disagreeing,
     first_harm_error,
     random_lines as random_lines_of_all,
 )
-from tests.physics.test_oracles import accelerations, at_once, exact_accelerations, in_steps, law_error_eps
+from tests.first_edition.physics.test_oracles import (
+    accelerations,
+    at_once,
+    exact_accelerations,
+    in_steps,
+    law_error_eps,
+)
+from tests.golden.test_golden import GOLDEN, figures
 from tests.programmes import Cases, Given, Told
 from tests.reference.exact_simulator import simulate
 from tests.reference.tolerances import (

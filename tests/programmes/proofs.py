@@ -25,8 +25,8 @@ from unittest import mock
 import numpy as np
 import z3
 
-from ethbrake_marl.physics import impact, motion, rows
-from ethbrake_marl.shields import certify
+from ethbrake_marl.first_edition.physics import impact, motion, rows
+from ethbrake_marl.first_edition.shields import certify
 from tests.programmes import Cases, Given, Told
 
 # ---------------------------------------------------------------- symbolic execution

@@ -10,8 +10,8 @@ from multiprocessing.context import ForkProcess
 from pathlib import Path
 
 import ethbrake_marl as eb
-from ethbrake_marl.training.checkpoint import newest_usable
-from ethbrake_marl.training.session import resume, train
+from ethbrake_marl.first_edition.training.checkpoint import newest_usable
+from ethbrake_marl.first_edition.training.session import resume, train
 from tests.programmes import Cases, Given, Told
 
 SOON_S = 300.0

@@ -1,6 +1,6 @@
 """Attacks on the step shield: the harm of an episode must not be above its bound at the alert.
 
-bound         random worlds against every adversary of ``tests/shield/attacks.py``, both counts, N = 3 and 5, e to 0.3
+bound         random worlds against every adversary of ``shield/attacks.py``, both counts, N = 3 and 5, e to 0.3
 build-up      as bound, with brakes that build up at 5 to 60 m/s3, and with other vehicles that brake by profiles
 joint         teams of hostile learners at cooperation levels 3 and 4, N = 3 and 5; harm must equal the last bound
 pieces        as joint, with every selection of message pieces: the shield must refuse or keep its bound
@@ -18,17 +18,16 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
-from ethbrake_marl.physics.messages import LOOK_AHEAD, PIECES
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.shields.certify import plan_harm
-from ethbrake_marl.shields.running import begin_running
+from ethbrake_marl.first_edition.engine.profiles import profile_problem
+from ethbrake_marl.first_edition.physics.messages import LOOK_AHEAD, PIECES
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.shields.certify import plan_harm
+from ethbrake_marl.first_edition.shields.running import begin_running
 from tests.extensions.certified.estimates import ABOVE, LISTS, WAYS, shielded
-from tests.programmes import Cases, Given, Told
-from tests.shield.attacks import (
+from tests.first_edition.shield.attacks import (
     ADVERSARIES,
     LEAKS,
     TEAM_ADVERSARIES,
@@ -41,7 +40,8 @@ from tests.shield.attacks import (
     line,
     search,
 )
-from tests.shield.plays import INSIDE as WRAPPED, PLAYS, WRAPPERS, Tally, disturbed, played, wrapped
+from tests.first_edition.shield.plays import INSIDE as WRAPPED, PLAYS, WRAPPERS, Tally, disturbed, played, wrapped
+from tests.programmes import Cases, Given, Told
 
 CHUNK = 2_000  # worlds attacked together
 BATCH = 50_000  # worlds simulated together with the applied actions

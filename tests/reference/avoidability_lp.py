@@ -20,8 +20,8 @@ import numpy as np
 from scipy import sparse
 from scipy.optimize import linprog
 
-from ethbrake_marl.physics.motion import solo_motion
-from ethbrake_marl.physics.state import Floats, Worlds
+from ethbrake_marl.first_edition.physics.motion import solo_motion
+from ethbrake_marl.first_edition.physics.state import Floats, Worlds
 
 
 class LinearVerdict(NamedTuple):

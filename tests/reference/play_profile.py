@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from ethbrake_marl.game.harm import Ledger, empty_ledger
-from ethbrake_marl.physics.advance import advance
-from ethbrake_marl.physics.state import Floats, Worlds
+from ethbrake_marl.first_edition.game.harm import Ledger, empty_ledger
+from ethbrake_marl.first_edition.physics.advance import advance
+from ethbrake_marl.first_edition.physics.state import Floats, Worlds
 
 
 def play_profile(worlds: Worlds, vehicle: int, switch_s: Floats, command_mps2: Floats) -> tuple[Worlds, Ledger]:

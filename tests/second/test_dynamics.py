@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import yaml
 
-import ethbrake_marl.scenario as first
-from ethbrake_marl.envs.making import make_engine
+import ethbrake_marl.first_edition.scenario as first
 from ethbrake_marl.episode.injury import CURVES
+from ethbrake_marl.first_edition.envs.making import make_engine
 from ethbrake_marl.motion import layout as at
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.game import game_of

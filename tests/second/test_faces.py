@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.envs.gymnasium import EthBrakeEnv as FirstEnv
-from ethbrake_marl.envs.vector import EthBrakeVectorEnv as FirstVectorEnv
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.faces.gymnasium import EthBrakeEnv
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv, raw_env
 from ethbrake_marl.faces.sb3 import make_sb3_vec_env
 from ethbrake_marl.faces.vector import EthBrakeVectorEnv
+from ethbrake_marl.first_edition.envs.gymnasium import EthBrakeEnv as FirstEnv
+from ethbrake_marl.first_edition.envs.vector import EthBrakeVectorEnv as FirstVectorEnv
 from ethbrake_marl.worlds.catalogue import load_scenario
 from tests.fixtures.scenarios import SHIPPED
 from tests.second.same import ALONE, LEARNING, draws, same

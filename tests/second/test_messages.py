@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-import ethbrake_marl.scenario as first
-from ethbrake_marl.agents.driving import script_agents
-from ethbrake_marl.physics.messages import Messages
+import ethbrake_marl.first_edition.scenario as first
+from ethbrake_marl.first_edition.agents.driving import script_agents
+from ethbrake_marl.first_edition.physics.messages import Messages
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.channel import EXTENSIONS
 from ethbrake_marl.worlds.game import game_of

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-import ethbrake_marl.scenario as first
+import ethbrake_marl.first_edition.scenario as first
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.first_edition.scenario.tables import worlds_from_table as first_from_table
 from ethbrake_marl.motion.layout import (
     BRAKE_RATE,
     BRAKING,
@@ -24,7 +25,6 @@ from ethbrake_marl.motion.layout import (
     SPEED,
     WEIGHT,
 )
-from ethbrake_marl.scenario.tables import worlds_from_table as first_from_table
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.given import worlds_from_table
 from tests.fixtures.scenarios import SHIPPED

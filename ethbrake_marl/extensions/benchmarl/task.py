@@ -19,16 +19,16 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from ethbrake_marl.envs.making import feature_box, learner_action_space, make_engine
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.game.discrete_actions import index_to_action
-from ethbrake_marl.game.full_state import full_state, state_features
-from ethbrake_marl.game.observed import observation_for
-from ethbrake_marl.game.rewards import Reward
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.shields.attach import guard_of
-from ethbrake_marl.shields.options import ShieldOptions
+from ethbrake_marl.first_edition.envs.making import feature_box, learner_action_space, make_engine
+from ethbrake_marl.first_edition.game.discrete_actions import index_to_action
+from ethbrake_marl.first_edition.game.full_state import full_state, state_features
+from ethbrake_marl.first_edition.game.observed import observation_for
+from ethbrake_marl.first_edition.game.rewards import Reward
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.first_edition.shields.attach import guard_of
+from ethbrake_marl.first_edition.shields.options import ShieldOptions
 
 GROUP = "learners"
 

@@ -24,17 +24,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ethbrake_marl.agents.driving import script_agents
-from ethbrake_marl.agents.protocol import fixed_commands
-from ethbrake_marl.agents.received import Received, places_of
-from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics.estimates import move_on
-from ethbrake_marl.physics.messages import BRAKING_CAPACITY, LATENCY, MASS
-from ethbrake_marl.physics.motion import has_acted
-from ethbrake_marl.physics.state import Bools, Floats, Vehicles, Worlds
-from ethbrake_marl.scenario.sampling import middle_world
-from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.first_edition.agents.driving import script_agents
+from ethbrake_marl.first_edition.agents.protocol import fixed_commands
+from ethbrake_marl.first_edition.agents.received import Received, places_of
+from ethbrake_marl.first_edition.engine.scripts import Script
+from ethbrake_marl.first_edition.physics.estimates import move_on
+from ethbrake_marl.first_edition.physics.messages import BRAKING_CAPACITY, LATENCY, MASS
+from ethbrake_marl.first_edition.physics.motion import has_acted
+from ethbrake_marl.first_edition.physics.state import Bools, Floats, Vehicles, Worlds
+from ethbrake_marl.first_edition.scenario.sampling import middle_world
+from ethbrake_marl.first_edition.scenario.schema import Scenario
 
 TOUCHING_M = 1e-9  # a gap below this counts as contact, because received positions are rounded
 

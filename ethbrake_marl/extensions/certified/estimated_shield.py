@@ -22,24 +22,24 @@ from itertools import product
 
 import numpy as np
 
-from ethbrake_marl.agents.driving import script_agents
-from ethbrake_marl.agents.received import Received
-from ethbrake_marl.engine.memory import renew_memory, take_memory
-from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.extensions.certified.estimated import Ranges
 from ethbrake_marl.extensions.certified.estimating_agents import Odometer
 from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import MOST_CORNERS, Uncertainty
-from ethbrake_marl.game.harm import HarmCount
-from ethbrake_marl.physics.columns import Packed
-from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
-from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.shields.certify import Decision, plan_harm
-from ethbrake_marl.shields.comparison import seen_columns, worlds_at
-from ethbrake_marl.shields.rollouts import Proposer
-from ethbrake_marl.shields.running import put
-from ethbrake_marl.shields.step import StepShield
+from ethbrake_marl.first_edition.agents.driving import script_agents
+from ethbrake_marl.first_edition.agents.received import Received
+from ethbrake_marl.first_edition.engine.memory import renew_memory, take_memory
+from ethbrake_marl.first_edition.engine.scripts import Script
+from ethbrake_marl.first_edition.game.harm import HarmCount
+from ethbrake_marl.first_edition.physics.columns import Packed
+from ethbrake_marl.first_edition.physics.state import Bools, Floats, Ints, Worlds
+from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.first_edition.shields.certify import Decision, plan_harm
+from ethbrake_marl.first_edition.shields.comparison import seen_columns, worlds_at
+from ethbrake_marl.first_edition.shields.rollouts import Proposer
+from ethbrake_marl.first_edition.shields.running import put
+from ethbrake_marl.first_edition.shields.step import StepShield
 
 PER_WORLD = ("predicted_harm", "interventions", "_heard", "_asked_s", "_wanted", "_impact_s")  # attributes [n, ...]
 

@@ -8,15 +8,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.protocol import Agent, AgentAround, Knowledge, Source
-from ethbrake_marl.agents.received import Received
-from ethbrake_marl.engine.memory import Memory, ask_script, begin_script, renew_memory
-from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.extensions.certified.estimated import Ranges
-from ethbrake_marl.physics.messages import LATENCY
-from ethbrake_marl.physics.state import Floats, Vehicles, Worlds
-from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.shields.paper_hybrid import HybridAgent
+from ethbrake_marl.first_edition.agents.protocol import Agent, AgentAround, Knowledge, Source
+from ethbrake_marl.first_edition.agents.received import Received
+from ethbrake_marl.first_edition.engine.memory import Memory, ask_script, begin_script, renew_memory
+from ethbrake_marl.first_edition.engine.scripts import Script
+from ethbrake_marl.first_edition.physics.messages import LATENCY
+from ethbrake_marl.first_edition.physics.state import Floats, Vehicles, Worlds
+from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.first_edition.shields.paper_hybrid import HybridAgent
 
 
 class Odometer(NamedTuple):

@@ -7,16 +7,16 @@ spec (the text that names the agent). Error messages quote ``settings.spec``.
 
 from __future__ import annotations
 
-from ethbrake_marl.agents.e_v2x_bm.coupled import make_e_v2x_bm
-from ethbrake_marl.agents.protocol import Agent, Driver, Source, Team
-from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.estimating_agents import Estimating, EstimatingHybrid
 from ethbrake_marl.extensions.certified.options import RobustOptions, mode_uncertainty
 from ethbrake_marl.extensions.certified.uncertainty import UNCERTAINTY_EXAMPLE
+from ethbrake_marl.first_edition.agents.e_v2x_bm.coupled import make_e_v2x_bm
+from ethbrake_marl.first_edition.agents.protocol import Agent, Driver, Source, Team
+from ethbrake_marl.first_edition.agents.settings import AgentSettings
+from ethbrake_marl.first_edition.shields.drivers import ShieldedDriver, shielded
+from ethbrake_marl.first_edition.shields.factories import shield_episodes
 from ethbrake_marl.registry import Part
-from ethbrake_marl.shields.drivers import ShieldedDriver, shielded
-from ethbrake_marl.shields.factories import shield_episodes
 
 
 def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.engine.engine import Engine, Ruling
 from ethbrake_marl.extensions.certified.estimated_shield import EstimatedShield
-from ethbrake_marl.physics.state import Floats, Ints, Worlds
-from ethbrake_marl.shields.contract import Guarded, ShieldGuard, why
-from ethbrake_marl.shields.guard import StepGuard
+from ethbrake_marl.first_edition.engine.engine import Engine, Ruling
+from ethbrake_marl.first_edition.physics.state import Floats, Ints, Worlds
+from ethbrake_marl.first_edition.shields.contract import Guarded, ShieldGuard, why
+from ethbrake_marl.first_edition.shields.guard import StepGuard
 
 
 class RobustMode(IntEnum):

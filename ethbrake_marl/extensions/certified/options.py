@@ -6,17 +6,23 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ethbrake_marl.agents.protocol import Agent, Source
-from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.estimated_shield import EstimatedShield
 from ethbrake_marl.extensions.certified.guards import EstimatedGuard, RobustGuard, RobustMode
 from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import UNCERTAINTY_EXAMPLE, Uncertainty, parse_uncertainty
-from ethbrake_marl.scenario.schema import Scenario, as_scenario
-from ethbrake_marl.shields.contract import ShieldGuard, ShieldMode
-from ethbrake_marl.shields.options import ShieldOptions, check_mode, misplaced, one_learner, shielded_vehicle
+from ethbrake_marl.first_edition.agents.protocol import Agent, Source
+from ethbrake_marl.first_edition.engine.engine import Engine
+from ethbrake_marl.first_edition.engine.scripts import Script
+from ethbrake_marl.first_edition.scenario.schema import Scenario, as_scenario
+from ethbrake_marl.first_edition.shields.contract import ShieldGuard, ShieldMode
+from ethbrake_marl.first_edition.shields.options import (
+    ShieldOptions,
+    check_mode,
+    misplaced,
+    one_learner,
+    shielded_vehicle,
+)
 
 
 @dataclass(frozen=True)

@@ -9,14 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.uncertainty import Uncertainty
-from ethbrake_marl.game.harm import HarmCount
-from ethbrake_marl.physics.state import Bools, Worlds
-from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.shields.running import Running
-from ethbrake_marl.shields.step import StepShield
+from ethbrake_marl.first_edition.engine.scripts import Script
+from ethbrake_marl.first_edition.game.harm import HarmCount
+from ethbrake_marl.first_edition.physics.state import Bools, Worlds
+from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.first_edition.shields.running import Running
+from ethbrake_marl.first_edition.shields.step import StepShield
 
 
 class RobustShield(StepShield):

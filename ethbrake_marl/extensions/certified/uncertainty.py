@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
-from ethbrake_marl.physics.state import Floats, Vehicles, Worlds
-from ethbrake_marl.scenario.fields import QUANTITY
-from ethbrake_marl.shields.checks import is_amount
+from ethbrake_marl.first_edition.physics.state import Floats, Vehicles, Worlds
+from ethbrake_marl.first_edition.scenario.fields import QUANTITY
+from ethbrake_marl.first_edition.shields.checks import is_amount
 
 OF_VEHICLES = (  # fields of ``Vehicles``
     "braking_capacity_mps2", "driving_capacity_mps2", "latency_s", "mass_t", "brake_rate_mps3", "release_rate_mps3",

@@ -7,17 +7,17 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.extensions.cooperation.joint_optimum import measure, questions
 from ethbrake_marl.extensions.cooperation.levels import Json, Plan, common_worlds
 from ethbrake_marl.extensions.cooperation.results import write_ablation
 from ethbrake_marl.extensions.search.best_harm import best_harm, chunks_left
 from ethbrake_marl.extensions.studies.trainings import Timed, train_all
-from ethbrake_marl.game.harm import HARM_COUNTS
+from ethbrake_marl.first_edition.agents.making import make_agent
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS
+from ethbrake_marl.first_edition.scenario.task import Task
+from ethbrake_marl.first_edition.shields.episodes import drive_shielded
+from ethbrake_marl.first_edition.training.team import load_team
 from ethbrake_marl.progress import OnProgress
-from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.shields.episodes import drive_shielded
-from ethbrake_marl.training.team import load_team
 
 
 def run_ablation(

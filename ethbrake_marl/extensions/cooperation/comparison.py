@@ -15,12 +15,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from ethbrake_marl.evaluation.seeds import interquartile_mean, mean_over_seeds, share_over_seeds
 from ethbrake_marl.extensions.cooperation.joint_optimum import Harms, Measured
 from ethbrake_marl.extensions.cooperation.levels import TOLERANCE, Json
-from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
-from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.shields.episodes import Shielded
+from ethbrake_marl.first_edition.evaluation.seeds import interquartile_mean, mean_over_seeds, share_over_seeds
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.first_edition.physics.state import Floats
+from ethbrake_marl.first_edition.shields.episodes import Shielded
 
 
 def compare(measured: Sequence[Measured], searched: int) -> Json:

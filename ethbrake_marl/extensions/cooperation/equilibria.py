@@ -14,9 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.engine.profiles import MOST_PHASES, ProfileProblem, Profiles, profile_problem
 from ethbrake_marl.errors import InvalidInput, check_whole_number, renumbered
-from ethbrake_marl.evaluation.statistics import relative_decrease
 from ethbrake_marl.extensions.search.best_harm import (
     SEARCH_BUDGET,
     best_harm,
@@ -27,12 +25,14 @@ from ethbrake_marl.extensions.search.best_harm import (
 )
 from ethbrake_marl.extensions.search.problem import minimising, search_profiles, seeded
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
-from ethbrake_marl.game.objectives import Declared
-from ethbrake_marl.physics.episode import CLOCK
-from ethbrake_marl.physics.state import Bools, Floats, Ints, Vehicles, Worlds
-from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.first_edition.engine.profiles import MOST_PHASES, ProfileProblem, Profiles, profile_problem
+from ethbrake_marl.first_edition.evaluation.statistics import relative_decrease
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.first_edition.game.objectives import Declared
+from ethbrake_marl.first_edition.physics.episode import CLOCK
+from ethbrake_marl.first_edition.physics.state import Bools, Floats, Ints, Vehicles, Worlds
+from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.first_edition.scenario.task import Task
 
 STARTS = ("braking", "driving", "random")  # names of the constant commands with which the search begins
 

@@ -12,7 +12,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from ethbrake_marl.envs.rendering import COLOURS
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.extensions.report.style import (
     GREY,
@@ -25,7 +24,8 @@ from ethbrake_marl.extensions.report.style import (
     series_style,
 )
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.first_edition.envs.rendering import COLOURS
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS, HarmCount
 
 LINEAR = 0.1  # m2/s2; axes are linear below this harm and logarithmic above it, because harm varies by a factor of 100
 

@@ -19,9 +19,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.protocol import Driver, Team
-from ethbrake_marl.evaluation.identity import result_identity
-from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.extensions.cooperation.levels import (
     HARM,
     TOLERANCE,
@@ -34,16 +31,19 @@ from ethbrake_marl.extensions.cooperation.levels import (
 )
 from ethbrake_marl.extensions.search.best_harm import search_list, task_problem
 from ethbrake_marl.extensions.search.tables import BestHarmTable
-from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount, Ledger
-from ethbrake_marl.game.objectives import objective_harm
-from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+from ethbrake_marl.first_edition.agents.protocol import Driver, Team
+from ethbrake_marl.first_edition.evaluation.identity import result_identity
+from ethbrake_marl.first_edition.evaluation.rollout import evaluate
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS, HarmCount, Ledger
+from ethbrake_marl.first_edition.game.objectives import objective_harm
+from ethbrake_marl.first_edition.physics.state import Bools, Floats, Ints, Worlds
+from ethbrake_marl.first_edition.scenario.sample import Sample
+from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.first_edition.scenario.task import Task
+from ethbrake_marl.first_edition.shields.episodes import Shielded, drive_shielded
+from ethbrake_marl.first_edition.training.team import load_team
+from ethbrake_marl.first_edition.training.training import Training
 from ethbrake_marl.progress import OnProgress, Progress
-from ethbrake_marl.scenario.sample import Sample
-from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.shields.episodes import Shielded, drive_shielded
-from ethbrake_marl.training.team import load_team
-from ethbrake_marl.training.training import Training
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,21 +15,21 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.spec import split_names
 from ethbrake_marl.errors import InvalidInput, check_whole_number, count_of
-from ethbrake_marl.evaluation.identity import LIST_SEED
-from ethbrake_marl.evaluation.trial import load_runnable
 from ethbrake_marl.extensions.cooperation.sweep import Swept
 from ethbrake_marl.extensions.studies.folder import StudyFolder
 from ethbrake_marl.extensions.studies.trainings import TrainingJob
 from ethbrake_marl.files.overrides import Override
-from ethbrake_marl.physics.messages import refuse_untold
-from ethbrake_marl.physics.state import Floats, Worlds
-from ethbrake_marl.scenario.sample import Sample
-from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.training.recipe import WORDS, TrainingRecipe, load_recipe
-from ethbrake_marl.training.settings import read_settings
-from ethbrake_marl.training.training import Training
+from ethbrake_marl.first_edition.agents.spec import split_names
+from ethbrake_marl.first_edition.evaluation.identity import LIST_SEED
+from ethbrake_marl.first_edition.evaluation.trial import load_runnable
+from ethbrake_marl.first_edition.physics.messages import refuse_untold
+from ethbrake_marl.first_edition.physics.state import Floats, Worlds
+from ethbrake_marl.first_edition.scenario.sample import Sample
+from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.first_edition.training.recipe import WORDS, TrainingRecipe, load_recipe
+from ethbrake_marl.first_edition.training.settings import read_settings
+from ethbrake_marl.first_edition.training.training import Training
 
 LADDER = (
     "cooperation-0-sensors",

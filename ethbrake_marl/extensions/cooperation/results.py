@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.evaluation.conditions import message_words
 from ethbrake_marl.extensions.cooperation.comparison import compare
 from ethbrake_marl.extensions.cooperation.figures import ablation_figure, swept_axis
 from ethbrake_marl.extensions.cooperation.joint_optimum import Measured
@@ -20,8 +19,9 @@ from ethbrake_marl.extensions.cooperation.levels import CSV, FIGURE, HARM, JSON,
 from ethbrake_marl.extensions.report.style import write_picture
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, csv_text
 from ethbrake_marl.files.store import write_output
-from ethbrake_marl.game.harm import HARM_COUNTS
-from ethbrake_marl.training.run_folder import RunDirectory
+from ethbrake_marl.first_edition.evaluation.conditions import message_words
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS
+from ethbrake_marl.first_edition.training.run_folder import RunDirectory
 
 
 def write_ablation(plan: Plan, measured: Sequence[Measured], machine: str) -> tuple[Json, list[Path]]:

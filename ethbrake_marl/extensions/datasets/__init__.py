@@ -14,21 +14,21 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.driving import episode_engine, script_agents
-from ethbrake_marl.agents.protocol import Driver, Team
-from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput, PhysicsError
-from ethbrake_marl.evaluation.identity import LIST_SEED, result_versions
-from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.files.sheet import parquet_file
 from ethbrake_marl.files.store import check_target
-from ethbrake_marl.game.actions import command_to_action
-from ethbrake_marl.game.observations import Observations
-from ethbrake_marl.game.observed import observation_for
-from ethbrake_marl.game.rewards import Reward, reward_params
-from ethbrake_marl.physics.state import Ints, Worlds
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.first_edition.agents.driving import episode_engine, script_agents
+from ethbrake_marl.first_edition.agents.protocol import Driver, Team
+from ethbrake_marl.first_edition.engine.engine import Engine
+from ethbrake_marl.first_edition.evaluation.identity import LIST_SEED, result_versions
+from ethbrake_marl.first_edition.evaluation.lineup import make_lineup
+from ethbrake_marl.first_edition.game.actions import command_to_action
+from ethbrake_marl.first_edition.game.observations import Observations
+from ethbrake_marl.first_edition.game.observed import observation_for
+from ethbrake_marl.first_edition.game.rewards import Reward, reward_params
+from ethbrake_marl.first_edition.physics.state import Ints, Worlds
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.scenario.schema import Scenario
 
 _BATCH = 500  # number of worlds simulated together; it limits memory and has no effect on the episodes
 

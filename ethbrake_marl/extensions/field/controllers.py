@@ -13,14 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.protocol import Source
-from ethbrake_marl.agents.received import Received
-from ethbrake_marl.agents.settings import AgentSettings
-from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.yaml import parse_numeral
-from ethbrake_marl.physics.messages import ACCELERATION, MEASURED, Messages, refuse_untold
-from ethbrake_marl.physics.state import Bools, Floats, Worlds
+from ethbrake_marl.first_edition.agents.protocol import Source
+from ethbrake_marl.first_edition.agents.received import Received
+from ethbrake_marl.first_edition.agents.settings import AgentSettings
+from ethbrake_marl.first_edition.engine.scripts import Script
+from ethbrake_marl.first_edition.physics.messages import ACCELERATION, MEASURED, Messages, refuse_untold
+from ethbrake_marl.first_edition.physics.state import Bools, Floats, Worlds
 from ethbrake_marl.registry import Part
 
 _TOUCHING_M = 1e-6  # least gap for a law, because laws divide by the gap

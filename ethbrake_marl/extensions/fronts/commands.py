@@ -7,10 +7,10 @@ from typing import Annotated
 
 import typer
 
-from ethbrake_marl.agents.spec import split_specs
 from ethbrake_marl.cli.command import ForceOption, JobsOption, JsonOption, Out, SettingsOption, example
 from ethbrake_marl.cli.evaluate import read_task
 from ethbrake_marl.extensions.studies.commands import FolderOption
+from ethbrake_marl.first_edition.agents.spec import split_specs
 from ethbrake_marl.registry import Part
 
 DEFAULT_AGENTS = "e_v2x_bm,universal"  # agents that are compared with the front if the scenario has one learner
@@ -67,7 +67,7 @@ def front_command(
         from ethbrake_marl.extensions.report.style import picture_bytes
         from ethbrake_marl.files.store import check_folder
         from ethbrake_marl.files.yaml import parse_yaml
-        from ethbrake_marl.physics.state import checked_numbers
+        from ethbrake_marl.first_edition.physics.state import checked_numbers
 
         task = read_task(scenario, settings)
         chosen = task.scenario

@@ -16,10 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.protocol import Driver
-from ethbrake_marl.engine.profiles import ProfileProblem, Profiles
 from ethbrake_marl.errors import InvalidInput, check_one_learner
-from ethbrake_marl.evaluation.lineup import make_agents
 from ethbrake_marl.extensions.fronts.hypervolume import nondominated
 from ethbrake_marl.extensions.search.best_harm import (
     best_harm,
@@ -32,12 +29,15 @@ from ethbrake_marl.extensions.search.best_harm import (
 )
 from ethbrake_marl.extensions.search.problem import search_profiles
 from ethbrake_marl.extensions.search.shipped import shipped_profiles
-from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
-from ethbrake_marl.game.objectives import weighted_harm
-from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds, checked_numbers
-from ethbrake_marl.policies.shipped import shipped_policies
-from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.first_edition.agents.protocol import Driver
+from ethbrake_marl.first_edition.engine.profiles import ProfileProblem, Profiles
+from ethbrake_marl.first_edition.evaluation.lineup import make_agents
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.first_edition.game.objectives import weighted_harm
+from ethbrake_marl.first_edition.physics.state import Bools, Floats, Ints, Worlds, checked_numbers
+from ethbrake_marl.first_edition.policies.shipped import shipped_policies
+from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.first_edition.scenario.task import Task
 
 BUDGET = 3_000  # number of candidates per world and choice of weights
 

@@ -8,18 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.evaluation.conditions import Conditions
-from ethbrake_marl.evaluation.identity import result_versions, scenario_sha256, worlds_sha256
-from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.evaluation.statistics import Texts, mean, paired_difference
 from ethbrake_marl.extensions.fronts.front import Borne, Front, amounts_of
 from ethbrake_marl.extensions.fronts.hypervolume import MOST_DIMENSIONS, hypervolume
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet
-from ethbrake_marl.game.harm import HARM_COUNTS
-from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.scenario.sample import Sample
-from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.first_edition.agents.protocol import Team
+from ethbrake_marl.first_edition.evaluation.conditions import Conditions
+from ethbrake_marl.first_edition.evaluation.identity import result_versions, scenario_sha256, worlds_sha256
+from ethbrake_marl.first_edition.evaluation.rollout import evaluate
+from ethbrake_marl.first_edition.evaluation.statistics import Texts, mean, paired_difference
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS
+from ethbrake_marl.first_edition.physics.state import Floats
+from ethbrake_marl.first_edition.scenario.sample import Sample
+from ethbrake_marl.first_edition.scenario.schema import Scenario
 
 RESAMPLES = 200  # bootstrap samples of the worlds, for intervals of hypervolumes
 

@@ -7,7 +7,7 @@ from math import comb
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, check_whole_number
-from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.first_edition.physics.state import Floats
 
 MOST = 1_000  # largest number of choices of weights
 

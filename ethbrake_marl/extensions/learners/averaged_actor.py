@@ -17,9 +17,9 @@ from torch import Tensor, nn
 from ethbrake_marl.extensions.learners.optimizer import adam
 from ethbrake_marl.extensions.learners.scout import Scout
 from ethbrake_marl.extensions.learners.vine_recipe import VineRecipe
-from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
-from ethbrake_marl.training.networks import ACTIVATIONS, sb3_names, tensors_of
+from ethbrake_marl.first_edition.physics.state import Floats
+from ethbrake_marl.first_edition.policies.network_spec import Float32s, NetworkSpec
+from ethbrake_marl.first_edition.training.networks import ACTIVATIONS, sb3_names, tensors_of
 
 
 class Deterministic(BasePolicy):

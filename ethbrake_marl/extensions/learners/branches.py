@@ -15,15 +15,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.engine.state import State
-from ethbrake_marl.game.harm import HarmCount
-from ethbrake_marl.game.objectives import objective_harm, objectives_of
-from ethbrake_marl.game.observations import Observations
-from ethbrake_marl.physics.columns import columns
-from ethbrake_marl.physics.jit import compiled
-from ethbrake_marl.physics.state import Bools, Floats, Ints
-from ethbrake_marl.policies.network_spec import Float32s
+from ethbrake_marl.first_edition.engine.engine import Engine
+from ethbrake_marl.first_edition.engine.state import State
+from ethbrake_marl.first_edition.game.harm import HarmCount
+from ethbrake_marl.first_edition.game.objectives import objective_harm, objectives_of
+from ethbrake_marl.first_edition.game.observations import Observations
+from ethbrake_marl.first_edition.physics.columns import columns
+from ethbrake_marl.first_edition.physics.jit import compiled
+from ethbrake_marl.first_edition.physics.state import Bools, Floats, Ints
+from ethbrake_marl.first_edition.policies.network_spec import Float32s
 
 ROUNDING_MPS2 = 1e-5  # commands closer than this are equal: a network's rounding depends on its batch size
 

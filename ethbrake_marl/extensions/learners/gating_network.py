@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from ethbrake_marl.extensions.learners.optimizer import adam
 from ethbrake_marl.extensions.learners.scout import Scout
 from ethbrake_marl.extensions.learners.vine_recipe import VineRecipe
-from ethbrake_marl.policies.network_spec import Float32s
-from ethbrake_marl.training.networks import ACTIVATIONS
+from ethbrake_marl.first_edition.policies.network_spec import Float32s
+from ethbrake_marl.first_edition.training.networks import ACTIVATIONS
 
 
 class AveragedGatingNetwork(nn.Module):

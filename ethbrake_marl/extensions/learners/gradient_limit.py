@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ethbrake_marl.physics.elementary import exp, log
-from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.first_edition.physics.elementary import exp, log
+from ethbrake_marl.first_edition.physics.state import Floats
 
 REMEMBERED = 65_536  # number of measured gradients in memory
 

@@ -10,8 +10,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import update_learning_rate
 from torch.nn.functional import mse_loss, softplus
 
-from ethbrake_marl.engine.state import State
-from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.extensions.learners.averaged_actor import AveragedActor
 from ethbrake_marl.extensions.learners.branches import moving_rows, other_count, visit
 from ethbrake_marl.extensions.learners.mixture_policy import ExpertsPolicy
@@ -29,8 +27,10 @@ from ethbrake_marl.extensions.learners.scout import choose_rows
 from ethbrake_marl.extensions.learners.trust_radius import Tried
 from ethbrake_marl.extensions.learners.vine_model import VineModel
 from ethbrake_marl.extensions.learners.vine_recipe import VineRecipe
-from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.policies.network_spec import Float32s
+from ethbrake_marl.first_edition.engine.state import State
+from ethbrake_marl.first_edition.envs.sb3 import EthBrakeVecEnv
+from ethbrake_marl.first_edition.physics.state import Floats
+from ethbrake_marl.first_edition.policies.network_spec import Float32s
 
 
 class ExpertsModel(VineModel):

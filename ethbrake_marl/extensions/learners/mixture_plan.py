@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field, model_validator
 
 from ethbrake_marl.files.model import FileModel
-from ethbrake_marl.training.recipe import Fraction, Layers, NonNegative, Positive, Rate
+from ethbrake_marl.first_edition.training.recipe import Fraction, Layers, NonNegative, Positive, Rate
 
 
 class Shares(FileModel):

@@ -15,9 +15,9 @@ from torch import Tensor, nn
 from ethbrake_marl.extensions.learners.averaged_actor import AveragedActor, Deterministic
 from ethbrake_marl.extensions.learners.gating_network import AveragedGatingNetwork
 from ethbrake_marl.extensions.learners.vine_recipe import VineRecipe
-from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
-from ethbrake_marl.training.networks import tensors_of_layers
+from ethbrake_marl.first_edition.physics.state import Floats
+from ethbrake_marl.first_edition.policies.network_spec import Float32s, NetworkSpec
+from ethbrake_marl.first_edition.training.networks import tensors_of_layers
 
 
 class ExpertsPolicy(Deterministic):

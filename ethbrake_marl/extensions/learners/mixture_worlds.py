@@ -12,19 +12,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.engine.profiles import profile_problem
-from ethbrake_marl.engine.state import State
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.extensions.learners.branches import Act, Offsets, counted_harm, play_on, play_to_the_end
 from ethbrake_marl.extensions.learners.mixture_plan import ExpertsPlan
 from ethbrake_marl.extensions.search.problem import minimising
 from ethbrake_marl.extensions.search.templates import best_templates
-from ethbrake_marl.game.actions import command_to_action
-from ethbrake_marl.game.harm import HarmCount
-from ethbrake_marl.game.observations import Observations
-from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
-from ethbrake_marl.policies.network_spec import Float32s
+from ethbrake_marl.first_edition.engine.engine import Engine
+from ethbrake_marl.first_edition.engine.profiles import profile_problem
+from ethbrake_marl.first_edition.engine.state import State
+from ethbrake_marl.first_edition.game.actions import command_to_action
+from ethbrake_marl.first_edition.game.harm import HarmCount
+from ethbrake_marl.first_edition.game.observations import Observations
+from ethbrake_marl.first_edition.physics.state import Bools, Floats, Ints, Worlds
+from ethbrake_marl.first_edition.policies.network_spec import Float32s
 
 NO_DIFFERENCE = 1e-2  # returns that differ by less than this count as equal
 

@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import Field, ValidationInfo, field_validator
 
 from ethbrake_marl.files.model import FileModel
-from ethbrake_marl.training.recipe import Rate
+from ethbrake_marl.first_edition.training.recipe import Rate
 
 
 class OffsetRange(FileModel):

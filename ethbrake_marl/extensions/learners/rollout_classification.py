@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.extensions.learners.rollout_classification_model import RolloutClassificationModel
 from ethbrake_marl.extensions.learners.rollout_classification_recipe import RolloutClassificationRecipe
 from ethbrake_marl.extensions.learners.start_weights import padded
-from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
-from ethbrake_marl.training.algorithm import Algorithm
-from ethbrake_marl.training.training import Training
+from ethbrake_marl.first_edition.envs.sb3 import EthBrakeVecEnv
+from ethbrake_marl.first_edition.policies.network_spec import Float32s, NetworkSpec
+from ethbrake_marl.first_edition.training.algorithm import Algorithm
+from ethbrake_marl.first_edition.training.training import Training
 
 
 class RolloutClassification(Algorithm):

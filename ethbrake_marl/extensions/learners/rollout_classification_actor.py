@@ -21,11 +21,11 @@ from ethbrake_marl.extensions.learners.averaged_actor import Deterministic
 from ethbrake_marl.extensions.learners.optimizer import adam
 from ethbrake_marl.extensions.learners.rollout_classification_recipe import RolloutClassificationRecipe
 from ethbrake_marl.extensions.learners.scout import draw_rows
-from ethbrake_marl.physics.state import Floats, Ints
-from ethbrake_marl.policies.actor import Actor
-from ethbrake_marl.policies.layers import Layers
-from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
-from ethbrake_marl.training.networks import ACTIVATIONS, copy_of, tensors_of_layers
+from ethbrake_marl.first_edition.physics.state import Floats, Ints
+from ethbrake_marl.first_edition.policies.actor import Actor
+from ethbrake_marl.first_edition.policies.layers import Layers
+from ethbrake_marl.first_edition.policies.network_spec import Float32s, NetworkSpec
+from ethbrake_marl.first_edition.training.networks import ACTIVATIONS, copy_of, tensors_of_layers
 
 
 class _TorchActor(Actor):

@@ -8,18 +8,18 @@ import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
-from ethbrake_marl.engine.state import State
-from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.extensions.learners.branches import counted_harm, moving_rows, other_count, play_on
 from ethbrake_marl.extensions.learners.optimizer import descend, follow
 from ethbrake_marl.extensions.learners.rollout_classification_actor import ChoosingActor
 from ethbrake_marl.extensions.learners.rollout_classification_recipe import RolloutClassificationRecipe
 from ethbrake_marl.extensions.learners.vine_model import VineModel
-from ethbrake_marl.game.observations import Observations
-from ethbrake_marl.physics.state import Floats, Ints
-from ethbrake_marl.policies.network_spec import Float32s
-from ethbrake_marl.scenario.sampling import members_of
-from ethbrake_marl.scenario.schema import as_scenario
+from ethbrake_marl.first_edition.engine.state import State
+from ethbrake_marl.first_edition.envs.sb3 import EthBrakeVecEnv
+from ethbrake_marl.first_edition.game.observations import Observations
+from ethbrake_marl.first_edition.physics.state import Floats, Ints
+from ethbrake_marl.first_edition.policies.network_spec import Float32s
+from ethbrake_marl.first_edition.scenario.sampling import members_of
+from ethbrake_marl.first_edition.scenario.schema import as_scenario
 
 FOR_GOOD = 2**31  # number of steps beyond the length of any episode
 

@@ -8,18 +8,25 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from ethbrake_marl.agents.protocol import Source
 from ethbrake_marl.errors import InvalidInput, refuse_shipped_path
 from ethbrake_marl.extensions.learners.recipe_keys import AVERAGING, NO_SHAPING, Averaging, Focus, Holds, OffsetRange
 from ethbrake_marl.files.model import refuse
-from ethbrake_marl.policies.bundle import load_policy
-from ethbrake_marl.policies.network_spec import Activation, NetworkSpec
-from ethbrake_marl.policies.policy import Policy
-from ethbrake_marl.policies.shipped import load_shipped
+from ethbrake_marl.first_edition.agents.protocol import Source
+from ethbrake_marl.first_edition.policies.bundle import load_policy
+from ethbrake_marl.first_edition.policies.network_spec import Activation, NetworkSpec
+from ethbrake_marl.first_edition.policies.policy import Policy
+from ethbrake_marl.first_edition.policies.shipped import load_shipped
+from ethbrake_marl.first_edition.training.agents import make_policy_agent
+from ethbrake_marl.first_edition.training.recipe import (
+    ACTOR_LAYERS,
+    Layers,
+    NonNegative,
+    Positive,
+    Shape,
+    TrainingRecipe,
+)
+from ethbrake_marl.first_edition.training.recipes import BATCH_SIZE, NETWORK
 from ethbrake_marl.registry import Part
-from ethbrake_marl.training.agents import make_policy_agent
-from ethbrake_marl.training.recipe import ACTOR_LAYERS, Layers, NonNegative, Positive, Shape, TrainingRecipe
-from ethbrake_marl.training.recipes import BATCH_SIZE, NETWORK
 
 
 class ChoosingShape(Shape):

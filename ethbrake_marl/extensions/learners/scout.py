@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ethbrake_marl.physics.state import Floats, Ints
-from ethbrake_marl.policies.network_spec import Float32s
+from ethbrake_marl.first_edition.physics.state import Floats, Ints
+from ethbrake_marl.first_edition.policies.network_spec import Float32s
 
 WIDTH = 64  # units of the hidden layer
 

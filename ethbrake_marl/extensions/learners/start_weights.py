@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.policies.policy import Policy
-from ethbrake_marl.training.training import Training
+from ethbrake_marl.first_edition.policies.policy import Policy
+from ethbrake_marl.first_edition.training.training import Training
 
 
 def widened(policy: Policy, training: Training) -> dict[str, NDArray[np.float32]]:

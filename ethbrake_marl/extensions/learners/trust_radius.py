@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.policies.network_spec import Float32s
+from ethbrake_marl.first_edition.policies.network_spec import Float32s
 
 
 class Tried(NamedTuple):

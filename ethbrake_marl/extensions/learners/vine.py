@@ -11,16 +11,16 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch.optim import Optimizer
 
-from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.extensions.learners.mixture_model import ExpertsModel
 from ethbrake_marl.extensions.learners.start_weights import widened
 from ethbrake_marl.extensions.learners.vine_model import VineModel
 from ethbrake_marl.extensions.learners.vine_recipe import VineRecipe
-from ethbrake_marl.policies.bundle import load_policy
-from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
-from ethbrake_marl.policies.shipped import load_shipped
-from ethbrake_marl.training.algorithm import Algorithm
-from ethbrake_marl.training.training import Training
+from ethbrake_marl.first_edition.envs.sb3 import EthBrakeVecEnv
+from ethbrake_marl.first_edition.policies.bundle import load_policy
+from ethbrake_marl.first_edition.policies.network_spec import Float32s, NetworkSpec
+from ethbrake_marl.first_edition.policies.shipped import load_shipped
+from ethbrake_marl.first_edition.training.algorithm import Algorithm
+from ethbrake_marl.first_edition.training.training import Training
 
 
 class Vine(Algorithm):

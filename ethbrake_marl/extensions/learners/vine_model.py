@@ -11,8 +11,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from torch import Tensor
 
-from ethbrake_marl.engine.state import State
-from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.extensions.learners.averaged_actor import AveragedActor, Deterministic
 from ethbrake_marl.extensions.learners.branches import Act, Offsets, moving_rows, play_to_the_end
 from ethbrake_marl.extensions.learners.gradient_limit import CUT, REMEMBERED, limit_that_cuts, smallest_offset
@@ -21,8 +19,10 @@ from ethbrake_marl.extensions.learners.optimizer import descend, follow
 from ethbrake_marl.extensions.learners.scout import choose_rows
 from ethbrake_marl.extensions.learners.trust_radius import Tried, trusted_targets
 from ethbrake_marl.extensions.learners.vine_recipe import VineRecipe
-from ethbrake_marl.physics.state import Floats, Ints
-from ethbrake_marl.policies.network_spec import Float32s
+from ethbrake_marl.first_edition.engine.state import State
+from ethbrake_marl.first_edition.envs.sb3 import EthBrakeVecEnv
+from ethbrake_marl.first_edition.physics.state import Floats, Ints
+from ethbrake_marl.first_edition.policies.network_spec import Float32s
 
 
 class VineModel(BaseAlgorithm):

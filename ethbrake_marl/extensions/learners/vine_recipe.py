@@ -9,18 +9,18 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from ethbrake_marl.agents.protocol import Source
 from ethbrake_marl.errors import InvalidInput, refuse_shipped_path
 from ethbrake_marl.extensions.learners.mixture_plan import ExpertsPlan
 from ethbrake_marl.extensions.learners.recipe_keys import AVERAGING, NO_SHAPING, Averaging, Focus, Holds, OffsetRange
 from ethbrake_marl.files.model import refuse
-from ethbrake_marl.policies.network_spec import Activation, NetworkSpec
-from ethbrake_marl.policies.shipped import load_shipped, shipped_policies
+from ethbrake_marl.first_edition.agents.protocol import Source
+from ethbrake_marl.first_edition.policies.network_spec import Activation, NetworkSpec
+from ethbrake_marl.first_edition.policies.shipped import load_shipped, shipped_policies
+from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.first_edition.training.agents import make_policy_agent
+from ethbrake_marl.first_edition.training.recipe import ACTOR_LAYERS, Layers, Positive, Rate, Shape, TrainingRecipe
+from ethbrake_marl.first_edition.training.recipes import BATCH_SIZE, NETWORK
 from ethbrake_marl.registry import Part
-from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.training.agents import make_policy_agent
-from ethbrake_marl.training.recipe import ACTOR_LAYERS, Layers, Positive, Rate, Shape, TrainingRecipe
-from ethbrake_marl.training.recipes import BATCH_SIZE, NETWORK
 
 _RIGHT_START = "must be the name of a shipped policy, for instance ppo, or ppo@PATH or vine@PATH of a trained policy"
 

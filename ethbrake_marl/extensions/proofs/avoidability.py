@@ -27,9 +27,9 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.extensions.proofs.plans import empty_plan, fill_braking, fill_plan, time_to_limit, walk
-from ethbrake_marl.physics.jit import compiled
-from ethbrake_marl.physics.motion import BOUND, solo_motion, stopping_distances
-from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+from ethbrake_marl.first_edition.physics.jit import compiled
+from ethbrake_marl.first_edition.physics.motion import BOUND, solo_motion, stopping_distances
+from ethbrake_marl.first_edition.physics.state import Bools, Floats, Ints, Worlds
 
 ROUNDING_M = 1e-12  # a smaller overlap is a rounding error at gap 0, not an impact
 

@@ -16,8 +16,8 @@ import math
 from ethbrake_marl.extensions.proofs.followers import after
 from ethbrake_marl.extensions.proofs.line import FRONT_FIRST, LINE, follower, leader
 from ethbrake_marl.extensions.proofs.meetings import gentlest
-from ethbrake_marl.physics.jit import compiled
-from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.first_edition.physics.jit import compiled
+from ethbrake_marl.first_edition.physics.state import Floats
 
 CELL = 1e-3  # relative and absolute (m2/s2) precision of a minimum
 

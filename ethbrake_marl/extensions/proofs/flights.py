@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 
-from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.first_edition.physics.jit import compiled
 
 
 @compiled

@@ -17,8 +17,8 @@ import math
 from ethbrake_marl.extensions.proofs.flights import largest_lead, widest_flight
 from ethbrake_marl.extensions.proofs.line import FRONT_FIRST, LINE, follower, leader
 from ethbrake_marl.extensions.proofs.plans import fill_braking, fill_drive_then_brake, fill_plan, fill_window, walk
-from ethbrake_marl.physics.jit import compiled
-from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.first_edition.physics.jit import compiled
+from ethbrake_marl.first_edition.physics.state import Floats
 
 HELD_M = 1e-6  # largest rounding error of the gap to the leader
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from ethbrake_marl.physics.jit import compiled
-from ethbrake_marl.physics.motion import BOUND, solo_motion
-from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.first_edition.physics.jit import compiled
+from ethbrake_marl.first_edition.physics.motion import BOUND, solo_motion
+from ethbrake_marl.first_edition.physics.state import Floats
 
 
 class _Line(NamedTuple):

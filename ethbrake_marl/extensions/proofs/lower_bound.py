@@ -46,10 +46,10 @@ from ethbrake_marl.extensions.proofs.onset import (
     rounding,
 )
 from ethbrake_marl.extensions.proofs.plans import empty_plan, fill_braking, fill_drive_then_brake, walk
-from ethbrake_marl.game.harm import HarmCount
-from ethbrake_marl.physics.jit import by_parts, compiled
-from ethbrake_marl.physics.motion import solo_motion
-from ethbrake_marl.physics.state import Bools, Floats, Worlds
+from ethbrake_marl.first_edition.game.harm import HarmCount
+from ethbrake_marl.first_edition.physics.jit import by_parts, compiled
+from ethbrake_marl.first_edition.physics.motion import solo_motion
+from ethbrake_marl.first_edition.physics.state import Bools, Floats, Worlds
 
 _GRAZE_S = 1e-3  # largest rounding error in the time of a contact at closing speed 0
 

@@ -21,8 +21,8 @@ from ethbrake_marl.extensions.proofs.plans import (
     time_to_limit,
     walk,
 )
-from ethbrake_marl.physics.jit import compiled
-from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.first_edition.physics.jit import compiled
+from ethbrake_marl.first_edition.physics.state import Floats
 
 _GUARD = 2.0**-46  # largest relative rounding error of positions; closing speeds are lowered accordingly
 

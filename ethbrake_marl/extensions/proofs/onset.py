@@ -10,9 +10,9 @@ import numpy as np
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.proofs.avoidability import Avoidability
 from ethbrake_marl.extensions.proofs.line import LINE
-from ethbrake_marl.game.harm import HarmCount, check_harm_count, empty_ledger
-from ethbrake_marl.physics.advance import advance
-from ethbrake_marl.physics.state import Bools, Floats, Worlds
+from ethbrake_marl.first_edition.game.harm import HarmCount, check_harm_count, empty_ledger
+from ethbrake_marl.first_edition.physics.advance import advance
+from ethbrake_marl.first_edition.physics.state import Bools, Floats, Worlds
 
 EPS = 2.0**-52  # the spacing of doubles at 1
 

@@ -13,9 +13,9 @@ import math
 
 import numpy as np
 
-from ethbrake_marl.physics.jit import compiled
-from ethbrake_marl.physics.motion import contact
-from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.first_edition.physics.jit import compiled
+from ethbrake_marl.first_edition.physics.motion import contact
+from ethbrake_marl.first_edition.physics.state import Floats
 
 ENDS, ACCELERATIONS = 0, 1
 

@@ -11,8 +11,8 @@ from typing import Any, Literal
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics.elementary import exp, log
-from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.first_edition.physics.elementary import exp, log
+from ethbrake_marl.first_edition.physics.state import Floats
 
 DataDraw = Literal["rows", "normal", "lognormal", "quantiles"]  # how the scenario draws worlds: rows, or kind of a fit
 

@@ -22,7 +22,7 @@ from ethbrake_marl.extensions.recorded.formats import Format
 from ethbrake_marl.extensions.recorded.reading import LARGEST_BYTES, NotARecording
 from ethbrake_marl.extensions.recorded.states import read_recording
 from ethbrake_marl.files.plain import open_plain
-from ethbrake_marl.scenario.vehicle_types import MOST_NUMBERS
+from ethbrake_marl.first_edition.scenario.vehicle_types import MOST_NUMBERS
 
 
 class Rows(NamedTuple):

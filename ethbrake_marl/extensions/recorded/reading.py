@@ -22,7 +22,7 @@ from ethbrake_marl.errors import InvalidInput, plain_text
 from ethbrake_marl.extensions.recorded.formats import NUMBER, Format
 from ethbrake_marl.files.plain import open_plain
 from ethbrake_marl.files.yaml import parse_numeral
-from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.first_edition.physics.state import Floats
 
 HEAD = 11  # number of first lines that may be the header
 

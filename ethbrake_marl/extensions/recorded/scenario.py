@@ -15,10 +15,10 @@ from ethbrake_marl.errors import InvalidInput, count_of, naming_extras, plain_te
 from ethbrake_marl.extensions.recorded.fits import DataDraw, fit_rows
 from ethbrake_marl.extensions.recorded.formats import DataFormat, format_of
 from ethbrake_marl.files.yaml import flow_text
-from ethbrake_marl.scenario.catalogue import check_file_name, load_scenario
-from ethbrake_marl.scenario.fields import QUANTITY, RECORDING
-from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.scenario.vehicle_types import MOST_CHARACTERS
+from ethbrake_marl.first_edition.scenario.catalogue import check_file_name, load_scenario
+from ethbrake_marl.first_edition.scenario.fields import QUANTITY, RECORDING
+from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.first_edition.scenario.vehicle_types import MOST_CHARACTERS
 
 with naming_extras():
     from ethbrake_marl.extensions.recorded.folder import Rows, read_rows

@@ -16,7 +16,7 @@ import pandas as pd
 from ethbrake_marl.errors import InvalidInput, plain_text
 from ethbrake_marl.extensions.recorded.formats import HIGHD_META, Format
 from ethbrake_marl.extensions.recorded.reading import Source, open_source, read_columns
-from ethbrake_marl.scenario.fields import QUANTITY
+from ethbrake_marl.first_edition.scenario.fields import QUANTITY
 
 FASTEST_MPS, LONGEST_M = 75.0, 40.0  # largest speed (270 km/h) and length of a road vehicle
 

@@ -11,19 +11,19 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
-from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_harm
-from ethbrake_marl.envs.rendering import COLOURS
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, name_axes, new_figure, style_axes
 from ethbrake_marl.extensions.search.best_harm import scripted_commands
 from ethbrake_marl.extensions.search.limits import Limits, Unproven, known_limits
-from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
-from ethbrake_marl.physics.advance import advance
-from ethbrake_marl.physics.forecast import forecast
-from ethbrake_marl.physics.state import Floats, Worlds, make_worlds
-from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.first_edition.agents.e_v2x_bm.coupled import optimise_coupled
+from ethbrake_marl.first_edition.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_harm
+from ethbrake_marl.first_edition.envs.rendering import COLOURS
+from ethbrake_marl.first_edition.evaluation.conditions import Conditions
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.first_edition.physics.advance import advance
+from ethbrake_marl.first_edition.physics.forecast import forecast
+from ethbrake_marl.first_edition.physics.state import Floats, Worlds, make_worlds
+from ethbrake_marl.first_edition.scenario.task import Task
 
 POINTS = 2001  # number of evenly spaced decelerations; the breakpoints of the closed form are added
 

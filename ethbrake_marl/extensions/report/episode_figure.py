@@ -10,12 +10,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ethbrake_marl.envs.rendering import vehicle_colour
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.conditions import Conditions
-from ethbrake_marl.evaluation.record import EpisodeRecord
 from ethbrake_marl.extensions.report.style import DASHES, GREY, finish, in_our_style, label_text, name_axes, new_panels
-from ethbrake_marl.game.harm import HARM_COUNTS
+from ethbrake_marl.first_edition.envs.rendering import vehicle_colour
+from ethbrake_marl.first_edition.evaluation.conditions import Conditions
+from ethbrake_marl.first_edition.evaluation.record import EpisodeRecord
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS
 
 
 @in_our_style

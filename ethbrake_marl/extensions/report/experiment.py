@@ -11,14 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.learned import TRAINED_POLICY, TRAINED_TEAM
-from ethbrake_marl.agents.protocol import Driver
 from ethbrake_marl.errors import Unfamiliar
-from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.record import record_episode
-from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.evaluation.summary import SummaryTable, summarise
-from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.report.episode_figure import trajectories
 from ethbrake_marl.extensions.report.learners import learners_sheets
 from ethbrake_marl.extensions.report.page import Part, Section
@@ -29,12 +22,18 @@ from ethbrake_marl.extensions.report.style import write_picture
 from ethbrake_marl.extensions.report.three_tests import TESTS, brief, other_tests
 from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.sheet import Sheet
-from ethbrake_marl.game.harm import HarmCount
-from ethbrake_marl.game.rewards import RewardParams
-from ethbrake_marl.policies.manifest import installed_versions
-from ethbrake_marl.progress import OnProgress, Progress
-from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.training.experiment import (
+from ethbrake_marl.first_edition.agents.learned import TRAINED_POLICY, TRAINED_TEAM
+from ethbrake_marl.first_edition.agents.protocol import Driver
+from ethbrake_marl.first_edition.evaluation.evaluation import Evaluation
+from ethbrake_marl.first_edition.evaluation.record import record_episode
+from ethbrake_marl.first_edition.evaluation.rollout import evaluate
+from ethbrake_marl.first_edition.evaluation.summary import SummaryTable, summarise
+from ethbrake_marl.first_edition.evaluation.summary_row import SummaryRow
+from ethbrake_marl.first_edition.game.harm import HarmCount
+from ethbrake_marl.first_edition.game.rewards import RewardParams
+from ethbrake_marl.first_edition.policies.manifest import installed_versions
+from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.first_edition.training.experiment import (
     HYBRID,
     SHIELDED_TEAM,
     Experiment,
@@ -42,7 +41,8 @@ from ethbrake_marl.training.experiment import (
     compared_agents,
     write_results,
 )
-from ethbrake_marl.training.progress import objective_in_words
+from ethbrake_marl.first_edition.training.progress import objective_in_words
+from ethbrake_marl.progress import OnProgress, Progress
 
 BESIDE = ("full_brake", "e_v2x_bm")  # agents shown together with the policy in the figures and the other two tests
 

@@ -9,13 +9,13 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from ethbrake_marl.agents.driving import episode_engine
-from ethbrake_marl.agents.protocol import Driver, Team
-from ethbrake_marl.envs.rendering import Frame, Scene
-from ethbrake_marl.envs.trace import Trace
 from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of, need
-from ethbrake_marl.physics.state import Worlds
-from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.first_edition.agents.driving import episode_engine
+from ethbrake_marl.first_edition.agents.protocol import Driver, Team
+from ethbrake_marl.first_edition.envs.rendering import Frame, Scene
+from ethbrake_marl.first_edition.envs.trace import Trace
+from ethbrake_marl.first_edition.physics.state import Worlds
+from ethbrake_marl.first_edition.scenario.schema import Scenario
 
 Films = Mapping[str, Sequence[Scene]]  # scenes of each film of one world, by title
 

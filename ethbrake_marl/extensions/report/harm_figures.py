@@ -9,9 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, PercentFormatter
 
-from ethbrake_marl.envs.rendering import COLOURS
-from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.report.page import SLIM_IN
 from ethbrake_marl.extensions.report.style import (
     TITLES,
@@ -25,7 +22,10 @@ from ethbrake_marl.extensions.report.style import (
 )
 from ethbrake_marl.extensions.search.limit_measures import best_known_words
 from ethbrake_marl.extensions.search.regret import regrets_of
-from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.first_edition.envs.rendering import COLOURS
+from ethbrake_marl.first_edition.evaluation.evaluation import Evaluation
+from ethbrake_marl.first_edition.evaluation.summary_row import SummaryRow
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS, HarmCount
 
 _POINTS = 250  # number of points of a curve; more points would not be visible
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from ethbrake_marl.agents.learned import TRAINED_TEAM
-from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.statistics import mean, paired_difference
 from ethbrake_marl.files.sheet import Column, Row, Sheet
-from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
-from ethbrake_marl.training.experiment import without
+from ethbrake_marl.first_edition.agents.learned import TRAINED_TEAM
+from ethbrake_marl.first_edition.evaluation.evaluation import Evaluation
+from ethbrake_marl.first_edition.evaluation.statistics import mean, paired_difference
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.first_edition.training.experiment import without
 
 _HARM = {"first": "first-impact harm", "total": "total harm"}
 

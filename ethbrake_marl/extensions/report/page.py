@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING, Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from ethbrake_marl.envs.rendering import BODY_M
 from ethbrake_marl.errors import plain_text
-from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.extensions.report.player import DATA, PLAYER_SCRIPTS, Played
 from ethbrake_marl.files.sheet import Sheet
+from ethbrake_marl.first_edition.envs.rendering import BODY_M
+from ethbrake_marl.first_edition.evaluation.conditions import Conditions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from ethbrake_marl.evaluation.notes import Note
-from ethbrake_marl.evaluation.summary import RowsBeside, SummaryTable
 from ethbrake_marl.extensions.report.three_tests import is_as_shipped
-from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.first_edition.evaluation.notes import Note
+from ethbrake_marl.first_edition.evaluation.summary import RowsBeside, SummaryTable
+from ethbrake_marl.first_edition.scenario.task import Task
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.protocol import Driver
-from ethbrake_marl.evaluation.motion import EpisodeMotion, follow_episodes
-from ethbrake_marl.physics.state import Worlds
-from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.first_edition.agents.protocol import Driver
+from ethbrake_marl.first_edition.evaluation.motion import EpisodeMotion, follow_episodes
+from ethbrake_marl.first_edition.physics.state import Worlds
+from ethbrake_marl.first_edition.scenario.schema import Scenario
 
 PLAYER_SCRIPTS = ("player-motion.js", "player-view.js", "player.js")
 

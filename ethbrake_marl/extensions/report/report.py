@@ -12,16 +12,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.learned import TRAINED_POLICY, TRAINED_TEAM
-from ethbrake_marl.agents.protocol import Driver
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.evaluation.conditions import Conditions
-from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.notes import identity_line
-from ethbrake_marl.evaluation.shield_modes import ShieldModes, compare_modes
-from ethbrake_marl.evaluation.statistics import mean, share_of
-from ethbrake_marl.evaluation.summary import SummaryTable
-from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.report.harm_figures import harm_by_agent, harm_in_parts, regret_distribution
 from ethbrake_marl.extensions.report.page import Page, Part, Section
 from ethbrake_marl.extensions.report.player import Played
@@ -31,8 +22,17 @@ from ethbrake_marl.extensions.search.limits import Unproven
 from ethbrake_marl.extensions.search.regret import limits_of, regrets_of
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, Shown
 from ethbrake_marl.files.store import write_output
-from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
-from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.first_edition.agents.learned import TRAINED_POLICY, TRAINED_TEAM
+from ethbrake_marl.first_edition.agents.protocol import Driver
+from ethbrake_marl.first_edition.evaluation.conditions import Conditions
+from ethbrake_marl.first_edition.evaluation.evaluation import Evaluation
+from ethbrake_marl.first_edition.evaluation.notes import identity_line
+from ethbrake_marl.first_edition.evaluation.shield_modes import ShieldModes, compare_modes
+from ethbrake_marl.first_edition.evaluation.statistics import mean, share_of
+from ethbrake_marl.first_edition.evaluation.summary import SummaryTable
+from ethbrake_marl.first_edition.evaluation.summary_row import SummaryRow
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.first_edition.scenario.task import Task
 
 SHIELD_WORLDS = 200  # number of worlds in which each replacement by a shield is simulated again
 

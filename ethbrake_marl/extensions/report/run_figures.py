@@ -8,11 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from ethbrake_marl.envs.rendering import COLOURS
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.statistics import mean
-from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.report.style import (
     band,
     finish,
@@ -22,6 +18,10 @@ from ethbrake_marl.extensions.report.style import (
     new_panels,
     series_style,
 )
+from ethbrake_marl.first_edition.envs.rendering import COLOURS
+from ethbrake_marl.first_edition.evaluation.evaluation import Evaluation
+from ethbrake_marl.first_edition.evaluation.statistics import mean
+from ethbrake_marl.first_edition.evaluation.summary_row import SummaryRow
 
 _PANELS = (
     ("first_impact_harm", "First-impact harm (m²/s²)"),

@@ -12,9 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from ethbrake_marl.envs.rendering import BODY_M, vehicle_colour
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.evaluation.varying import drawn_alike
 from ethbrake_marl.extensions.report.style import (
     GREY,
     finish,
@@ -26,10 +24,12 @@ from ethbrake_marl.extensions.report.style import (
     style_axes,
     write_picture,
 )
-from ethbrake_marl.physics.state import Floats, Worlds
-from ethbrake_marl.scenario.fields import QUANTITY
-from ethbrake_marl.scenario.sample import Sample
-from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.first_edition.envs.rendering import BODY_M, vehicle_colour
+from ethbrake_marl.first_edition.evaluation.varying import drawn_alike
+from ethbrake_marl.first_edition.physics.state import Floats, Worlds
+from ethbrake_marl.first_edition.scenario.fields import QUANTITY
+from ethbrake_marl.first_edition.scenario.sample import Sample
+from ethbrake_marl.first_edition.scenario.schema import Scenario
 
 _ABREAST = 4  # number of distributions in a row of the figure
 

@@ -12,7 +12,7 @@ from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethod
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.report.style import GREY, band, finish, in_our_style, name_axes, new_panels, series_style
-from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.first_edition.physics.state import Floats
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.extensions.report.player import Played
 from ethbrake_marl.extensions.search.regret import regrets_of
-from ethbrake_marl.game.harm import HarmCount
-from ethbrake_marl.physics.state import Bools, Floats, Ints
+from ethbrake_marl.first_edition.evaluation.evaluation import Evaluation
+from ethbrake_marl.first_edition.game.harm import HarmCount
+from ethbrake_marl.first_edition.physics.state import Bools, Floats, Ints
 
 MOST_WORLDS = 50
 

@@ -15,10 +15,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.font_manager import findfont, get_font
 
-from ethbrake_marl.envs.rendering import COLOURS
 from ethbrake_marl.errors import InvalidInput, plain_text
 from ethbrake_marl.files.store import write_output
-from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.first_edition.envs.rendering import COLOURS
+from ethbrake_marl.first_edition.physics.state import Floats
 
 # Curves differ by marker and dashes as well as by colour.
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")

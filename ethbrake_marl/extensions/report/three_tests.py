@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.evaluation.summary import SummaryTable
 from ethbrake_marl.files.sheet import Column, Sheet
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.first_edition.evaluation.summary import SummaryTable
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.scenario.schema import Scenario
 
 TESTS = {
     "paper-random": "Main test, the paper's rules: Vehicle 2 may drive, there is no obstacle ahead of Vehicle 1, and"

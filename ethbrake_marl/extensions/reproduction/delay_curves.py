@@ -11,8 +11,6 @@ from functools import lru_cache
 
 import numpy as np
 
-from ethbrake_marl.evaluation.seeds import interquartile_mean
-from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.report.seed_curves import SeedCurve, seed_curves
 from ethbrake_marl.extensions.reproduction.folder import (
     Drawn,
@@ -37,10 +35,12 @@ from ethbrake_marl.extensions.reproduction.strategies import (
 from ethbrake_marl.extensions.reproduction.trainings import CURVES, HARM_COLUMN
 from ethbrake_marl.extensions.reproduction.verdicts import PROVEN, Less, Verdict, judge_statement
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet
-from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.training.recipe import load_recipe
-from ethbrake_marl.training.run_folder import RunDirectory
+from ethbrake_marl.first_edition.evaluation.seeds import interquartile_mean
+from ethbrake_marl.first_edition.evaluation.statistics import mean
+from ethbrake_marl.first_edition.physics.state import Floats
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.training.recipe import load_recipe
+from ethbrake_marl.first_edition.training.run_folder import RunDirectory
 
 HIGH, LOW = "high", "low"
 

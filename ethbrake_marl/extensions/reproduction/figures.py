@@ -10,10 +10,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ethbrake_marl.envs.rendering import vehicle_colour
-from ethbrake_marl.evaluation.record import EpisodeRecord
 from ethbrake_marl.extensions.report.style import GREY, band, finish, in_our_style, name_axes, new_panels, series_style
 from ethbrake_marl.files.sheet import Estimate
+from ethbrake_marl.first_edition.envs.rendering import vehicle_colour
+from ethbrake_marl.first_edition.evaluation.record import EpisodeRecord
 
 _ARROW_STEPS = 10  # time steps between arrows, as in the paper
 

@@ -28,10 +28,10 @@ from ethbrake_marl.extensions.reproduction.verdicts import (
     summarise_verdicts,
 )
 from ethbrake_marl.files.sheet import Estimate, Sheet, Shown, csv_text as csv_of
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.first_edition.training.run_folder import RunDirectory
 from ethbrake_marl.progress import OnProgress
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.training.run_folder import RunDirectory
 
 SETTINGS, RESULT = "reproduction.json", "result.json"
 

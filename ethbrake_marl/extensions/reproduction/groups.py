@@ -11,8 +11,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.reproduction.figures import estimates_figure
 from ethbrake_marl.extensions.reproduction.folder import (
     FIRST_IMPACTS,
@@ -42,9 +40,11 @@ from ethbrake_marl.extensions.reproduction.strategies import (
 )
 from ethbrake_marl.extensions.reproduction.verdicts import LIST_SEED, PREDICTED, PROVEN, Less, Verdict, judge_statement
 from ethbrake_marl.files.sheet import Sheet
-from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.first_edition.evaluation.evaluation import Evaluation
+from ethbrake_marl.first_edition.evaluation.statistics import mean
+from ethbrake_marl.first_edition.physics.state import Floats
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.scenario.schema import Scenario
 
 Groups = Mapping[str, Mapping[str, Floats]]  # group of worlds -> strategy -> harm of each world
 

@@ -10,10 +10,6 @@ from functools import lru_cache
 
 import numpy as np
 
-from ethbrake_marl.agents.learned import LearnedAgent
-from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS
 from ethbrake_marl.extensions.reproduction.folder import (
     FIRST_IMPACTS,
@@ -41,8 +37,12 @@ from ethbrake_marl.extensions.reproduction.strategies import (
 )
 from ethbrake_marl.extensions.reproduction.tables import Beside, beside_printed, decrease_verdict, selection_verdict
 from ethbrake_marl.extensions.reproduction.verdicts import PREDICTED, Verdict, judge_statement
-from ethbrake_marl.policies.shipped import load_shipped
-from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.agents.learned import LearnedAgent
+from ethbrake_marl.first_edition.agents.protocol import Agent
+from ethbrake_marl.first_edition.evaluation.evaluation import Evaluation
+from ethbrake_marl.first_edition.evaluation.statistics import mean
+from ethbrake_marl.first_edition.policies.shipped import load_shipped
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
 
 RANDOM, _HYBRID_WORLDS, _RANDOM_WORLDS, _KINDS = "paper-random", 5_000, 10_000, ("SAC", "PPO")
 

@@ -11,21 +11,21 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.evaluation.identity import result_identity, worlds_sha256
-from ethbrake_marl.evaluation.seeds import interquartile_mean
 from ethbrake_marl.extensions.report.seed_curves import SeedCurve, seed_curves
 from ethbrake_marl.extensions.report.style import write_picture
 from ethbrake_marl.extensions.studies.folder import StudyFolder
 from ethbrake_marl.extensions.studies.trainings import TrainingJob, train_all
 from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.store import write_output
-from ethbrake_marl.game.harm import HARM_COUNTS
-from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.first_edition.evaluation.identity import result_identity, worlds_sha256
+from ethbrake_marl.first_edition.evaluation.seeds import interquartile_mean
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS
+from ethbrake_marl.first_edition.policies.bundle import load_policy
+from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.first_edition.training.recipe import TrainingRecipe
+from ethbrake_marl.first_edition.training.run_folder import RunDirectory
+from ethbrake_marl.first_edition.training.training import Training
 from ethbrake_marl.progress import OnProgress
-from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.training.recipe import TrainingRecipe
-from ethbrake_marl.training.run_folder import RunDirectory
-from ethbrake_marl.training.training import Training
 
 _RETURNED = "return"  # name of the metric here
 

@@ -12,9 +12,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.evaluation.statistics import mean, paired_difference
 from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS
 from ethbrake_marl.extensions.reproduction.figures import changes_figure
 from ethbrake_marl.extensions.reproduction.folder import (
@@ -33,13 +30,16 @@ from ethbrake_marl.extensions.reproduction.tables import collision_rate
 from ethbrake_marl.extensions.reproduction.trainings import HARM_COLUMN, OPEN, PPO_PAPER
 from ethbrake_marl.extensions.reproduction.verdicts import HARM, LIST_SEED, PERCENT, Less, Verdict, compare_number
 from ethbrake_marl.files.sheet import Estimate, Sheet
-from ethbrake_marl.physics.state import Bools, Floats
-from ethbrake_marl.policies.shipped import load_shipped
+from ethbrake_marl.first_edition.agents.protocol import Agent
+from ethbrake_marl.first_edition.evaluation.rollout import evaluate
+from ethbrake_marl.first_edition.evaluation.statistics import mean, paired_difference
+from ethbrake_marl.first_edition.physics.state import Bools, Floats
+from ethbrake_marl.first_edition.policies.shipped import load_shipped
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.first_edition.training.recipe import load_recipe
+from ethbrake_marl.first_edition.training.run_folder import RunDirectory
 from ethbrake_marl.progress import Progress
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.training.recipe import load_recipe
-from ethbrake_marl.training.run_folder import RunDirectory
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,25 +9,25 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from ethbrake_marl.agents.learned import LearnedAgent
-from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.lineup import make_agents
-from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.extensions.reproduction.folder import Reproduction
 from ethbrake_marl.extensions.reproduction.trainings import EARLY, STOPPED
 from ethbrake_marl.extensions.reproduction.verdicts import LIST_SEED, PREDICTED, PROVEN
 from ethbrake_marl.extensions.search.limits import Unproven
 from ethbrake_marl.extensions.search.regret import limits_of
-from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.policies.bundle import load_policy
-from ethbrake_marl.policies.policy import Policy
-from ethbrake_marl.policies.shipped import load_shipped
+from ethbrake_marl.first_edition.agents.learned import LearnedAgent
+from ethbrake_marl.first_edition.agents.protocol import Agent
+from ethbrake_marl.first_edition.evaluation.evaluation import Evaluation
+from ethbrake_marl.first_edition.evaluation.lineup import make_agents
+from ethbrake_marl.first_edition.evaluation.rollout import evaluate
+from ethbrake_marl.first_edition.physics.state import Floats
+from ethbrake_marl.first_edition.policies.bundle import load_policy
+from ethbrake_marl.first_edition.policies.policy import Policy
+from ethbrake_marl.first_edition.policies.shipped import load_shipped
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.first_edition.shields.paper_hybrid import HybridAgent
+from ethbrake_marl.first_edition.training.run_folder import RunDirectory
 from ethbrake_marl.progress import Progress
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.shields.paper_hybrid import HybridAgent
-from ethbrake_marl.training.run_folder import RunDirectory
 
 FULL_BRAKE, PAIRWISE, COUPLED = "full_brake", "e_v2x_bm:pairwise", "e_v2x_bm"
 

@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
 
-from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.statistics import mean, rate, relative_decrease
 from ethbrake_marl.extensions.report.paper_rows import PaperRow
 from ethbrake_marl.extensions.reproduction.folder import Made, Parameter, csv_text
 from ethbrake_marl.extensions.reproduction.strategies import ABOUT_BASELINE, FULL_BRAKE, NAMES, PAIRWISE, harms
 from ethbrake_marl.extensions.reproduction.verdicts import HARM, PERCENT, PREDICTED, PROVEN, Verdict, compare_number
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet
-from ethbrake_marl.physics.state import Bools
+from ethbrake_marl.first_edition.evaluation.evaluation import Evaluation
+from ethbrake_marl.first_edition.evaluation.statistics import mean, rate, relative_decrease
+from ethbrake_marl.first_edition.physics.state import Bools
 
 _RATE, _MEAN_HARM, _DECREASE, _TOTAL = "collision rate", "average harm", "harm decrease", "total harm"
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
+from ethbrake_marl.first_edition.training.recipe import TrainingRecipe, load_recipe
 
 STOPPED, OPEN = "stopped", "open"
 

@@ -10,8 +10,6 @@ from functools import cache
 
 import numpy as np
 
-from ethbrake_marl.evaluation.lineup import make_agents
-from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
 from ethbrake_marl.extensions.report.episode_figure import trajectories
 from ethbrake_marl.extensions.report.page import Part
 from ethbrake_marl.extensions.report.player import Played
@@ -38,9 +36,11 @@ from ethbrake_marl.extensions.reproduction.strategies import (
 )
 from ethbrake_marl.extensions.reproduction.verdicts import LIST_SEED, Less, Verdict, judge_statement
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet
-from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.first_edition.evaluation.lineup import make_agents
+from ethbrake_marl.first_edition.evaluation.record import EpisodeRecord, record_episode
+from ethbrake_marl.first_edition.physics.state import Floats
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
 from ethbrake_marl.progress import Progress
-from ethbrake_marl.scenario.catalogue import load_scenario
 
 _AGENTS = (PPO, SAC, COUPLED, FULL_BRAKE)
 

@@ -27,9 +27,9 @@ from typing import Literal, get_args
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass as model
 
-from ethbrake_marl.evaluation.statistics import mean, paired_difference, unpaired_difference
 from ethbrake_marl.files.sheet import Column, Estimate
-from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.first_edition.evaluation.statistics import mean, paired_difference, unpaired_difference
+from ethbrake_marl.first_edition.physics.state import Floats
 
 Judgement = Literal["cannot agree", "differs", "undecided", "not run", "agrees"]  # in this order, the worst first
 

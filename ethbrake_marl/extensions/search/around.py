@@ -6,19 +6,19 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ethbrake_marl.agents.driving import record_commands
-from ethbrake_marl.agents.protocol import Agent, AgentAround, Source, check_agent, fixed_commands
-from ethbrake_marl.agents.settings import AgentSettings
-from ethbrake_marl.engine.memory import Memory
-from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import check_whole_number
 from ethbrake_marl.extensions.search.outlook import MOST_CANDIDATES, Outlook
 from ethbrake_marl.extensions.search.refine import refine
-from ethbrake_marl.game.harm import HarmCount, check_harm_count
-from ethbrake_marl.physics.episode import CLOCK
-from ethbrake_marl.physics.state import Floats, Worlds
+from ethbrake_marl.first_edition.agents.driving import record_commands
+from ethbrake_marl.first_edition.agents.protocol import Agent, AgentAround, Source, check_agent, fixed_commands
+from ethbrake_marl.first_edition.agents.settings import AgentSettings
+from ethbrake_marl.first_edition.engine.memory import Memory
+from ethbrake_marl.first_edition.engine.scripts import Script
+from ethbrake_marl.first_edition.game.harm import HarmCount, check_harm_count
+from ethbrake_marl.first_edition.physics.episode import CLOCK
+from ethbrake_marl.first_edition.physics.state import Floats, Worlds
+from ethbrake_marl.first_edition.scenario.schema import Scenario
 from ethbrake_marl.registry import Part
-from ethbrake_marl.scenario.schema import Scenario
 
 
 class Searched(AgentAround):

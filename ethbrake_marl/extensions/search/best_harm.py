@@ -18,24 +18,24 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.driving import record_commands, script_agents
-from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
-from ethbrake_marl.agents.protocol import Agent, Driver, fixed_commands
-from ethbrake_marl.engine.profiles import MOST_PHASES, ProfileProblem, Profiles, profile_problem
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError, check_one_learner
 from ethbrake_marl.extensions.proofs.onset import onset_states
 from ethbrake_marl.extensions.search.extreme_profiles import extreme_profiles
 from ethbrake_marl.extensions.search.problem import Found, minimising, search_profiles
 from ethbrake_marl.extensions.search.tables import COUNTS, LEFT_OUT, LOWERED, OBJECTIVE, BestHarmTable, BestKnown
-from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
-from ethbrake_marl.game.objectives import Declared
-from ethbrake_marl.physics.advance import advance
-from ethbrake_marl.physics.episode import CLOCK
-from ethbrake_marl.physics.left_out import leaving_out_failed
-from ethbrake_marl.physics.state import Floats, Ints, UInt64s, Worlds
-from ethbrake_marl.scenario.sample import Sample
-from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.first_edition.agents.driving import record_commands, script_agents
+from ethbrake_marl.first_edition.agents.e_v2x_bm.coupled import optimise_coupled
+from ethbrake_marl.first_edition.agents.protocol import Agent, Driver, fixed_commands
+from ethbrake_marl.first_edition.engine.profiles import MOST_PHASES, ProfileProblem, Profiles, profile_problem
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.first_edition.game.objectives import Declared
+from ethbrake_marl.first_edition.physics.advance import advance
+from ethbrake_marl.first_edition.physics.episode import CLOCK
+from ethbrake_marl.first_edition.physics.left_out import leaving_out_failed
+from ethbrake_marl.first_edition.physics.state import Floats, Ints, UInt64s, Worlds
+from ethbrake_marl.first_edition.scenario.sample import Sample
+from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.first_edition.scenario.task import Task
 
 SEARCH_BUDGET = 100_000  # candidates per world and count
 

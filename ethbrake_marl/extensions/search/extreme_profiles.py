@@ -15,7 +15,11 @@ import math
 
 import numpy as np
 
-from ethbrake_marl.engine.profiles import (
+from ethbrake_marl.extensions.proofs.line import FRONT_FIRST, REAR_FIRST
+from ethbrake_marl.extensions.proofs.meetings import meet_front, meet_rear
+from ethbrake_marl.extensions.proofs.plans import empty_plan
+from ethbrake_marl.extensions.search.profiles import allowed, copy_profile, largest
+from ethbrake_marl.first_edition.engine.profiles import (
     MOST_PHASES,
     ProfileProblem,
     Profiles,
@@ -23,13 +27,9 @@ from ethbrake_marl.engine.profiles import (
     copy_rows,
     make_search_world,
 )
-from ethbrake_marl.extensions.proofs.line import FRONT_FIRST, REAR_FIRST
-from ethbrake_marl.extensions.proofs.meetings import meet_front, meet_rear
-from ethbrake_marl.extensions.proofs.plans import empty_plan
-from ethbrake_marl.extensions.search.profiles import allowed, copy_profile, largest
-from ethbrake_marl.physics.episode import CLOCK, follow_whole
-from ethbrake_marl.physics.jit import compiled
-from ethbrake_marl.physics.state import Bools, Floats, Ints
+from ethbrake_marl.first_edition.physics.episode import CLOCK, follow_whole
+from ethbrake_marl.first_edition.physics.jit import compiled
+from ethbrake_marl.first_edition.physics.state import Bools, Floats, Ints
 
 KEPT = 12  # number of profiles of each world
 

@@ -7,14 +7,14 @@ from dataclasses import asdict
 from typing import Any
 
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.evaluation.agent_tally import AgentTally
-from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.identity import HELD
-from ethbrake_marl.evaluation.measure_sets import BASELINE, GroupColumn, Measure, MeasureSet, Silent
-from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.search.limits import Unproven
 from ethbrake_marl.extensions.search.regret import KNOWN_OF_WORLDS, Between, Regrets, limits_of, regrets_of
 from ethbrake_marl.files.sheet import DASH, Column
+from ethbrake_marl.first_edition.evaluation.agent_tally import AgentTally
+from ethbrake_marl.first_edition.evaluation.evaluation import Evaluation
+from ethbrake_marl.first_edition.evaluation.identity import HELD
+from ethbrake_marl.first_edition.evaluation.measure_sets import BASELINE, GroupColumn, Measure, MeasureSet, Silent
+from ethbrake_marl.first_edition.evaluation.summary_row import SummaryRow
 
 NAME = "limits"  # name of the entry point
 

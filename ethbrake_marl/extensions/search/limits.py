@@ -11,10 +11,10 @@ from ethbrake_marl.errors import count_of
 from ethbrake_marl.extensions.proofs.avoidability import avoidability
 from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
 from ethbrake_marl.extensions.search.shipped import best_known
-from ethbrake_marl.game.harm import HARM_COUNTS
-from ethbrake_marl.physics.motion import stopping_distances
-from ethbrake_marl.physics.state import Bools, Floats, Worlds
-from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS
+from ethbrake_marl.first_edition.physics.motion import stopping_distances
+from ethbrake_marl.first_edition.physics.state import Bools, Floats, Worlds
+from ethbrake_marl.first_edition.scenario.task import Task
 
 _VEHICLES, _DRIVEN = 3, 1
 

@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.engine.memory import Memory
-from ethbrake_marl.engine.profiles import ProfileProblem, profile_problem
 from ethbrake_marl.extensions.search.problem import minimising
-from ethbrake_marl.game.harm import HarmCount
-from ethbrake_marl.game.objectives import Declared
-from ethbrake_marl.physics.episode import Decisions
-from ethbrake_marl.physics.state import Floats, Worlds
+from ethbrake_marl.first_edition.engine.memory import Memory
+from ethbrake_marl.first_edition.engine.profiles import ProfileProblem, profile_problem
+from ethbrake_marl.first_edition.game.harm import HarmCount
+from ethbrake_marl.first_edition.game.objectives import Declared
+from ethbrake_marl.first_edition.physics.episode import Decisions
+from ethbrake_marl.first_edition.physics.state import Floats, Worlds
 
 MOST_CANDIDATES = 1_000_000  # most candidates per world
 

@@ -7,12 +7,12 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from ethbrake_marl.engine.profiles import MOST_PHASES, ProfileProblem, Profiles, make_search_world
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.extensions.search.profiles import search_world
-from ethbrake_marl.game.harm import HarmCount
-from ethbrake_marl.game.objectives import Declared, aim_of, objectives_of
-from ethbrake_marl.physics.state import Floats, UInt64s, Worlds
+from ethbrake_marl.first_edition.engine.profiles import MOST_PHASES, ProfileProblem, Profiles, make_search_world
+from ethbrake_marl.first_edition.game.harm import HarmCount
+from ethbrake_marl.first_edition.game.objectives import Declared, aim_of, objectives_of
+from ethbrake_marl.first_edition.physics.state import Floats, UInt64s, Worlds
 
 _MIX = 0xD1342543DE82EF95  # odd multiplier that spreads seeds over 64 bits
 

@@ -15,11 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.engine.profiles import SearchWorld, copy_rows
-from ethbrake_marl.physics.elementary import exp
-from ethbrake_marl.physics.episode import CLOCK, follow, follow_whole
-from ethbrake_marl.physics.jit import compiled
-from ethbrake_marl.physics.state import Floats, Ints, UInt64s
+from ethbrake_marl.first_edition.engine.profiles import SearchWorld, copy_rows
+from ethbrake_marl.first_edition.physics.elementary import exp
+from ethbrake_marl.first_edition.physics.episode import CLOCK, follow, follow_whole
+from ethbrake_marl.first_edition.physics.jit import compiled
+from ethbrake_marl.first_edition.physics.state import Floats, Ints, UInt64s
 
 RESOLUTION = 1048576.0  # commands are multiples of 1 / 2^20 m/s2: short to store and exactly repeatable
 

@@ -6,24 +6,24 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ethbrake_marl.agents.driving import record_commands
-from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
-from ethbrake_marl.agents.making import make_agent
-from ethbrake_marl.agents.protocol import Agent, Source, fixed_commands
-from ethbrake_marl.agents.settings import AgentSettings
-from ethbrake_marl.engine.memory import Memory
-from ethbrake_marl.engine.profiles import TIME_STEP_S, Profiles
-from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, renumbered
 from ethbrake_marl.extensions.search.outlook import MOST_CANDIDATES, Outlook, budget_of
 from ethbrake_marl.extensions.search.problem import search_profiles
 from ethbrake_marl.extensions.search.refine import refine
 from ethbrake_marl.extensions.search.shipped import shipped_profiles
-from ethbrake_marl.game.harm import HarmCount, check_harm_count
-from ethbrake_marl.physics.episode import CLOCK
-from ethbrake_marl.physics.state import Floats, Worlds
+from ethbrake_marl.first_edition.agents.driving import record_commands
+from ethbrake_marl.first_edition.agents.e_v2x_bm.coupled import optimise_coupled
+from ethbrake_marl.first_edition.agents.making import make_agent
+from ethbrake_marl.first_edition.agents.protocol import Agent, Source, fixed_commands
+from ethbrake_marl.first_edition.agents.settings import AgentSettings
+from ethbrake_marl.first_edition.engine.memory import Memory
+from ethbrake_marl.first_edition.engine.profiles import TIME_STEP_S, Profiles
+from ethbrake_marl.first_edition.engine.scripts import Script
+from ethbrake_marl.first_edition.game.harm import HarmCount, check_harm_count
+from ethbrake_marl.first_edition.physics.episode import CLOCK
+from ethbrake_marl.first_edition.physics.state import Floats, Worlds
+from ethbrake_marl.first_edition.scenario.schema import Scenario
 from ethbrake_marl.registry import Part
-from ethbrake_marl.scenario.schema import Scenario
 
 PROFILE_BUDGET = 20_000  # candidates in a world that is in no table
 

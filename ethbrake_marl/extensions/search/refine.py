@@ -18,15 +18,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.engine.profiles import ProfileProblem, SearchWorld, copy_rows, make_search_world
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number, count_of
 from ethbrake_marl.extensions.search.problem import seeded
 from ethbrake_marl.extensions.search.profiles import allowed, draw, draw_below, draw_command
-from ethbrake_marl.physics.elementary import exp
-from ethbrake_marl.physics.episode import CLOCK, GOES_ON, Episode, grid_of, restore, save, step_again, value_of
-from ethbrake_marl.physics.jit import compiled
-from ethbrake_marl.physics.rows import ROW
-from ethbrake_marl.physics.state import Bools, Floats, UInt64s
+from ethbrake_marl.first_edition.engine.profiles import ProfileProblem, SearchWorld, copy_rows, make_search_world
+from ethbrake_marl.first_edition.physics.elementary import exp
+from ethbrake_marl.first_edition.physics.episode import (
+    CLOCK,
+    GOES_ON,
+    Episode,
+    grid_of,
+    restore,
+    save,
+    step_again,
+    value_of,
+)
+from ethbrake_marl.first_edition.physics.jit import compiled
+from ethbrake_marl.first_edition.physics.rows import ROW
+from ethbrake_marl.first_edition.physics.state import Bools, Floats, UInt64s
 
 # fractions of the budget for drawing templates and for improving the best one; the rest improves the given commands
 TEMPLATE_SHARE, THEIR_CLIMB_SHARE = 0.3, 0.3

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.outcome import Outcome, Values
 from ethbrake_marl.extensions.search.limits import IncompleteTable, Limits, Unproven, known_limits
-from ethbrake_marl.game.harm import HarmCount
-from ethbrake_marl.physics.state import Bools, Floats
+from ethbrake_marl.first_edition.evaluation.evaluation import Evaluation
+from ethbrake_marl.first_edition.evaluation.outcome import Outcome, Values
+from ethbrake_marl.first_edition.game.harm import HarmCount
+from ethbrake_marl.first_edition.physics.state import Bools, Floats
 
 NO_HARM = 1e-3  # m2/s2; less harm (an impact at 0.03 m/s) is treated as 0
 

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ethbrake_marl.engine.profiles import ProfileProblem, Profiles
 from ethbrake_marl.extensions.search.best_harm import task_problem
 from ethbrake_marl.extensions.search.tables import BestHarmTable
-from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
-from ethbrake_marl.physics.state import Bools, Floats, Worlds
-from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.first_edition.engine.profiles import ProfileProblem, Profiles
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.first_edition.physics.state import Bools, Floats, Worlds
+from ethbrake_marl.first_edition.scenario.task import Task
 
 TABLES = Path(__file__).with_name("_tables")
 

@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from ethbrake_marl.engine.profiles import ProfileProblem, Profiles
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.files.arrays import ArrayArchive, ArrayRow
 from ethbrake_marl.files.model import first_mistake
 from ethbrake_marl.files.plain import parse_strict_json, read_plain
 from ethbrake_marl.files.store import write_file
-from ethbrake_marl.game.harm import HarmCount
-from ethbrake_marl.physics.state import Bools, Floats, Ints, UInt64s
+from ethbrake_marl.first_edition.engine.profiles import ProfileProblem, Profiles
+from ethbrake_marl.first_edition.game.harm import HarmCount
+from ethbrake_marl.first_edition.physics.state import Bools, Floats, Ints, UInt64s
 
 TABLE_FORMAT = 1
 

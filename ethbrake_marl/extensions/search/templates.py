@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from ethbrake_marl.engine.profiles import ProfileProblem, copy_rows, make_search_world
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.extensions.search.problem import seeded
 from ethbrake_marl.extensions.search.refine import Plan, copy_steps, draw_templates
-from ethbrake_marl.physics.jit import compiled
-from ethbrake_marl.physics.state import Floats, Ints, UInt64s
+from ethbrake_marl.first_edition.engine.profiles import ProfileProblem, copy_rows, make_search_world
+from ethbrake_marl.first_edition.physics.jit import compiled
+from ethbrake_marl.first_edition.physics.state import Floats, Ints, UInt64s
 
 
 def best_templates(problem: ProfileProblem, bound: Floats, *, number: int, seed: int = 0) -> tuple[Floats, Ints]:

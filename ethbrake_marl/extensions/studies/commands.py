@@ -9,11 +9,11 @@ from typing import Annotated, Any
 
 import typer
 
-from ethbrake_marl import evaluation, training
 from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, SettingsOption, example
 from ethbrake_marl.cli.evaluate import read_task
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.files.sheet import Sheet
+from ethbrake_marl.first_edition import evaluation, training
 
 REMAINS = "the same command continues the work in this folder"
 
@@ -195,10 +195,10 @@ def _drive_again(out: Out, file: Path, agent: str | None) -> None:
     """
     import numpy as np
 
-    from ethbrake_marl.agents.spec import parse_spec
     from ethbrake_marl.extensions.studies.named_worlds import NamedWorlds
     from ethbrake_marl.extensions.studies.weakness import Measure
-    from ethbrake_marl.scenario.sample import Sample
+    from ethbrake_marl.first_edition.agents.spec import parse_spec
+    from ethbrake_marl.first_edition.scenario.sample import Sample
 
     named = NamedWorlds.read(file)
     for spec in (*([named.agent] if agent is None else []), *([named.against] if named.against else [])):

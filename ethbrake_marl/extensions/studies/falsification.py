@@ -11,8 +11,8 @@ import numpy as np
 
 from ethbrake_marl.errors import check_whole_number
 from ethbrake_marl.extensions.studies.named_worlds import NamedWorld
-from ethbrake_marl.physics.state import Floats, Ints
-from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.first_edition.physics.state import Floats, Ints
+from ethbrake_marl.first_edition.scenario.sample import Sample
 
 Score = Callable[[Floats], Floats]  # points [n, d] of [0, 1) -> scores [n]; minus infinity: the point is invalid
 

@@ -14,13 +14,13 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.identity import scenario_sha256
 from ethbrake_marl.files.model import FileModel, Wording, read_model
 from ethbrake_marl.files.yaml import flow_text, read_yaml
-from ethbrake_marl.game.harm import HarmCount
-from ethbrake_marl.physics.state import Worlds
-from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.scenario.tables import worlds_from_table
+from ethbrake_marl.first_edition.evaluation.identity import scenario_sha256
+from ethbrake_marl.first_edition.game.harm import HarmCount
+from ethbrake_marl.first_edition.physics.state import Worlds
+from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.first_edition.scenario.tables import worlds_from_table
 
 MOST_NAMED_WORLDS = 1000  # largest number of worlds in a file
 

@@ -11,15 +11,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, plain_text
-from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.files.plain import read_object
+from ethbrake_marl.first_edition.evaluation.rollout import evaluate
+from ethbrake_marl.first_edition.physics.state import Worlds
+from ethbrake_marl.first_edition.scenario.sample import Sample
+from ethbrake_marl.first_edition.training.run_folder import RunDirectory
+from ethbrake_marl.first_edition.training.team import load_team
+from ethbrake_marl.first_edition.training.training import Training, check_same_training
 from ethbrake_marl.parallel import run_each
-from ethbrake_marl.physics.state import Worlds
 from ethbrake_marl.progress import OnProgress, Progress
-from ethbrake_marl.scenario.sample import Sample
-from ethbrake_marl.training.run_folder import RunDirectory
-from ethbrake_marl.training.team import load_team
-from ethbrake_marl.training.training import Training, check_same_training
 
 
 def train_all(trainings: Sequence[TrainingJob], jobs: int = 1, tell: OnProgress | None = None) -> bool:
@@ -82,7 +82,7 @@ class TrainingJob:
 
         Raises the exceptions of ``train`` and ``resume``.
         """
-        from ethbrake_marl.training.session import resume, train  # torch takes seconds to load
+        from ethbrake_marl.first_edition.training.session import resume, train  # torch takes seconds to load
 
         def say(progress: Progress) -> None:
             if tell is not None:
@@ -143,7 +143,7 @@ class TrainingJob:
 
         The policies drive at most 50 worlds of ``sample`` (None: of the list on which the recipe evaluates).
         """
-        from ethbrake_marl.training.session import train
+        from ethbrake_marl.first_edition.training.session import train
 
         reports: list[tuple[Progress, float]] = []  # with the CPU time
 

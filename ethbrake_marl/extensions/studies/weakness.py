@@ -8,18 +8,18 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from ethbrake_marl.agents.protocol import Driver
 from ethbrake_marl.errors import InvalidInput, PhysicsError, unknown_name
-from ethbrake_marl.evaluation.lineup import make_lineup
-from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.evaluation.varying import states_of
 from ethbrake_marl.extensions.studies.falsification import Falsified, Watcher, far_apart, search
 from ethbrake_marl.extensions.studies.named_worlds import NamedWorld
-from ethbrake_marl.game.harm import HarmCount
-from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.scenario.ranges import ranges
-from ethbrake_marl.scenario.sample import Sample
-from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.first_edition.agents.protocol import Driver
+from ethbrake_marl.first_edition.evaluation.lineup import make_lineup
+from ethbrake_marl.first_edition.evaluation.rollout import evaluate
+from ethbrake_marl.first_edition.evaluation.varying import states_of
+from ethbrake_marl.first_edition.game.harm import HarmCount
+from ethbrake_marl.first_edition.physics.state import Floats
+from ethbrake_marl.first_edition.scenario.ranges import ranges
+from ethbrake_marl.first_edition.scenario.sample import Sample
+from ethbrake_marl.first_edition.scenario.schema import Scenario
 
 MeasureName = Literal["harm", "regret", "difference", "bound"]
 

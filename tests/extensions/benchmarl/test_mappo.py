@@ -11,7 +11,7 @@ import torch
 
 import ethbrake_marl as eb
 from tests.docs.site import load
-from tests.learning.tiny import harm_beside_full_braking
+from tests.first_edition.learning.tiny import harm_beside_full_braking
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning", "ignore::FutureWarning")
 

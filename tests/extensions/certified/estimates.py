@@ -6,10 +6,10 @@ impacts fall on one moment, and the last bit decides which of them is first.
 """
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.driving import drive
-from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.shields.drivers import ShieldedDriver
-from tests.shield.attacks import Hostile
+from ethbrake_marl.first_edition.agents.driving import drive
+from ethbrake_marl.first_edition.physics.state import Floats
+from ethbrake_marl.first_edition.shields.drivers import ShieldedDriver
+from tests.first_edition.shield.attacks import Hostile
 
 WAYS = ("coast", "drive", "chance")
 ABOVE = 1e-6  # m2/s2; what is told is moved on with rounding

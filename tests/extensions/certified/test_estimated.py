@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.driving import drive
-from ethbrake_marl.agents.making import make_agent
-from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.shields.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
+from ethbrake_marl.first_edition.agents.driving import drive
+from ethbrake_marl.first_edition.agents.making import make_agent
+from ethbrake_marl.first_edition.physics.state import Floats
+from ethbrake_marl.first_edition.shields.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
 from tests.extensions.certified.estimates import ABOVE, HEARD_LATE, LISTS, NEVER_HEARD, WAYS, shielded
-from tests.shield.attacks import all_infos
-from tests.shield.plays import reported
+from tests.first_edition.shield.attacks import all_infos
+from tests.first_edition.shield.plays import reported
 
 BASE = eb.load_scenario("cooperation-2-paper").replace(early_impacts="keep")
 PERIODIC = BASE.replace(v2x={"preset": "blocked", "persistence": "periodic"})

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.driving import drive
-from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.shields.drivers import ShieldedDriver
-from ethbrake_marl.shields.evidence import review
-from tests.shield.test_step_shield import wavering
+from ethbrake_marl.first_edition.agents.driving import drive
+from ethbrake_marl.first_edition.agents.making import make_agent
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.shields.drivers import ShieldedDriver
+from ethbrake_marl.first_edition.shields.evidence import review
+from tests.first_edition.shield.test_step_shield import wavering
 
 SCENARIO = load_scenario("paper-random")
 WORLDS = SCENARIO.sample(60, 3).worlds

@@ -7,20 +7,20 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.driving import episode_engine
-from ethbrake_marl.agents.making import make_agent
-from ethbrake_marl.evaluation.shield_modes import compare_modes
 from ethbrake_marl.extensions.certified.guards import RobustMode
 from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
-from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.shields.drivers import ShieldedDriver
-from tests.evaluation.test_shield_modes import WORLDS
-from tests.shield import test_wrappers as wrappers
-from tests.shield.attacks import line
-from tests.shield.test_guard import PAPER, Counting, asks_once, drives_off, remembering
-from tests.shield.test_infos import INTERFACES, belonging
-from tests.shield.test_step_shield import begins_apart, coasts
+from ethbrake_marl.first_edition.agents.driving import episode_engine
+from ethbrake_marl.first_edition.agents.making import make_agent
+from ethbrake_marl.first_edition.evaluation.shield_modes import compare_modes
+from ethbrake_marl.first_edition.scenario.task import Task
+from ethbrake_marl.first_edition.shields.drivers import ShieldedDriver
+from tests.first_edition.evaluation.test_shield_modes import WORLDS
+from tests.first_edition.shield import test_wrappers as wrappers
+from tests.first_edition.shield.attacks import line
+from tests.first_edition.shield.test_guard import PAPER, Counting, asks_once, drives_off, remembering
+from tests.first_edition.shield.test_infos import INTERFACES, belonging
+from tests.first_edition.shield.test_step_shield import begins_apart, coasts
 
 MODES: dict[str, tuple[int, dict[str, Any]]] = {
     "robust": (2, {"uncertainty": "gaps_m=0.2"}),

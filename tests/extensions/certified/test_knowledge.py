@@ -4,16 +4,23 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.driving import drive, script_agents
-from ethbrake_marl.agents.making import make_agent
-from ethbrake_marl.agents.protocol import Source
-from ethbrake_marl.agents.received import Received
-from ethbrake_marl.agents.spec import parse_spec
-from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.certified.estimated import Ranges
 from ethbrake_marl.extensions.certified.estimating_agents import Odometer
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
-from tests.agents.test_knowledge import PAPER, agent_of, changed_decisions, check_stated, in_two, with_channels
+from ethbrake_marl.first_edition.agents.driving import drive, script_agents
+from ethbrake_marl.first_edition.agents.making import make_agent
+from ethbrake_marl.first_edition.agents.protocol import Source
+from ethbrake_marl.first_edition.agents.received import Received
+from ethbrake_marl.first_edition.agents.spec import parse_spec
+from ethbrake_marl.first_edition.evaluation.lineup import make_lineup
+from tests.first_edition.agents.test_knowledge import (
+    PAPER,
+    agent_of,
+    changed_decisions,
+    check_stated,
+    in_two,
+    with_channels,
+)
 
 BLOCKED = eb.load_scenario("cooperation-2-blocked")
 

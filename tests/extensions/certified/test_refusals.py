@@ -6,22 +6,22 @@ from typing import Any
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import registry
-from ethbrake_marl.agents.making import make_agent
-from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.agents.registry import Entry
 from ethbrake_marl.errors import UnknownName
-from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.certified.options import checked_uncertainty
 from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import Interval, Uncertainty, parse_uncertainty
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.shields.options import ShieldOptions
-from ethbrake_marl.shields.wrappers import HybridShield, ShieldedEnv
+from ethbrake_marl.first_edition.agents import registry
+from ethbrake_marl.first_edition.agents.making import make_agent
+from ethbrake_marl.first_edition.agents.protocol import Team
+from ethbrake_marl.first_edition.agents.registry import Entry
+from ethbrake_marl.first_edition.evaluation.lineup import make_lineup
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.shields.options import ShieldOptions
+from ethbrake_marl.first_edition.shields.wrappers import HybridShield, ShieldedEnv
+from tests.first_edition.shield.attacks import begun
 from tests.fixtures.commands import Refuse
 from tests.fixtures.lines import line as one_line
 from tests.refused import refused
-from tests.shield.attacks import begun
 
 PAPER, PAIR = load_scenario("paper-random"), load_scenario("cooperation-3-pair")
 PERIODIC = load_scenario("cooperation-2-paper").replace(v2x={"preset": "blocked", "persistence": "periodic"})

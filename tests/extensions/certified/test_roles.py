@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.agents.test_roles import SCENARIOS, check_role
+from tests.first_edition.agents.test_roles import SCENARIOS, check_role
 
 SPECS = {"e_v2x_bm": ["e_v2x_bm:estimated", "e_v2x_bm:pairwise:estimated"]}
 

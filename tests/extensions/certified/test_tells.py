@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.driving import drive
-from ethbrake_marl.agents.making import make_agent
-from ethbrake_marl.agents.received import Received
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics.messages import PIECES, USUAL_PIECES
-from tests.agents.test_knowledge import agent_of, changed_decisions
+from ethbrake_marl.first_edition.agents.driving import drive
+from ethbrake_marl.first_edition.agents.making import make_agent
+from ethbrake_marl.first_edition.agents.received import Received
+from ethbrake_marl.first_edition.physics.messages import PIECES, USUAL_PIECES
 from tests.extensions.certified.estimates import ABOVE, WAYS, shielded
 from tests.extensions.certified.test_knowledge import BASE, engine_of, estimated
+from tests.first_edition.agents.test_knowledge import agent_of, changed_decisions
 
 LACKING = {
     "capacity and mass": ["place", "speed", "acceleration", "latency"],

@@ -8,21 +8,21 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.driving import drive
-from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.extensions.certified.options import checked_uncertainty
 from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.shields.certify import plan_harm
-from ethbrake_marl.shields.drivers import ShieldedDriver
-from ethbrake_marl.shields.reasons import ShieldReason
+from ethbrake_marl.first_edition.agents.driving import drive
+from ethbrake_marl.first_edition.agents.making import make_agent
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.first_edition.scenario.task import Task
+from ethbrake_marl.first_edition.shields.certify import plan_harm
+from ethbrake_marl.first_edition.shields.drivers import ShieldedDriver
+from ethbrake_marl.first_edition.shields.reasons import ShieldReason
+from tests.first_edition.physics.random_worlds import Draws
+from tests.first_edition.shield.attacks import Hostile, begun, line
 from tests.fixtures.lines import line as one_line
 from tests.golden.test_golden import decisions_hash
-from tests.physics.random_worlds import Draws
-from tests.shield.attacks import Hostile, begun, line
 
 EVERY = {
     3: "braking_capacity_mps2=5%,latency_s.vehicle_2=0.15,gaps_m.pair_1=0.5,mass_t.vehicle_3=20%",

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.engine.profiles import ProfileProblem
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.extensions.cooperation import (
     Equilibrium,
@@ -18,11 +17,12 @@ from ethbrake_marl.extensions.cooperation import (
 )
 from ethbrake_marl.extensions.search.best_harm import joined, scripted_commands, starting_profiles, task_problem
 from ethbrake_marl.extensions.search.problem import Found, search_profiles
-from ethbrake_marl.game.harm import HARM_COUNTS
-from ethbrake_marl.game.objectives import aim_of, parse_objective
-from ethbrake_marl.physics.episode import CLOCK, Decisions
-from ethbrake_marl.physics.state import Floats, Worlds
-from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.first_edition.engine.profiles import ProfileProblem
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS
+from ethbrake_marl.first_edition.game.objectives import aim_of, parse_objective
+from ethbrake_marl.first_edition.physics.episode import CLOCK, Decisions
+from ethbrake_marl.first_edition.physics.state import Floats, Worlds
+from ethbrake_marl.first_edition.scenario.task import Task
 
 LEVELS = ("cooperation-3-pair", "cooperation-4-all")
 

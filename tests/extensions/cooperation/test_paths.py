@@ -5,7 +5,7 @@ from pathlib import Path
 
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.cooperation.levels import plan_ablation
-from ethbrake_marl.training.recipe import TrainingRecipe
+from ethbrake_marl.first_edition.training.recipe import TrainingRecipe
 
 
 def test_recipes_and_levels__may_lie_in_folders_of_any_name(empty_folder: Path) -> None:

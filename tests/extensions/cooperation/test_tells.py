@@ -8,7 +8,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.cooperation.levels import common_worlds, plan_ablation, read_levels
-from ethbrake_marl.physics.messages import USUAL_PIECES
+from ethbrake_marl.first_edition.physics.messages import USUAL_PIECES
 from tests.fixtures.commands import run_command
 
 SEEN = ["own", "front_1", "rear_1", "front_1.intent", "rear_1.intent"]

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.driving import record_commands
-from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.extensions.field.controllers import LAWS, Parameters, Seen, fuzzy
+from ethbrake_marl.first_edition.agents.driving import record_commands
+from ethbrake_marl.first_edition.agents.making import make_agent
 from tests.refused import refused
 
 

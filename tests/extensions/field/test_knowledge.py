@@ -2,8 +2,15 @@
 
 import pytest
 
-from ethbrake_marl.agents.protocol import Source
-from tests.agents.test_knowledge import BLOCKED, agent_of, changed_decisions, check_stated, in_two, with_channels
+from ethbrake_marl.first_edition.agents.protocol import Source
+from tests.first_edition.agents.test_knowledge import (
+    BLOCKED,
+    agent_of,
+    changed_decisions,
+    check_stated,
+    in_two,
+    with_channels,
+)
 
 STATED = {
     **dict.fromkeys(("idm", "acc", "cacc", "rss", "r157_human", "r157_fsm", "aeb", "idm:T=1.5"), (Source.MESSAGES,)),

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.agents.test_roles import SCENARIOS, check_role
+from tests.first_edition.agents.test_roles import SCENARIOS, check_role
 
 SPECS = {"acc": ["acc"], "aeb": ["aeb:ttc=2"], "cacc": ["cacc:T=0.8"], "idm": ["idm:T=1.0"], "r157_fsm": ["r157_fsm"],
          "r157_human": ["r157_human"], "rss": ["rss"]}  # fmt: skip

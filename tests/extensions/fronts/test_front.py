@@ -5,14 +5,14 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.statistics import mean, paired_difference
 from ethbrake_marl.extensions.fronts.front import Front, amounts_of, least_largest, search_front
 from ethbrake_marl.extensions.fronts.results import FRONT, front_results, front_sheet, full_braking, hypervolumes
 from ethbrake_marl.extensions.fronts.weights import corners, weight_grid
 from ethbrake_marl.extensions.search.best_harm import task_problem
 from ethbrake_marl.extensions.search.shipped import best_known
-from ethbrake_marl.scenario.task import Task
-from tests.evaluation.test_clusters import recorded
+from ethbrake_marl.first_edition.evaluation.statistics import mean, paired_difference
+from ethbrake_marl.first_edition.scenario.task import Task
+from tests.first_edition.evaluation.test_clusters import recorded
 
 PAPER = eb.load_scenario("paper-random")
 WORLDS = PAPER.sample(40, 7).worlds

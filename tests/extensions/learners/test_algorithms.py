@@ -15,7 +15,6 @@ import torch
 from stable_baselines3.common.logger import Logger
 
 import ethbrake_marl as eb
-from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.extensions.learners.branches import visit
 from ethbrake_marl.extensions.learners.gradient_limit import limit_that_cuts, smallest_offset
 from ethbrake_marl.extensions.learners.mixture_plan import ExpertsPlan
@@ -34,16 +33,17 @@ from ethbrake_marl.extensions.learners.start_weights import widened
 from ethbrake_marl.extensions.learners.trust_radius import Tried, trusted_targets
 from ethbrake_marl.extensions.learners.vine_model import VineModel
 from ethbrake_marl.extensions.search.templates import best_templates
-from ethbrake_marl.game.objectives import scored
-from ethbrake_marl.scenario.sampling import members_of
-from ethbrake_marl.training.finite import TrainingDiverged
-from ethbrake_marl.training.models import make_environment, make_model
-from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
-from ethbrake_marl.training.session import train
-from ethbrake_marl.training.training import Training
-from tests.evaluation.test_rollout import check_beyond
+from ethbrake_marl.first_edition.engine.profiles import profile_problem
+from ethbrake_marl.first_edition.game.objectives import scored
+from ethbrake_marl.first_edition.scenario.sampling import members_of
+from ethbrake_marl.first_edition.training.finite import TrainingDiverged
+from ethbrake_marl.first_edition.training.models import make_environment, make_model
+from ethbrake_marl.first_edition.training.recipe import TrainingRecipe, load_recipe
+from ethbrake_marl.first_edition.training.session import train
+from ethbrake_marl.first_edition.training.training import Training
 from tests.extensions.learners.tiny import EXPERTS, TINY_EXPERTS, TINY_ROLLOUTS, TINY_VINE
-from tests.policies.test_networks import check_mixture
+from tests.first_edition.evaluation.test_rollout import check_beyond
+from tests.first_edition.policies.test_networks import check_mixture
 
 SCENARIO = eb.load_scenario("paper-random")
 

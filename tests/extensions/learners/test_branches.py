@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.engine.state import State
-from ethbrake_marl.envs.making import make_engine
 from ethbrake_marl.extensions.learners import branches
 from ethbrake_marl.extensions.learners.branches import Offsets, play_to_the_end
-from tests.physics.random_worlds import line
+from ethbrake_marl.first_edition.engine.engine import Engine
+from ethbrake_marl.first_edition.engine.state import State
+from ethbrake_marl.first_edition.envs.making import make_engine
+from tests.first_edition.physics.random_worlds import line
 
 PAIR = ["vehicle_2", "vehicle_3"]
 

@@ -2,8 +2,15 @@
 
 import pytest
 
-from ethbrake_marl.agents.protocol import Source
-from tests.agents.test_knowledge import BLOCKED, agent_of, changed_decisions, check_stated, in_two, with_channels
+from ethbrake_marl.first_edition.agents.protocol import Source
+from tests.first_edition.agents.test_knowledge import (
+    BLOCKED,
+    agent_of,
+    changed_decisions,
+    check_stated,
+    in_two,
+    with_channels,
+)
 
 STATED = {"rollout-obstacle": (Source.MESSAGES,)}
 APART = {"vine@PATH", "rollout-classification@PATH"}  # they need a run, and have tests of their own

@@ -9,10 +9,10 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.errors import UnknownName
 from ethbrake_marl.extensions.learners.start_weights import widened
-from ethbrake_marl.training.recipe import load_recipe
-from ethbrake_marl.training.session import train
-from ethbrake_marl.training.settings import read_settings
-from ethbrake_marl.training.training import Training
+from ethbrake_marl.first_edition.training.recipe import load_recipe
+from ethbrake_marl.first_edition.training.session import train
+from ethbrake_marl.first_edition.training.settings import read_settings
+from ethbrake_marl.first_edition.training.training import Training
 from tests.extensions.learners.tiny import TINY_EXPERTS, TINY_ROLLOUTS, TINY_VINE
 from tests.fixtures.policies import make_policy
 from tests.refused import refused

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.agents.test_roles import SCENARIOS, check_role
+from tests.first_edition.agents.test_roles import SCENARIOS, check_role
 
 SPECS = {"vine": ["vine@mine"], "rollout-classification": ["rollout-classification@mine"]}
 

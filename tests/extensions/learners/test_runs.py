@@ -6,16 +6,24 @@ from pathlib import Path
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.evaluation.summary import summarise
-from ethbrake_marl.training import session as train_module
-from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
-from ethbrake_marl.training.run_folder import RunDirectory
+from ethbrake_marl.first_edition.evaluation.rollout import evaluate
+from ethbrake_marl.first_edition.evaluation.summary import summarise
+from ethbrake_marl.first_edition.training import session as train_module
+from ethbrake_marl.first_edition.training.recipe import TrainingRecipe, load_recipe
+from ethbrake_marl.first_edition.training.run_folder import RunDirectory
 from tests.cli.test_scenarios import check_new_recipe
 from tests.extensions.learners.tiny import EXPERTS, TINY_EXPERTS, TINY_ROLLOUTS, TINY_VINE
+from tests.first_edition.learning.test_runs import (
+    MIXTURE,
+    Whole,
+    check_one_update,
+    check_resumed,
+    measure,
+    stop,
+    trained_once,
+)
+from tests.first_edition.learning.test_teams import check_meanings, check_shipped
 from tests.fixtures.policies import make_policy
-from tests.learning.test_runs import MIXTURE, Whole, check_one_update, check_resumed, measure, stop, trained_once
-from tests.learning.test_teams import check_meanings, check_shipped
 from tests.refused import refused
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of those who read event files

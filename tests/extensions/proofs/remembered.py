@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.extensions.proofs import lower_bound, onset
-from ethbrake_marl.physics.state import Bools, Floats
+from ethbrake_marl.first_edition.physics.state import Bools, Floats
 
 # Evaluations prove their limits, a millisecond for each world, and many tests evaluate on the same worlds. Who asks
 # for the lower bound itself gets it computed.

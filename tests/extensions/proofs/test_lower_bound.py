@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.extensions.proofs.avoidability import avoidability
 from ethbrake_marl.extensions.proofs.branch_and_bound import CELLS, HEAP_WIDTH, lacking
 from ethbrake_marl.extensions.proofs.flights import lead, widest_flight
@@ -18,11 +17,12 @@ from ethbrake_marl.extensions.proofs.onset import rounding
 from ethbrake_marl.extensions.proofs.plans import empty_plan
 from ethbrake_marl.extensions.search.problem import search_profiles
 from ethbrake_marl.extensions.search.shipped import best_known
-from ethbrake_marl.game.harm import empty_ledger
-from ethbrake_marl.physics.advance import advance
-from ethbrake_marl.physics.state import Worlds, make_worlds
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.first_edition.engine.profiles import profile_problem
+from ethbrake_marl.first_edition.game.harm import empty_ledger
+from ethbrake_marl.first_edition.physics.advance import advance
+from ethbrake_marl.first_edition.physics.state import Worlds, make_worlds
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.scenario.task import Task
 from tests.fixtures.lines import REGIONS, line, moved_profiles, opening, random_profiles, wide_worlds, worlds_of
 from tests.reference.play_profile import play_profile
 

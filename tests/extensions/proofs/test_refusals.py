@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ethbrake_marl.engine.profiles import ProfileProblem, Profiles, profile_problem
 from ethbrake_marl.errors import CorruptBundle
 from ethbrake_marl.extensions.proofs.avoidability import avoidability
 from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
 from ethbrake_marl.extensions.search.best_harm import best_harm
 from ethbrake_marl.extensions.search.shipped import TABLES
 from ethbrake_marl.extensions.search.tables import BestHarmTable
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.first_edition.engine.profiles import ProfileProblem, Profiles, profile_problem
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.scenario.task import Task
 from tests.fixtures.lines import line, wide_worlds
 from tests.programmes.hostile import good_table
 from tests.refused import refused

@@ -7,12 +7,6 @@ from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
-from ethbrake_marl.envs.rendering import BODY_M
-from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
-from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.evaluation.statistics import mean
-from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.extensions.report import deceleration as module
 from ethbrake_marl.extensions.report.deceleration import deceleration_curve, deceleration_figure
 from ethbrake_marl.extensions.report.episode_figure import trajectories
@@ -22,11 +16,17 @@ from ethbrake_marl.extensions.report.scenario_figures import worlds_figure
 from ethbrake_marl.extensions.report.seed_curves import SeedCurve, seed_curves
 from ethbrake_marl.extensions.report.style import label_text, new_figure, picture_bytes
 from ethbrake_marl.extensions.search.regret import regrets_of
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.scenario.tables import worlds_from_table
-from ethbrake_marl.scenario.task import Task
-from tests.physics.random_worlds import line
+from ethbrake_marl.first_edition.envs.rendering import BODY_M
+from ethbrake_marl.first_edition.evaluation.evaluation import Evaluation
+from ethbrake_marl.first_edition.evaluation.record import EpisodeRecord, record_episode
+from ethbrake_marl.first_edition.evaluation.rollout import evaluate
+from ethbrake_marl.first_edition.evaluation.statistics import mean
+from ethbrake_marl.first_edition.evaluation.summary import summarise
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.first_edition.scenario.tables import worlds_from_table
+from ethbrake_marl.first_edition.scenario.task import Task
+from tests.first_edition.physics.random_worlds import line
 
 BRAKE = {"full_brake": eb.make_agent("full_brake")}
 DISTANCE = load_scenario("paper-distance")

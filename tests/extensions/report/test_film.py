@@ -8,9 +8,9 @@ import pytest
 from PIL import Image, ImageSequence
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.making import make_agent
-from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.extensions.report.film import film, film_scenes
+from ethbrake_marl.first_edition.agents.making import make_agent
+from ethbrake_marl.first_edition.evaluation.record import record_episode
 from tests.contract.interfaces import CRASH
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"

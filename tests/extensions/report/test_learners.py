@@ -6,12 +6,12 @@ from typing import Any
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.extensions.report.learners import learners_sheets
-from ethbrake_marl.training.experiment import run_experiment
-from ethbrake_marl.training.team import load_team
+from ethbrake_marl.first_edition.agents.protocol import Team
+from ethbrake_marl.first_edition.training.experiment import run_experiment
+from ethbrake_marl.first_edition.training.team import load_team
+from tests.first_edition.learning.tiny import TINY_PPO
 from tests.fixtures.commands import draw_nothing
-from tests.learning.tiny import TINY_PPO
 
 SCENARIO = eb.load_scenario("cooperation-3-pair")
 BRAKING = eb.make_agent("full_brake")

@@ -3,9 +3,9 @@
 import pytest
 
 from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS, is_papers_test
-from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
-from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.first_edition.scenario.catalogue import list_scenarios, load_scenario
+from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.first_edition.scenario.task import Task
 
 SILENT = pytest.mark.filterwarnings("ignore::ethbrake_marl.extensions.search.limits.IncompleteTable")
 

@@ -11,7 +11,7 @@ from ethbrake_marl.extensions.report.film import film
 from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap
 from ethbrake_marl.extensions.report.seed_curves import SeedCurve
 from ethbrake_marl.extensions.report.style import picture_ending
-from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.first_edition.scenario.task import Task
 from tests.contract.interfaces import CRASH
 from tests.refused import refused
 

@@ -9,7 +9,6 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import plain_text
-from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.report import page as page_module
 from ethbrake_marl.extensions.report.page import Part, Section, read_file
 from ethbrake_marl.extensions.report.paper_rows import with_paper_rows
@@ -18,8 +17,9 @@ from ethbrake_marl.extensions.report.shown_worlds import choose_shown, worst_row
 from ethbrake_marl.extensions.report.style import new_figure
 from ethbrake_marl.extensions.search.regret import regrets_of
 from ethbrake_marl.files.sheet import Column, Sheet, Shown
-from ethbrake_marl.game.harm import HarmCount
-from tests.evaluation.test_rollout import left_out_by
+from ethbrake_marl.first_edition.evaluation.lineup import make_lineup
+from ethbrake_marl.first_edition.game.harm import HarmCount
+from tests.first_edition.evaluation.test_rollout import left_out_by
 from tests.fixtures.page import HOSTILE, UNSEEN, Page
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.report.experiment import telling_world
+from ethbrake_marl.first_edition.evaluation.lineup import make_lineup
 from tests.cli.test_train import ctrl_c_when, status_of
 from tests.fixtures.commands import rows_of, told_json
 

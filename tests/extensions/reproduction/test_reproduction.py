@@ -9,7 +9,6 @@ import pytest
 from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation.statistics import rate
 from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS, PaperRow
 from ethbrake_marl.extensions.report.seed_curves import SeedCurve
 from ethbrake_marl.extensions.reproduction import delay_curves, folder as folder_module, hybrid, trainings
@@ -38,9 +37,10 @@ from ethbrake_marl.extensions.reproduction.verdicts import (
     summarise_verdicts,
 )
 from ethbrake_marl.files.sheet import Estimate, Sheet
+from ethbrake_marl.first_edition.evaluation.statistics import rate
+from tests.first_edition.learning.tiny import TINY_PPO
 from tests.fixtures.page import Page
 from tests.fixtures.snapshots import check_snapshot
-from tests.learning.tiny import TINY_PPO
 
 SNAPSHOTS = Path(__file__).parent / "snapshots"
 HOSTILE = "<script>alert('x')</script>\"|*_\u202e"

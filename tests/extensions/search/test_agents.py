@@ -5,18 +5,18 @@ from pathlib import Path
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.protocol import policy_sha256
-from ethbrake_marl.agents.spec import AgentSpec, parse_spec
-from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.search.around import Searched
-from ethbrake_marl.shields.drivers import ShieldedDriver
-from ethbrake_marl.shields.paper_hybrid import HybridAgent
-from tests.agents.test_drive import check_holds, check_rows
-from tests.agents.test_policy import check_bound, check_file, train_ppo
-from tests.engine.test_engine import check_restore, with_script
-from tests.evaluation.test_rollout import check_left_out, left_out_by
-from tests.physics.test_pieces import check_predicted
-from tests.scenario.test_sampling import check_obstacles_apart
+from ethbrake_marl.first_edition.agents.protocol import policy_sha256
+from ethbrake_marl.first_edition.agents.spec import AgentSpec, parse_spec
+from ethbrake_marl.first_edition.evaluation.lineup import make_lineup
+from ethbrake_marl.first_edition.shields.drivers import ShieldedDriver
+from ethbrake_marl.first_edition.shields.paper_hybrid import HybridAgent
+from tests.first_edition.agents.test_drive import check_holds, check_rows
+from tests.first_edition.agents.test_policy import check_bound, check_file, train_ppo
+from tests.first_edition.engine.test_engine import check_restore, with_script
+from tests.first_edition.evaluation.test_rollout import check_left_out, left_out_by
+from tests.first_edition.physics.test_pieces import check_predicted
+from tests.first_edition.scenario.test_sampling import check_obstacles_apart
 
 PAPER = eb.load_scenario("paper-random")
 

@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.driving import drive, script_agents
-from ethbrake_marl.agents.making import make_agent
-from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.extensions.search import refine as refine_module
 from ethbrake_marl.extensions.search.around import Searched
 from ethbrake_marl.extensions.search.refine import refine
-from ethbrake_marl.game.harm import HARM_COUNTS
-from ethbrake_marl.shields.drivers import ShieldedDriver
+from ethbrake_marl.first_edition.agents.driving import drive, script_agents
+from ethbrake_marl.first_edition.agents.making import make_agent
+from ethbrake_marl.first_edition.engine.profiles import profile_problem
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS
+from ethbrake_marl.first_edition.shields.drivers import ShieldedDriver
+from tests.first_edition.shield.test_step_shield import Remembering
 from tests.fixtures.asked import Asked
-from tests.shield.test_step_shield import Remembering
 
 SCENARIO = eb.load_scenario("paper-random")
 WORLDS = SCENARIO.sample(80, 3).worlds

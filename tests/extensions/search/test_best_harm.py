@@ -8,18 +8,9 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.driving import drive
-from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
-from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.cli.evaluate import GROUP_EPISODES
-from ethbrake_marl.engine.profiles import Profiles, profile_problem
 from ethbrake_marl.errors import CorruptBundle, PhysicsError
-from ethbrake_marl.evaluation import chunks
-from ethbrake_marl.evaluation.lineup import make_lineup
-from ethbrake_marl.evaluation.per_world import write_per_world
-from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.extensions.proofs import lower_bound as bounding
 from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
 from ethbrake_marl.extensions.proofs.onset import onset_states
@@ -33,13 +24,22 @@ from ethbrake_marl.extensions.search.recall import BestHarm
 from ethbrake_marl.extensions.search.regret import limits_of, regrets_of
 from ethbrake_marl.extensions.search.shipped import TABLES, best_known, shipped_profiles, shipped_tables
 from ethbrake_marl.extensions.search.tables import LEFT_OUT, BestHarmTable
-from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
-from ethbrake_marl.physics.advance import advance
-from ethbrake_marl.physics.state import Floats, Worlds
-from ethbrake_marl.policies.shipped import load_shipped, shipped_policies
-from ethbrake_marl.scenario.catalogue import group_of_scenarios, load_scenario
-from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.first_edition.agents.driving import drive
+from ethbrake_marl.first_edition.agents.e_v2x_bm.coupled import optimise_coupled
+from ethbrake_marl.first_edition.agents.making import make_agent
+from ethbrake_marl.first_edition.engine.profiles import Profiles, profile_problem
+from ethbrake_marl.first_edition.evaluation import chunks
+from ethbrake_marl.first_edition.evaluation.lineup import make_lineup
+from ethbrake_marl.first_edition.evaluation.per_world import write_per_world
+from ethbrake_marl.first_edition.evaluation.rollout import evaluate
+from ethbrake_marl.first_edition.evaluation.summary import summarise
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.first_edition.physics.advance import advance
+from ethbrake_marl.first_edition.physics.state import Floats, Worlds
+from ethbrake_marl.first_edition.policies.shipped import load_shipped, shipped_policies
+from ethbrake_marl.first_edition.scenario.catalogue import group_of_scenarios, load_scenario
+from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.first_edition.scenario.task import Task
 from tests.docs.site import load
 from tests.failing_worlds import planted_list, without
 from tests.fixtures.lines import line

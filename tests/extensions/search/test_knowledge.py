@@ -2,8 +2,8 @@
 
 import pytest
 
-from ethbrake_marl.agents.protocol import Source
-from tests.agents.test_knowledge import BLOCKED, agent_of, changed_decisions, check_stated, in_two
+from ethbrake_marl.first_edition.agents.protocol import Source
+from tests.first_edition.agents.test_knowledge import BLOCKED, agent_of, changed_decisions, check_stated, in_two
 
 MESSAGES, MODEL = Source.MESSAGES, Source.MODEL
 STATED = {

@@ -14,29 +14,29 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation.chunks import Lineup
-from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.measure_sets import measures
-from ethbrake_marl.evaluation.outcome import Outcome
-from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk, evaluate
-from ethbrake_marl.evaluation.summary import summarise
-from ethbrake_marl.evaluation.tally import Tally
 from ethbrake_marl.extensions.search import limits, regret
 from ethbrake_marl.extensions.search.limit_measures import LIMITS
 from ethbrake_marl.extensions.search.limits import IncompleteTable, Unproven, known_limits, prove, unproven_because
 from ethbrake_marl.extensions.search.regret import KNOWN_OF_WORLDS, Between, limits_of, regrets_of
 from ethbrake_marl.extensions.search.shipped import shipped_tables
 from ethbrake_marl.extensions.search.tables import BestHarmTable
-from ethbrake_marl.game.harm import Ledger
-from ethbrake_marl.physics.left_out import Impacts
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.first_edition.evaluation.chunks import Lineup
+from ethbrake_marl.first_edition.evaluation.evaluation import Evaluation
+from ethbrake_marl.first_edition.evaluation.measure_sets import measures
+from ethbrake_marl.first_edition.evaluation.outcome import Outcome
+from ethbrake_marl.first_edition.evaluation.rollout import chunks_of, drive_chunk, evaluate
+from ethbrake_marl.first_edition.evaluation.summary import summarise
+from ethbrake_marl.first_edition.evaluation.tally import Tally
+from ethbrake_marl.first_edition.game.harm import Ledger
+from ethbrake_marl.first_edition.physics.left_out import Impacts
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.first_edition.scenario.task import Task
 from tests.docs.site import load
-from tests.evaluation.test_measures import ALWAYS, per_world
-from tests.evaluation.test_rollout import AGENTS, in_both_ways
-from tests.learning.test_runs import check_measured
-from tests.scenario.test_roads import final
+from tests.first_edition.evaluation.test_measures import ALWAYS, per_world
+from tests.first_edition.evaluation.test_rollout import AGENTS, in_both_ways
+from tests.first_edition.learning.test_runs import check_measured
+from tests.first_edition.scenario.test_roads import final
 
 RECORDED_AGENTS = ("full_brake", "e_v2x_bm", "e_v2x_bm:pairwise")
 

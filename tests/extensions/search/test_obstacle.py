@@ -2,8 +2,8 @@
 
 from ethbrake_marl.extensions.proofs.avoidability import avoidability
 from ethbrake_marl.extensions.search.best_harm import best_harm, task_problem
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.scenario.task import Task
 from tests.refused import refused
 
 ALL = load_scenario("cooperation-4-all")

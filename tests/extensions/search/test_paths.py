@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.agents.test_paths import NAMES, check_folder
+from tests.first_edition.agents.test_paths import NAMES, check_folder
 
 
 @pytest.mark.usefixtures("empty_folder")

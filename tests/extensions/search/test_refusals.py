@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.driving import drive
-from ethbrake_marl.agents.making import make_agent
-from ethbrake_marl.engine.profiles import ProfileProblem, profile_problem
 from ethbrake_marl.extensions.search.around import Searched
 from ethbrake_marl.extensions.search.refine import refine
 from ethbrake_marl.extensions.search.templates import best_templates
-from tests.agents.test_refusals import check_failure
+from ethbrake_marl.first_edition.agents.driving import drive
+from ethbrake_marl.first_edition.agents.making import make_agent
+from ethbrake_marl.first_edition.engine.profiles import ProfileProblem, profile_problem
+from tests.first_edition.agents.test_refusals import check_failure
 from tests.refused import refused
 
 PAPER = eb.load_scenario("paper-random")

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.agents.test_roles import SCENARIOS, check_nothing_around, check_role
+from tests.first_edition.agents.test_roles import SCENARIOS, check_nothing_around, check_role
 
 SPECS = {"best_harm": ["best_harm:50", "best_harm"]}
 

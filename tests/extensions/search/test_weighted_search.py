@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.engine.profiles import Profiles
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.extensions.search.best_harm import best_harm, fold_episodes, search_list, task_problem
 from ethbrake_marl.extensions.search.problem import search_profiles
-from ethbrake_marl.game.objectives import aim_of, parse_objective
-from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.first_edition.engine.profiles import Profiles
+from ethbrake_marl.first_edition.game.objectives import aim_of, parse_objective
+from ethbrake_marl.first_edition.scenario.task import Task
 
 SCENARIOS = ["paper-random", "cooperation-3-pair", "cooperation-4-all", "realistic-truck"]
 

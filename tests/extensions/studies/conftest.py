@@ -7,8 +7,8 @@ import pytest
 import yaml
 
 from ethbrake_marl.cli.app import run_command
+from tests.first_edition.learning.tiny import TINY_PPO
 from tests.fixtures.pictures import draw_nothing
-from tests.learning.tiny import TINY_PPO
 
 RECIPE = {
     **TINY_PPO.model_dump(mode="json"),

@@ -12,7 +12,6 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.evaluation.seeds import mean_over_seeds
 from ethbrake_marl.extensions.cooperation.comparison import compare
 from ethbrake_marl.extensions.cooperation.joint_optimum import (
     Goal,
@@ -28,17 +27,18 @@ from ethbrake_marl.extensions.cooperation.levels import STANDARD, Level, Plan, c
 from ethbrake_marl.extensions.cooperation.results import levels_csv, tables
 from ethbrake_marl.extensions.search.best_harm import best_harm, chunks_left
 from ethbrake_marl.extensions.studies.trainings import TrainingJob
-from ethbrake_marl.game.harm import HarmCount
-from ethbrake_marl.scenario.catalogue import load_scenario, scenario_path
-from ethbrake_marl.scenario.sample import Sample
-from ethbrake_marl.shields.episodes import Shielded
-from ethbrake_marl.training.callback import RunCallback
-from ethbrake_marl.training.recipe import Scheme, TrainingRecipe, load_recipe
-from ethbrake_marl.training.training import Training
+from ethbrake_marl.first_edition.evaluation.seeds import mean_over_seeds
+from ethbrake_marl.first_edition.game.harm import HarmCount
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario, scenario_path
+from ethbrake_marl.first_edition.scenario.sample import Sample
+from ethbrake_marl.first_edition.shields.episodes import Shielded
+from ethbrake_marl.first_edition.training.callback import RunCallback
+from ethbrake_marl.first_edition.training.recipe import Scheme, TrainingRecipe, load_recipe
+from ethbrake_marl.first_edition.training.training import Training
 from tests.extensions.studies.conftest import ABLATE, LEVELS, study
 from tests.extensions.studies.killing import PROGRAM, end_when
+from tests.first_edition.learning.tiny import TINY_PPO
 from tests.fixtures.snapshots import check_snapshot
-from tests.learning.tiny import TINY_PPO
 
 SNAPSHOTS = Path(__file__).parent / "snapshots"
 

@@ -9,9 +9,9 @@ import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.studies.falsification import APART, Scored, far_apart, search
 from ethbrake_marl.extensions.studies.weakness import Measure, MeasureName
-from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
-from ethbrake_marl.physics.state import Bools, Floats, Worlds
-from ethbrake_marl.scenario.ranges import ranges
+from ethbrake_marl.first_edition.game.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.first_edition.physics.state import Bools, Floats, Worlds
+from ethbrake_marl.first_edition.scenario.ranges import ranges
 
 SCENARIO = eb.load_scenario("paper-random")
 

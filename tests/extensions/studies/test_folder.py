@@ -15,9 +15,9 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.extensions.studies.folder import StudyFolder
 from ethbrake_marl.extensions.studies.trainings import TrainingJob, train_all
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.training.recipe import load_recipe
-from ethbrake_marl.training.training import Training
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.training.recipe import load_recipe
+from ethbrake_marl.first_edition.training.training import Training
 from tests.extensions.studies.conftest import ABLATE
 
 ROOT = Path(__file__).resolve().parents[3]

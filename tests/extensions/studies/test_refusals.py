@@ -6,7 +6,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.cooperation.levels import Level, common_worlds, with_scheme
-from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
 from tests.refused import refused
 
 LEVEL_2 = load_scenario("cooperation-2-paper")

@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.report.page import Part
 from ethbrake_marl.extensions.report.report import Report
 from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap
+from ethbrake_marl.first_edition.evaluation.lineup import make_lineup
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 AGENTS = ("full_brake", "e_v2x_bm", "constant:3+step", "ppo")

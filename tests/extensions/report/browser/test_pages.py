@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.report.report import Report
 from ethbrake_marl.extensions.reproduction.folder import Reproduction
 from ethbrake_marl.extensions.reproduction.making import choose_items, make_items
+from ethbrake_marl.first_edition.evaluation.lineup import make_lineup
 from tests.extensions.report.browser.conftest import AGENTS, PAPER, wait_until
 from tests.extensions.report.test_report import whole_page
 from tests.fixtures.page import HOSTILE

@@ -1,0 +1,225 @@
+"""Exponential, logarithm and normal quantile, computed with + - * / and sqrt only, so all machines get the same bits.
+
+The C library and numpy have several implementations of exp, log and pow, and choose one by the processor. The results
+of these implementations differ in the last bits. The functions of this module do the same IEEE operations in the same
+order on every machine, so worlds drawn from a seed have the same bits everywhere. Each error bound in this module is
+the largest error, rounded up, that a comparison with values of 40 digits has shown
+(tests/first_edition/physics/test_compiling.py).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ethbrake_marl.first_edition.physics.jit import compiled
+from ethbrake_marl.first_edition.physics.state import Floats
+
+PER_LN2 = 1.4426950408889634
+
+_LN2_HIGH = 0.693147180369123816490  # its last 32 bits are 0, so its product with a whole number below 2^32 is exact
+
+_LN2_LOW = 1.90821492927058770002e-10
+
+_SQRT2 = 1.4142135623730951
+
+_PER_SQRT_2PI = 0.3989422804014327
+
+_LARGEST_EXPONENT = 709.782712893384  # e to this power, or more, overflows a double
+
+_LEAST_EXPONENT = -708.0  # below this exp returns 0 instead of a number under 3e-308
+
+_EXP = tuple(1.0 / math.factorial(k) for k in range(13, -1, -1))  # Taylor's series, highest power first
+
+_LOG = tuple(2.0 / k for k in range(25, 1, -2))  # series of 2 artanh(s) / s - 2 in s^2, highest power first
+
+# x = q (sqrt(2 pi) + q^2 P(q^2)) for q = p - 1/2 up to 1/4; else x = C - t N(t) / Q(t) - r for r = sqrt(-2 ln p): one
+# set for t = r - 1.65 up to r = 4, one for t = r - 4 up to 10.3. Fitted to quantiles of 60 digits at Chebyshev nodes.
+_SQRT_2PI = 2.5066282746310005
+
+_SQRT_2PI_LOW = -1.8328579980459168e-16
+
+_CENTRE = (
+    *(18944880.09719004886, -2601371.67573968287, 693994.2277388069859, 43161.61138466289868, 22235.96413435671455),
+    *(5825.684752120609166, 1690.927397560813073, 496.2580620421304563, 149.8299419042506391, 47.03578667872906836),
+    *(15.66760896558029334, 5.772533538609159947, 2.624934990953737101),
+)
+
+_NEAR_N = (
+    *(6.1185316165014996e-7, 0.00008261143491068899677, 0.002322868125000261793, 0.02490544383476077933),
+    *(0.1311039275523617481, 0.3712863146520682371, 0.5402166937189504813, 0.3135851649710710218),
+)
+
+_NEAR_Q = (
+    *(6.147238663971861779e-7, 0.0000873801370475760379, 0.002763799911765273603, 0.03519014821667497178),
+    *(0.2297472124395027504, 0.8540322507157666525, 1.833041457545810481, 2.108039519865067479, 1.0),
+)
+
+_FAR_N = (
+    *(7.698177493540387221e-10, 2.577566285595523487e-7, 0.00001747840342402818464, 0.0004218995970155167333),
+    *(0.004540379350103703873, 0.02472412625213424433, 0.0718366187418152831, 0.09339620476270569954),
+)
+
+_FAR_Q = (
+    *(1.285585017040169419e-9, 4.476251633827289854e-7, 0.00003350272214316739949, 0.000953171528510754796),
+    *(0.0129777876898960319, 0.09549439826703192372, 0.4028001940673617521, 0.951490915339779628, 1.0),
+)
+
+_NEAR, _NEAR_C = 1.65, 0.9953300906244928
+
+_FAR, _FAR_C = 4.0, 0.5988073438553344
+
+_LEAST_PROBABILITY = 1e-22  # scenarios draw no smaller probability: 2^-53 times the least mass of a normal
+
+_FRACTIONS = 150  # terms of the continued fraction: for x >= 2 its remainder is below 1e-17
+
+
+@compiled
+def _polynomial(coefficients: tuple[float, ...], x: float) -> float:
+    """Return the value at ``x`` of the polynomial with ``coefficients`` (highest power first), by Horner's rule."""
+    total = 0.0
+    for coefficient in coefficients:
+        total = total * x + coefficient
+    return total
+
+
+@compiled
+def power_of_two(k: int) -> float:
+    """Return ``2^k`` exactly, for k from -1022 to 1023."""
+    base, power = (2.0, k) if k >= 0 else (0.5, -k)
+    result = 1.0
+    while power > 0:
+        if power % 2:
+            result *= base
+        base *= base
+        power //= 2
+    return result
+
+
+@compiled
+def exp_rest(x: float, k: int) -> float:
+    """Return ``e^x / 2^k`` for the whole number k nearest to ``x / ln 2``.
+
+    The result is the Taylor series of ``e^y`` up to ``y^13``, with ``y = x - k ln 2``, so ``|y| <= ln(2) / 2``. The
+    relative error of ending the series there is 5e-18.
+    """
+    return _polynomial(_EXP, (x - k * _LN2_HIGH) - k * _LN2_LOW)
+
+
+@compiled
+def exp(x: float) -> float:
+    """Return ``e^x`` within 1.5 ulp; infinite above 709.78, 0 below -708.
+
+    The function computes ``2^k e^(x - k ln 2)`` for the whole number k nearest to ``x / ln 2``.
+    """
+    if not x < _LARGEST_EXPONENT:
+        return np.inf if x >= _LARGEST_EXPONENT else np.nan
+    if x < _LEAST_EXPONENT:
+        return 0.0
+    k = math.floor(x * PER_LN2 + 0.5)
+    return exp_rest(x, k) * power_of_two(k - 1) * 2.0
+
+
+@compiled
+def _log_parts(x: float) -> tuple[float, float]:
+    """Return two numbers whose sum is ``ln x``, for a finite x > 0; the pair is more accurate than a single number.
+
+    With ``x = 2^k m`` and m between ``sqrt(1/2)`` and ``sqrt(2)``, the first number is k times the leading bits of
+    ``ln 2``; this product is exact. The second number is the rest of ``k ln 2``, plus the series of
+    ``ln m = 2 artanh((m - 1) / (m + 1))``.
+    """
+    k, m = 0, x
+    while m >= _SQRT2:
+        m *= 0.5
+        k += 1
+    while m < 0.5 * _SQRT2:
+        m *= 2.0
+        k -= 1
+    f = m - 1.0
+    s = f / (2.0 + f)
+    half = 0.5 * f * f
+    z = s * s
+    return k * _LN2_HIGH, f - (half - (s * (half + z * _polynomial(_LOG, z)) + k * _LN2_LOW))
+
+
+@compiled
+def log(x: float) -> float:
+    """Return ``ln x`` within 1 ulp, for a finite x > 0."""
+    whole, rest = _log_parts(x)
+    return whole + rest
+
+
+@compiled
+def normal_quantile(p: float) -> float:
+    """Return the number x below which a standard normal variable lies with probability p, within 1.5 ulp.
+
+    p is clipped to [1e-22, 1 - 1e-22]. For p outside [1/4, 3/4], let q be the smaller of p and 1 - p. The function
+    represents ``r = sqrt(-2 ln q)`` as the sum of two numbers; the first has 24 bits, so its square is exact.
+    """
+    q = p - 0.5
+    if abs(q) <= 0.25:
+        w = q * q
+        return q * (_SQRT_2PI + (w * _polynomial(_CENTRE, w) + _SQRT_2PI_LOW))
+    whole, rest = _log_parts(max(p if q < 0.0 else 1.0 - p, _LEAST_PROBABILITY))
+    square = -2.0 * (whole + rest)
+    root = math.sqrt(square)
+    head = np.float64(np.float32(root))
+    tail = ((-2.0 * whole - head * head) - 2.0 * rest) / (head + root)
+    r = head + tail
+    if r <= _FAR:
+        t = r - _NEAR
+        x = head - (_NEAR_C - (t * (_polynomial(_NEAR_N, t) / _polynomial(_NEAR_Q, t)) + tail))
+    else:
+        t = r - _FAR
+        x = head - (_FAR_C - (t * (_polynomial(_FAR_N, t) / _polynomial(_FAR_Q, t)) + tail))
+    return -x if q < 0.0 else x
+
+
+@compiled
+def normal_probability(x: float) -> float:
+    """Return the probability that a standard normal variable is below x; the relative error is 1e-13 for x > -30.
+
+    Let phi be the standard normal density. For ``0 <= x <= 2``, the probability of a value above x is computed by the
+    series ``1/2 - phi(x) (x + x^3 / 3 + x^5 / 15 + ...)``. For larger x, this probability is computed by the continued
+    fraction ``phi(x) / (x + 1 / (x + 2 / (x + ...)))``. For ``x < 0``, the result is the probability of a value above
+    -x.
+    """
+    a = abs(x)
+    density = _PER_SQRT_2PI * exp(-0.5 * a * a)
+    if a <= 2.0:
+        total, term, k = 0.0, a, 3
+        while total + term > total:
+            total += term
+            term *= a * a / k
+            k += 2
+        rest = 0.5 - density * total
+    else:
+        fraction = a
+        for k in range(_FRACTIONS, 0, -1):
+            fraction = a + k / fraction
+        rest = density / fraction
+    return rest if x < 0.0 else 1.0 - rest
+
+
+@compiled
+def exp_each(values: Floats) -> Floats:
+    """Return ``exp`` of each entry of ``values`` [n]."""
+    result = np.empty(len(values))
+    for i in range(len(values)):
+        result[i] = exp(values[i])
+    return result
+
+
+@compiled
+def normal_quantile_each(values: Floats) -> Floats:
+    """Return ``normal_quantile`` of each probability in ``values`` [n]."""
+    result = np.empty(len(values))
+    for i in range(len(values)):
+        result[i] = normal_quantile(values[i])
+    return result
+
+
+def logistic(values: Floats) -> Floats:
+    """Return ``1 / (1 + e^-x)`` of each x in ``values``, in the same shape."""
+    return 1.0 / (1.0 + exp_each(-values.ravel()).reshape(values.shape))
