@@ -126,13 +126,17 @@ def digest_in(package: Path, name: str) -> str:
 @pytest.mark.parametrize(
     ("kernel", "edited", "moves"),
     [
-        ("physics/advance.py", "physics/advance.py", True),  # its own file
-        ("physics/advance.py", "physics/impact.py", True),  # what it calls
-        ("shields/members.py", "physics/impact.py", True),  # through several files
-        ("shields/options.py", "errors.py", False),  # a file without kernels or constants
-        ("physics/advance.py", "shields/options.py", False),  # kernels that it does not call
-        ("physics/impact.py", "physics/advance.py", False),  # its callers
-        ("physics/advance.py", "physics/state.py", False),  # types
+        ("first_edition/physics/advance.py", "first_edition/physics/advance.py", True),  # its own file
+        ("first_edition/physics/advance.py", "first_edition/physics/impact.py", True),  # what it calls
+        ("first_edition/shields/members.py", "first_edition/physics/impact.py", True),  # through several files
+        ("first_edition/shields/options.py", "errors.py", False),  # a file without kernels or constants
+        (
+            "first_edition/physics/advance.py",
+            "first_edition/shields/options.py",
+            False,
+        ),  # kernels that it does not call
+        ("first_edition/physics/impact.py", "first_edition/physics/advance.py", False),  # its callers
+        ("first_edition/physics/advance.py", "first_edition/physics/state.py", False),  # types
     ],
 )
 def test_digest_of_sources__changes_with_what_its_kernels_are_made_of(copied, monkeypatch, kernel, edited, moves):
@@ -146,13 +150,13 @@ def test_digest_of_sources__changes_with_what_its_kernels_are_made_of(copied, mo
 
 def test_digest_of_sources__is_not_known_of_code_in_no_file_edited_since_or_from_the_future_which_is_told(copied):
     assert digest_of_sources(Path("<stdin>")) == ""
-    assert digest_in(copied, "physics/advance.py")
+    assert digest_in(copied, "first_edition/physics/advance.py")
     now = time.time()
     for date in ((jit._IMPORTED_S + now) / 2, now + 3600.0):
-        os.utime(copied / "physics" / "impact.py", (date, date))
+        os.utime(copied / "first_edition" / "physics" / "impact.py", (date, date))
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
-            assert digest_in(copied, "physics/advance.py") == ""
+            assert digest_in(copied, "first_edition/physics/advance.py") == ""
         expected = [f"{copied}: a file in this folder has a date in the future"] * (date > now)
         assert [str(each.message)[: len(expected[0])] for each in told] == expected
 
@@ -266,7 +270,7 @@ def test_kernels__of_a_moved_package_are_at_hand_and_one_damaged_or_an_edited_ca
     for file in cache_folder().iterdir():
         file.write_bytes(file.read_bytes()[:-1])
     assert run(copied) == COMPILED
-    with (copied / "physics" / "impact.py").open("a") as file:
+    with (copied / "first_edition" / "physics" / "impact.py").open("a") as file:
         file.write("# a change\n")
     assert run(copied) == COMPILED
     assert run(PACKAGE) == SAME

@@ -28,17 +28,17 @@ SQUARES = "squares of arrays, which numpy multiplies, or powers of whole numbers
 TRAINED = "training: torch's own sums differ by machine, too"
 PRINTED = "drawn or printed, with few digits"
 REMAINS = {
-    ("envs/trace.py", "**"): SQUARES,
-    ("envs/rendering.py", "math.cos"): PRINTED,
-    ("envs/rendering.py", "math.sin"): PRINTED,
-    ("evaluation/seeds.py", "scipy.stats"): "resampling and sorting: sums and products alone",
-    ("evaluation/statistics.py", "**"): SQUARES,
+    ("first_edition/envs/trace.py", "**"): SQUARES,
+    ("first_edition/envs/rendering.py", "math.cos"): PRINTED,
+    ("first_edition/envs/rendering.py", "math.sin"): PRINTED,
+    ("first_edition/evaluation/seeds.py", "scipy.stats"): "resampling and sorting: sums and products alone",
+    ("first_edition/evaluation/statistics.py", "**"): SQUARES,
     (
-        "evaluation/statistics.py",
+        "first_edition/evaluation/statistics.py",
         "scipy.special",
     ): "quantiles for the ends of an interval; the last bit of the t quantile"
     " differs for 1 in 1,000 counts where the processor has no FMA. Means and errors are exact sums",
-    ("training/recipe.py", "math.cos"): TRAINED,
+    ("first_edition/training/recipe.py", "math.cos"): TRAINED,
 }
 
 

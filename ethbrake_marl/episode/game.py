@@ -13,6 +13,7 @@ from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.reward import Rewarding
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Rules, Step
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Floats, Ints
 
 
@@ -32,8 +33,8 @@ class Shield(Protocol):
     def begin(self, game: Game, alert: State, state: State) -> Any:
         """Return the memory for new episodes, whose first decision is ``state``."""
 
-    def decide(self, game: Game, state: State, proposed: Floats, *, donate: bool) -> tuple[Floats, Any]:
-        """Return the actions to apply, [n, L], and the new memory."""
+    def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Any]:
+        """Return the actions to apply, [n, L], and the new memory. ``proposed`` None: its own agents propose."""
 
     def infos(self, game: Game, state: State) -> dict[str, Any]:
         """Return what users may want to know of it: name -> [n]."""
@@ -75,15 +76,17 @@ class Game(NamedTuple):
         """Return worlds ``first`` to ``first + n - 1`` of the seed at their first decision."""
         return self.begin(self.draw(n, seed, first))
 
-    def step(self, state: State, actions: Floats, *, donate: bool = False) -> tuple[State, Step]:
+    def step(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
         """Return the state after one step of all worlds, and what the step did.
 
-        ``actions`` [n, L] of the learners, in [-1, 1]. ``donate``: the memory of ``state`` may be reused. What raises
-        leaves ``state`` as it was.
+        ``actions`` [n, L] of the learners, in [-1, 1]; None: the shield's own agents propose them. ``donate``: the
+        memory of ``state`` may be reused. What raises leaves ``state`` as it was.
         """
         if self.shield is not None:
             actions, memory = self.shield.decide(self, state, actions, donate=donate)
             state = state._replace(memories={**state.memories, "shield": memory})
+        if actions is None:
+            raise InvalidInput("step: actions = None: no shield proposes actions; give an array [n, L]")
         if self.rewarding.is_compiled:
             return self.follow(state, actions, donate=donate)
         after, step = self.follow(state, actions)

@@ -141,15 +141,15 @@ def test_bugs__each_patch_stands_in_the_code_exactly_once() -> None:
 
 
 def test_tests_of_a_function__are_those_that_call_it_near_ones_first():
-    summing = ["physics/state.py:sum_rows"]
+    summing = ["first_edition/physics/state.py:sum_rows"]
     tests = faults.Callers(
         {
-            "tests/test_a.py::test_one": (0.1, ["physics/advance.py:advance"]),
+            "tests/test_a.py::test_one": (0.1, ["first_edition/physics/advance.py:advance"]),
             "tests/test_b.py::test_two": (0.2, summing),
             "tests/first_edition/physics/test_c.py::test_three": (9.0, summing),
         }
     )
-    file = faults.PACKAGE / "physics/state.py"
+    file = faults.PACKAGE / "first_edition/physics/state.py"
     first = file.read_text("utf-8").splitlines().index("def sum_rows(values: Floats) -> Floats:") + 1
     near_ones_first = ["tests/first_edition/physics/test_c.py::test_three", "tests/test_b.py::test_two"]
     assert tests.ordered(tests.at(file, first + 2), "", 10.0, 9) == near_ones_first

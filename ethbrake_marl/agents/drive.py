@@ -1,0 +1,106 @@
+"""The loop in which a team of agents drives worlds to the end. Whatever lets agents drive calls it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from ethbrake_marl.episode.game import Game, Shield
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.step import Step, asked
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
+
+# what an agent has to know, from little to much; each includes those before it
+SENSORS = "own sensors"  # its own vehicle, and the neighbours that its sensors see
+MESSAGES = "messages"  # also the messages that the vehicle has received
+STATE = "true state"  # also gaps, speeds, capacities and latencies of all vehicles, whether received or not
+MODEL = "true model"  # also masses, restitution and scripts: everything that an exact simulation needs
+
+NOBODY = np.zeros(0, np.int64)
+
+
+class Agent(Protocol):
+    """Drives one vehicle: a script, a policy, a search. It sees the whole state, and decides when the learners do."""
+
+    name: str  # in tables and messages
+    knows: str  # what it has to know, for tables: one of the texts above
+
+    def begin(self, alert: State, body: int) -> Any:
+        """Return the memory for new episodes: None, an array with one row per world, or a tuple of memories."""
+
+    def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
+        """Return the commands of vehicle ``body`` (1: Vehicle 1), [n] m/s2, and the new memory."""
+
+
+class Team(NamedTuple):
+    """Who drives the learners of a game."""
+
+    name: str  # in tables and messages
+    drivers: Mapping[int, Agent]  # body -> agent
+    shield: Shield | None = None  # asks its own team, the drivers, what they propose
+
+    def game(self, game: Game) -> Game:
+        """Return ``game`` with this team's shield. Raises ``InvalidInput`` unless the team drives all its learners."""
+        driven, wanted = sorted(self.drivers), sorted(game.rules.learners.tolist())
+        if driven != wanted:
+            theirs, right = (", ".join(f"vehicle_{i}" for i in each) or "nobody" for each in (driven, wanted))
+            raise InvalidInput(f"team {self.name!r}: drives {theirs}; must drive exactly {right}")
+        return game._replace(shield=self.shield)
+
+
+def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Iterator[tuple[Step | None, State]]:
+    """Let a team drive these worlds from the alert to the end: yield every state, and the step that led to it.
+
+    The first pair is ``None`` and the state at the first decision. Agents are asked there for the first time; their
+    commands are applied as they are, without a detour by actions. Under a shield the shield asks them. ``donate``: a
+    state is worthless once the next one is asked for.
+    """
+    game = team.game(game)
+    if game.shield is None:
+        state = game.begin(alert)
+        memories = {body: agent.begin(alert, body) for body, agent in team.drivers.items()}
+        state = state._replace(memories={**state.memories, **memories})
+        game = driven_by(game, team.drivers)
+        actions = np.zeros((alert.n, 0))
+    else:
+        state, actions = game.begin(alert), None
+    yield None, state
+    while not state.ended.all():
+        state, step = game.step(state, actions, donate=donate)
+        yield step, state
+
+
+def drive(game: Game, alert: State, team: Team) -> State:
+    """Let a team drive these worlds from the alert to the end; return the last state, the result of the episodes."""
+    for _, state in play(game, alert, team, donate=True):
+        last = state
+    return last
+
+
+def driven_by(game: Game, drivers: Mapping[int, Agent]) -> Game:
+    """Return the game in which the learners' agents decide as scripts do, from the first decision on."""
+    return game._replace(scripts={**game.scripts, **drivers}, rules=game.rules._replace(learners=NOBODY))
+
+
+def propose(drivers: Mapping[int, Agent], state: State, memories: Mapping[int, Any]) -> tuple[Floats, dict[int, Any]]:
+    """Return the actions that agents propose, [n, L] in the order of ``drivers``, and their new memories."""
+    actions, after = np.empty((state.n, len(drivers))), dict(memories)
+    for column, (body, agent) in enumerate(drivers.items()):
+        commands, after[body] = asked(agent, state, memories[body], body)
+        actions[:, column] = to_action(state, body, commands)
+    return actions, after
+
+
+def to_command(state: State, body: int, actions: Floats) -> Floats:
+    """Turn actions [n], from -1 (full braking) to 1 (full driving), into commands of vehicle ``body``, [n] m/s2."""
+    return np.where(actions < 0.0, state.car[:, BRAKING, body], state.car[:, DRIVING, body]) * actions
+
+
+def to_action(state: State, body: int, commands: Floats) -> Floats:
+    """Turn commands [n] of vehicle ``body`` (m/s2) into actions; one beyond a capacity becomes -1 or 1."""
+    capacity = np.where(commands < 0.0, state.car[:, BRAKING, body], state.car[:, DRIVING, body])
+    share = np.divide(commands, capacity, out=np.zeros_like(capacity), where=capacity > 0.0)
+    return np.clip(share, -1.0, 1.0)

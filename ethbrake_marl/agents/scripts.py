@@ -1,0 +1,47 @@
+"""Scripts that hold one command: full braking (the paper's non-ethical strategy), coasting, a constant deceleration."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.agents.drive import SENSORS
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
+from ethbrake_marl.worlds.roles import check_role, first_command
+
+
+class Held(NamedTuple):
+    """Holds the command of a role: ``full_brake``, ``coast`` or ``constant:a`` (deceleration a in m/s2)."""
+
+    name: str
+    knows: str = SENSORS
+
+    def begin(self, alert: State, body: int) -> Floats:
+        """Return the command, [n] m/s2. Raises ``InvalidInput`` if it is beyond a capacity of the vehicle."""
+        braking, driving = alert.car[:, BRAKING, body], alert.car[:, DRIVING, body]
+        command = first_command(self.name, braking)
+        beyond = np.flatnonzero((command < -braking) | (command > driving))
+        if len(beyond):
+            k = beyond[0]
+            raise InvalidInput(
+                f"agent {self.name!r}: vehicle_{body} must decelerate at most {braking[k]:g} m/s2 and drive at most"
+                f" {driving[k]:g} m/s2 in row {k}"
+            )
+        return command
+
+    def act(self, state: State, memory: Floats, body: int) -> tuple[Floats, Floats]:
+        """Return the command, which is the memory."""
+        return memory, memory
+
+
+FULL_BRAKE, COAST = Held("full_brake"), Held("coast")
+
+
+def constant(deceleration_mps2: float) -> Held:
+    """Return the script ``constant:a``. Raises ``InvalidInput`` unless the deceleration is finite."""
+    role = f"constant:{deceleration_mps2!r}"
+    check_role(role)
+    return Held(role)

@@ -1,0 +1,1 @@
+"""Shields: check each proposed action, and replace it where it could break a promise about harm."""
