@@ -189,7 +189,7 @@ def begin(alert: State, deciders: Ints, time_step_s: float, horizon_s: float) ->
 
 
 def step(
-    rules: Rules, scripts: Mapping[int, Any], state: State, actions: Floats, *, donate: bool = False
+    rules: Rules, scripts: Mapping[int, Any], state: State, actions: Floats | None, *, donate: bool = False
 ) -> tuple[State, Step]:
     """Return the state after one step, and what the step did.
 

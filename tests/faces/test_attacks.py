@@ -17,11 +17,13 @@ from ethbrake_marl.worlds.game import game_of
 PAPER = load_scenario("paper-random").replace(early_impacts="keep")
 
 
-@pytest.mark.parametrize("role", ["idm", "nonsense", "ppo"])
-def test_role_of_an_agent__must_be_given(role: str) -> None:
+@pytest.mark.parametrize("role", ["nonsense", "coast@x", "no:3"])
+def test_role_of_an_agent__must_be_known(role: str) -> None:
     scenario = PAPER.replace(roles={"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": role})
     for face in (EthBrakeEnv, EthBrakeParallelEnv, lambda each: EthBrakeVectorEnv(2, each)):
-        with pytest.raises(InvalidInput, match=rf"roles.vehicle_3 = {role}: is an agent, which must be given"):
+        with pytest.raises(
+            InvalidInput, match=rf"roles.vehicle_3 = {role}: (unknown agent|agent coast@x: coast uses no policy)"
+        ):
             face(scenario)
 
 
