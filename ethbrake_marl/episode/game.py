@@ -62,7 +62,9 @@ class Game(NamedTuple):
         if self.scripts:
             wanted = wanted.copy()
             for body, script in self.scripts.items():
-                wanted[:, body], memories[body] = one_step.asked(script, alert, script.begin(alert, body), body)
+                wanted[:, body], memories[body] = one_step.asked(
+                    script, alert, one_step.begun(script, alert, body), body
+                )
         state = self.first_decision(alert._replace(wanted=wanted, memories=memories))
         memories = dict(state.memories)
         if self.rewarding.shaping is not None:

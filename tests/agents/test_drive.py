@@ -10,7 +10,7 @@ import pytest
 from ethbrake_marl.agents.drive import Team, drive, play, propose, to_action, to_command
 from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import AgentFailed, InvalidInput
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
 from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
 from ethbrake_marl.names import open_game
@@ -105,7 +105,9 @@ class Gives:
     "commands", [[0.0], [[0.0, 0.0]], np.array([np.nan, 0.0]), [np.inf, 0.0], ["a", "b"], [True, False], None]
 )
 def test_bad_commands__are_refused_with_the_vehicle(commands: Any):
-    with pytest.raises(InvalidInput, match="script of vehicle_2: its commands are"):
+    with pytest.raises(
+        InvalidInput, match="agent 'gives'.*vehicle_2.*(its commands are|must be in|act fails|act returned)"
+    ):
         drive(GAME, PAPER.sample(2, 7), Team("gives", {2: Gives(commands)}))
 
 
@@ -132,6 +134,32 @@ def test_proposals__stand_in_the_order_of_the_drivers():
     memories = {body: agent.begin(state, body) for body, agent in drivers.items()}
     actions, after = propose(drivers, state, memories)
     assert (actions == [[-1.0, 0.0]] * 3).all() and set(after) == {2, 3}
+
+
+class Spoils:
+    """Changes what it sees, by mistake."""
+
+    name, knows = "spoils", "nothing"
+
+    def begin(self, alert: State, body: int) -> None:
+        return None
+
+    def act(self, state: State, memory: Any, body: int) -> Any:
+        gaps = state.gaps_m
+        gaps -= 2.0
+        return np.zeros(state.n), memory
+
+
+def test_an_agent__cannot_change_the_state_by_mistake_and_its_errors_name_it():
+    with pytest.raises(
+        AgentFailed, match="agent 'spoils', vehicle_2: act fails: ValueError: output array is read-only"
+    ):
+        drive(GAME, PAPER.sample(2, 7), Team("spoils", {2: Spoils()}))
+
+
+def test_a_command_beyond_a_capacity__is_refused_with_world_and_time():
+    with pytest.raises(AgentFailed, match=r"agent 'gives', world 1, vehicle_2 at 0.50 s: command -8 m/s2; must be in"):
+        drive(GAME, PAPER.sample(2, 7), Team("gives", {2: Gives([0.0, -8.0])}))
 
 
 @pytest.mark.parametrize("role", ["constant:20", "constant:-20"])

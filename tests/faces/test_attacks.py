@@ -55,7 +55,7 @@ def test_script__must_command_finite_numbers(given: Any) -> None:
     _, game = game_of(PAPER, scripts={3: Scripted(given)})
     state = game.start(2, 1, 0)
     before = pickle.dumps(state.line)
-    with pytest.raises(InvalidInput, match=r"script of vehicle_3: its commands are .*; must be finite numbers"):
+    with pytest.raises(InvalidInput, match=r"agent 'Scripted'.*vehicle_3.*(must be numbers|must be in)"):
         game.step(state, np.zeros((2, 1)), donate=True)
     assert pickle.dumps(state.line) == before
 
