@@ -20,7 +20,7 @@ from typer.exceptions import TyperException
 from typer.main import get_command
 
 from ethbrake_marl import __version__
-from ethbrake_marl.cli import doctor, evaluate, scenario, train
+from ethbrake_marl.cli import agent, doctor, evaluate, scenario, train
 from ethbrake_marl.cli.command import EVERY_S, Out, example
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, describe_error, naming_extras
 from ethbrake_marl.kernel_store import is_temporary, on_first_compilation
@@ -43,7 +43,7 @@ for name, command, shown in (
     ("doctor", doctor.doctor_command, "doctor"),
 ):
     app.command(name, epilog=example(shown) + (f"\n\n{_NAMES}" if name in ("train", "evaluate") else ""))(command)
-for name, group in (("scenario", scenario.scenario_group), ("agent", scenario.agent_group)):
+for name, group in (("scenario", scenario.scenario_group), ("agent", agent.agent_group)):
     app.add_typer(group, name=name)
 
 

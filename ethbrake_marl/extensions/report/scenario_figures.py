@@ -44,12 +44,13 @@ _MOST_NAMED = 8  # largest number of vehicles for which gaps and speeds are writ
 _SHOWN = {0.0: "shortest line", 0.5: "median line", 1.0: "longest line"}  # by relative rank of the sum of gaps
 
 
-def write_worlds(path: Path, scenario: Scenario, sample: Sample, *, seed: int, force: bool = False) -> None:
-    """Write the picture of ``ethbrake scenario sample`` to the file ``path``.
+def write_worlds(path: Path, scenario: Any, episodes: int, *, seed: int, force: bool = False) -> None:
+    """Write the picture of ``ethbrake scenario sample``, of ``episodes`` worlds of the seed, to the file ``path``.
 
-    ``seed`` is the seed of the list of worlds in ``sample``. Raises the exceptions of ``write_picture``.
+    Raises the exceptions of ``write_picture``.
     """
-    write_picture(path, worlds_figure(scenario, sample, seed=seed), force=force)
+    first_edition = Scenario(**scenario.declared())
+    write_picture(path, worlds_figure(first_edition, first_edition.sample(episodes, seed), seed=seed), force=force)
 
 
 @in_our_style
