@@ -204,8 +204,8 @@ def check_agent(agent: Any, where: str, *, alone: bool = True) -> None:
     missing = [what for what in ("name", "knows", "begin", "act") if not hasattr(agent, what)]
     if missing:
         raise InvalidInput(
-            f"{where}: {type(agent).__name__} is not an agent, because it has no {' and no '.join(missing)}; an agent is made by"
-            " make_agent(name), or policy_agent(policy) for a function or a model"
+            f"{where}: {type(agent).__name__} is not an agent, because it has no {' and no '.join(missing)}; an"
+            " agent is made by make_agent(name), or policy_agent(policy) for a function or a model"
         )
 
 
