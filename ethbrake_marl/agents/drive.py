@@ -9,7 +9,7 @@ import numpy as np
 
 from ethbrake_marl.episode.game import Game, Shield
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.episode.step import Step, asked
+from ethbrake_marl.episode.step import Step, asked, begun
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
 
@@ -61,7 +61,7 @@ def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Itera
     game = team.game(game)
     if game.shield is None:
         state = game.begin(alert)
-        memories = {body: agent.begin(alert, body) for body, agent in team.drivers.items()}
+        memories = {body: begun(agent, alert, body) for body, agent in team.drivers.items()}
         state = state._replace(memories={**state.memories, **memories})
         game = driven_by(game, team.drivers)
         actions = np.zeros((alert.n, 0))
