@@ -13,7 +13,9 @@ from ethbrake_marl.motion.layout import Floats
 
 
 class Indices(Discrete):
-    """Indices of actions evenly spaced from -1 to 1, which travels with a model that stores its spaces."""
+    """Indices of actions that are evenly spaced from -1 to 1; a model that stores its spaces shows it."""
+
+    evenly_spaced = True
 
 
 def action_space(count: int | None) -> Any:
