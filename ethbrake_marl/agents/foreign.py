@@ -163,10 +163,10 @@ def count_of_actions(policy: Any, given: int | None, who: str) -> int | None:
 
     Raises ``InvalidInput`` if its action space is neither a box from -1 to 1 nor as ``given``.
     """
-    space = getattr(policy, "action_space", None)
+    space: Any = getattr(policy, "action_space", None)
     count, least = getattr(space, "n", None), getattr(space, "start", None)
     if given is None and getattr(space, "evenly_spaced", False):  # of an environment of this package
-        given = int(count)
+        given = int(space.n)
     low, high = (np.asarray(getattr(space, end, np.nan)).tolist() for end in ("low", "high"))
     fits = (low, high) == ([-1.0], [1.0]) if given is None else (count, least) == (given, 0)
     if space is not None and not fits:
