@@ -20,9 +20,9 @@ from difflib import get_close_matches
 from inspect import signature
 from typing import Any
 
-from ethbrake_marl.agents.drive import Agent, Team
+from ethbrake_marl.agents.drive import Agent, Team, check_agent
 from ethbrake_marl.episode.game import Game, Script
-from ethbrake_marl.errors import EthBrakeError, InvalidInput, describe_error, refuse_shipped_path, unknown_name
+from ethbrake_marl.errors import EthBrakeError, InvalidInput, describe_error, refuse_shipped_path
 from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.registry import Registry
 from ethbrake_marl.worlds.catalogue import load_scenario
@@ -179,34 +179,18 @@ def teams_of(agents: Any, scenario: Scenario, *, harm_count: str = "first") -> d
     teams = {}
     for name, given in agents.items():
         if isinstance(given, Mapping):
-            bodies = {vehicle: body for body, vehicle in enumerate(scenario.vehicle_names, 1)}
-            if unknown := [vehicle for vehicle in given if vehicle not in bodies]:
-                raise unknown_name(f"vehicle of agent {name!r}:", unknown[0], bodies)
-            drivers = {bodies[vehicle]: _alone(name, each, scenario, harm_count) for vehicle, each in given.items()}
-            teams[name] = Team(name, dict(sorted(drivers.items())))
+            drivers = {vehicle: _driver(each, scenario, harm_count) for vehicle, each in given.items()}
+            teams[name] = Team.of(drivers, name)
         else:
-            driver = make_agent(given, scenario=scenario, harm_count=harm_count) if isinstance(given, str) else given
-            check_agent(driver, f"agent {name!r}", alone=False)
+            driver = _driver(given, scenario, harm_count)
+            if not isinstance(driver, Team):
+                check_agent(driver, f"agent {name!r} = {driver!r:.60}")
             teams[name] = team_of(driver, scenario)._replace(name=name)
     return teams
 
 
-def _alone(name: str, given: Any, scenario: Scenario, harm_count: str) -> Agent:
-    agent = make_agent(given, scenario=scenario, harm_count=harm_count) if isinstance(given, str) else given
-    check_agent(agent, f"agent {name!r}")
-    return agent  # type: ignore[no-any-return]
-
-
-def check_agent(agent: Any, where: str, *, alone: bool = True) -> None:
-    """Raise ``InvalidInput`` unless this is an agent or, not ``alone``, a team. The message begins with ``where``."""
-    if isinstance(agent, Team) and not alone:
-        return
-    missing = [what for what in ("name", "knows", "begin", "act") if not hasattr(agent, what)]
-    if missing:
-        raise InvalidInput(
-            f"{where}: {type(agent).__name__} is not an agent, because it has no {' and no '.join(missing)}; an"
-            " agent is made by make_agent(name), or policy_agent(policy) for a function or a model"
-        )
+def _driver(given: Any, scenario: Scenario, harm_count: str) -> Any:
+    return make_agent(given, scenario=scenario, harm_count=harm_count) if isinstance(given, str) else given
 
 
 def group(name: str) -> list[str]:
@@ -279,7 +263,8 @@ def _make(core: str, settings: AgentSettings) -> Driver:
         if not callable(make):
             raise InvalidInput(f"agent {core!r}: is the name of a group of agents; write the name of one agent")
     driver: Driver = _called(core, make, argument or None, settings)
-    check_agent(driver, f"agent {core!r}", alone=False)
+    if not isinstance(driver, Team):
+        check_agent(driver, f"agent {core!r} = {driver!r:.60}")
     return driver
 
 

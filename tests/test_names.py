@@ -147,7 +147,9 @@ def test_a_name__belongs_to_one_agent():
 
 def test_what_is_no_agent__is_refused_with_what_it_lacks():
     register_agent("theirs", lambda argument, settings: object())
-    with pytest.raises(InvalidInput, match="object is not an agent, because it has no name and no knows and no begin"):
+    with pytest.raises(
+        InvalidInput, match=r"agent 'theirs' = <object object.*: has no name and no knows and no begin and no act"
+    ):
         make_agent("theirs")
 
 
@@ -217,11 +219,11 @@ def test_agents__are_given_as_names_or_as_mappings_of_names_agents_and_vehicles(
         ({}, "must be names, such as"),
         (None, "must be names, such as"),
         (3, "must be names, such as"),
-        ({"a": 3}, "agent 'a': int is not an agent"),
-        ({"a": print}, "agent 'a': builtin_function_or_method is not an agent"),
-        ({"a": {"vehicle_9": "coast"}}, "unknown vehicle of agent 'a': 'vehicle_9'"),
-        ({"a": {2: "coast"}}, "unknown vehicle of agent 'a': 2"),
-        ({"a": {"vehicle_2": Team("x", {})}}, "agent 'a': Team is not an agent"),
+        ({"a": 3}, "agent 'a' = 3: has no name"),
+        ({"a": print}, "agent 'a' = <built-in function print>: has no name"),
+        ({"a": {"vehicle": "coast"}}, "team 'a': 'vehicle': must be the name of a vehicle"),
+        ({"a": {2: "coast"}}, "team 'a': 2: must be the name of a vehicle"),
+        ({"a": {"vehicle_2": Team("x", {})}}, "team 'a': vehicle_2 = Team.*has no knows"),
         (["coast", 3], "must be a name, for instance"),
     ],
 )
