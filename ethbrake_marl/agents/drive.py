@@ -26,8 +26,13 @@ NOBODY = np.zeros(0, np.int64)
 class Agent(Protocol):
     """Drives one vehicle: a script, a policy, a search. It sees the whole state, and decides when the learners do."""
 
-    name: str  # in tables and messages
-    knows: str  # what it has to know, for tables: one of the texts above
+    @property
+    def name(self) -> str:
+        """Name in tables and messages."""
+
+    @property
+    def knows(self) -> str:
+        """What it has to know, for tables: one of the texts above."""
 
     def begin(self, alert: State, body: int) -> Any:
         """Return the memory for new episodes: None, an array with one row per world, or a tuple of memories."""
