@@ -25,10 +25,9 @@ from ethbrake_marl.worlds.scenario import Scenario
 FIRST_PARTS = 64  # number of parts into which all decelerations are split, and
 PARTS = 8  # into which a cell of them is split
 EVENLY = np.arange(PARTS + 1)
-NARROWEST_MPS2 = 1e-6  # narrower cells are not split
-SMALL = 1e-4  # harm (m2/s2) that is not worth a further split
+NARROWEST_MPS2 = 1e-5  # narrower cells are not split
+SMALL = 1e-3  # harm (m2/s2) that is not worth a further split
 TIE = 1e-9  # harms (m2/s2) closer than this count as equal
-ASIDE_MPS2 = 1e-9  # distance from a jump of the harm that rounding does not bridge
 
 
 def coupled(alert: State, body: int, count: str = "first", horizon_s: float = 8.0) -> Choice:
@@ -47,7 +46,7 @@ def coupled(alert: State, body: int, count: str = "first", horizon_s: float = 8.
     if len(rows):
         alert = alert.take(rows)
         found = search(alert, body, np.stack([best[rows], *harm[:, rows]], axis=1), count, horizon_s)
-        best[rows], harm[0, rows] = step_aside(alert, body, found, count, horizon_s)
+        best[rows], harm[0, rows] = found[:, 0], found[:, 1]
     return Choice(best, harm[0])
 
 
@@ -71,7 +70,7 @@ def search(alert: State, body: int, best: Floats, count: str, horizon_s: float) 
         at, harm = low[:, np.newaxis] + step[rows, np.newaxis] * EVENLY, np.empty((len(rows), 2, PARTS + 1))
         harm[:, :, 0], harm[:, :, PARTS] = ends
         harm[:, :, 1:PARTS] = harms(alert.take(rows), body, at[:, 1:PARTS], count, horizon_s).swapaxes(0, 1)
-    return best[:, 0]
+    return best
 
 
 @large
@@ -119,15 +118,3 @@ def compare(harm, known):
             return -1 if harm[count] < known[count + 1] else 1
     return 0
 
-
-def step_aside(alert: State, body: int, best: Floats, count: str, horizon_s: float) -> tuple[Floats, Floats]:
-    """Return decelerations that are not at a jump of the harm, [n], and their harms.
-
-    An episode is played step by step, and rounded differently: at a jump, rounding would decide how much harm is done.
-    """
-    around = np.clip(best[:, np.newaxis] + ASIDE_MPS2 * np.arange(-2, 3), 0.0, alert.car[:, BRAKING, [body]])
-    harm = harms(alert, body, around, count, horizon_s)[0]
-    worst = np.maximum(np.maximum(harm[:, :-2], harm[:, 1:-1]), harm[:, 2:])
-    at_jump = worst[:, 1] > worst.min(axis=1) + SMALL
-    row, pick = np.arange(alert.n), np.where(at_jump, worst.argmin(axis=1), 1) + 1
-    return around[row, pick], harm[row, pick]

@@ -73,70 +73,77 @@ def meet(gap, front, front_braking, front_onset, rear, rear_braking, rear_onset,
 
 
 @large
-def harms_alone(line, braking, wait, body, tried, out):
-    """Write H to ``out`` [n, C] for the decelerations ``tried`` [n, C] (m/s2) of vehicle ``body``.
-
-    ``braking`` [n, N + 1] is how hard the others brake (m/s2), ``wait`` [n, N + 1] when each may begin (s from now).
-    """
-    last = line.shape[2] - 1
-    for k in range(line.shape[0]):
-        gap, speed, force, onset = line[k, GAP], line[k, SPEED], braking[k], wait[k]
-        for c in range(tried.shape[1]):
-            a, out[k, c] = tried[k, c], 0.0
-            if body > 1:
-                i = body - 1
-                out[k, c] += meet(gap[i], speed[i], force[i], onset[i], speed[body], a, onset[body], math.inf)[0]
-            if body < last:
-                i = body + 1
-                out[k, c] += meet(gap[body], speed[body], a, onset[body], speed[i], force[i], onset[i], math.inf)[0]
+def predicted_harm(line, braking, wait, body, a):
+    """Return H (m2/s2) in one world if vehicle ``body`` decelerates with ``a`` (m/s2)."""
+    gap, speed, harm = line[GAP], line[SPEED], 0.0
+    if body > 1:
+        i = body - 1
+        harm += meet(gap[i], speed[i], braking[i], wait[i], speed[body], a, wait[body], math.inf)[0]
+    if body < line.shape[1] - 1:
+        i = body + 1
+        harm += meet(gap[body], speed[body], a, wait[body], speed[i], braking[i], wait[i], math.inf)[0]
+    return harm
 
 
 @large
 def find_candidates(line, braking, wait, body, at):
-    """Write the decelerations of vehicle ``body`` at which H may be least to ``at`` [n, CANDIDATES] (m/s2).
+    """Write the decelerations of vehicle ``body`` at which H may be least to ``at`` [CANDIDATES] (m/s2), in one world.
 
     They belong to the state at its onset: gap d, own speed v and the neighbour's u, closing speed w, and the time s for
     which the neighbour still coasts before it brakes with b. Some are not in [0, capacity], or not a number.
     """
-    last = line.shape[2] - 1
+    gap, speed, onset = line[GAP], line[SPEED], wait[body]
+    at[:] = 0.0
+    at[1] = braking[body]
+    if body > 1:
+        i = body - 1
+        b, s = braking[i], max(wait[i] - onset, 0.0)
+        _, d, u, v = meet(gap[i], speed[i], b, wait[i], speed[body], 0.0, onset, onset)
+        w = v - u
+        at[2] = v * v / (2.0 * (d + u * s + u * u / (2.0 * b)))  # it stops right behind the neighbour
+        at[3] = (w * w + 2.0 * b * (d - w * s)) / (2.0 * d - b * s * s)  # it touches while both brake
+        at[4] = w * w / (2.0 * d)  # it touches while the neighbour coasts,
+        at[5] = (w * w - 4.0 * TOUCH_MPS * TOUCH_MPS) / (2.0 * d)  # or strikes it then as lightly as can be
+        at[6] = 2.0 * (w * s - d) / (s * s)  # it arrives at the moment in which the neighbour begins to brake
+    if body < line.shape[1] - 1:
+        i = body + 1
+        b, s = braking[i], max(wait[i] - onset, 0.0)
+        _, d, v, u = meet(gap[body], speed[body], 0.0, onset, speed[i], b, wait[i], onset)
+        w = u - v
+        at[7] = v * v / (2.0 * (u * s + u * u / (2.0 * b) - d))  # the neighbour stops right behind
+        at[8] = (2.0 * b * (d - w * s) - w * w) / (b * s * s + 2.0 * d)  # the neighbour touches while both brake
+
+
+@large
+def choose(line, braking, wait, body, at, harm, best, least):
+    """Write the best decelerations of vehicle ``body`` to ``best`` [n] and H to ``least`` [n].
+
+    ``braking`` [n, N + 1] is how hard each vehicle brakes, or can (m/s2), ``wait`` [n, N + 1] when it may begin (s from
+    now). Of several best candidates it is the middle between the outer ones, if H is as small there.
+    """
     for k in range(line.shape[0]):
-        gap, speed, onset = line[k, GAP], line[k, SPEED], wait[k, body]
-        at[k] = 0.0
-        at[k, 1] = braking[k, body]
-        if body > 1:
-            i = body - 1
-            b, s = braking[k, i], max(wait[k, i] - onset, 0.0)
-            _, d, u, v = meet(gap[i], speed[i], b, wait[k, i], speed[body], 0.0, onset, onset)
-            w = v - u
-            at[k, 2] = v * v / (2.0 * (d + u * s + u * u / (2.0 * b)))  # stops right behind the neighbour
-            at[k, 3] = (w * w + 2.0 * b * (d - w * s)) / (2.0 * d - b * s * s)  # touches it while both brake
-            at[k, 4] = w * w / (2.0 * d)  # touches it while it coasts,
-            at[k, 5] = (w * w - 4.0 * TOUCH_MPS * TOUCH_MPS) / (2.0 * d)  # or strikes it then as lightly as can be
-            at[k, 6] = 2.0 * (w * s - d) / (s * s)  # meets it at the moment in which it begins to brake
-        if body < last:
-            i = body + 1
-            b, s = braking[k, i], max(wait[k, i] - onset, 0.0)
-            _, d, v, u = meet(gap[body], speed[body], 0.0, onset, speed[i], b, wait[k, i], onset)
-            w = u - v
-            at[k, 7] = v * v / (2.0 * (u * s + u * u / (2.0 * b) - d))  # the neighbour stops right behind
-            at[k, 8] = (2.0 * b * (d - w * s) - w * w) / (b * s * s + 2.0 * d)  # it touches while both brake
+        find_candidates(line[k], braking[k], wait[k], body, at)
+        least[k], first, last = math.inf, math.inf, 0.0
+        for c in range(CANDIDATES):
+            at[c] = at[c] if 0.0 <= at[c] <= braking[k, body] else 0.0
+            harm[c] = predicted_harm(line[k], braking[k], wait[k], body, at[c])
+            least[k] = min(least[k], harm[c])
+        tied = least[k] + TIE * (1.0 + least[k])
+        for c in range(CANDIDATES):
+            if harm[c] <= tied:
+                first, last = min(first, at[c]), max(last, at[c])
+        best[k] = 0.5 * (first + last)
+        least[k] = predicted_harm(line[k], braking[k], wait[k], body, best[k])
+        if least[k] > tied:
+            best[k], least[k] = first, predicted_harm(line[k], braking[k], wait[k], body, first)
 
 
 def closed_form(alert: State, braking: Floats, body: int) -> Choice:
     """Return the choice of vehicle ``body`` where the others brake with ``braking`` [n, N + 1] (m/s2) to rest."""
     wait = np.maximum(alert.car[:, LATENCY] - alert.time_s[:, np.newaxis], 0.0)
-    at = np.empty((alert.n, CANDIDATES))
-    find_candidates(alert.line, braking, wait, body, at)
-    at[~((at >= 0.0) & (at <= braking[:, [body]]))] = 0.0
-    harm, harm_between = np.empty(at.shape), np.empty((alert.n, 1))
-    harms_alone(alert.line, braking, wait, body, at, harm)
-    least = harm.min(axis=1, keepdims=True)
-    least += TIE * (1.0 + least)
-    first = np.where(harm <= least, at, np.inf).min(axis=1, keepdims=True)
-    between = 0.5 * (first + np.where(harm <= least, at, 0.0).max(axis=1, keepdims=True))
-    harms_alone(alert.line, braking, wait, body, between, harm_between)
-    flat = (harm_between <= least)[:, 0]
-    return Choice(np.where(flat, between[:, 0], first[:, 0]), np.where(flat, harm_between[:, 0], harm.min(axis=1)))
+    choice = Choice(np.empty(alert.n), np.empty(alert.n))
+    choose(alert.line, braking, wait, body, np.empty(CANDIDATES), np.empty(CANDIDATES), *choice)
+    return choice
 
 
 def pairwise(alert: State, body: int) -> Choice:
