@@ -154,10 +154,11 @@ def pairwise(alert: State, body: int) -> Choice:
 
     Raises ``InvalidInput`` where the proof does not hold: a vehicle moves backward, or brakes build up gradually.
     """
-    builds = np.isfinite(alert.car[:, [BRAKE_RATE, RELEASE_RATE], 1:]).any(axis=(1, 2))
     backward = (alert.speeds_mps < 0.0).any(axis=1)
-    if (builds | backward).any():
-        k = np.argmax(builds | backward)
-        why = "brakes build up gradually" if builds[k] else "a vehicle moves backward"
-        raise InvalidInput(f"e_v2x_bm:pairwise: {why} in row {k}, where the closed form does not hold; use e_v2x_bm")
+    builds = np.isfinite(alert.car[:, [BRAKE_RATE, RELEASE_RATE], 1:]).any(axis=(1, 2))
+    for wrong, what in ((backward, "a vehicle moves backward"), (builds, "brakes build up gradually")):
+        if np.any(wrong):
+            raise InvalidInput(
+                f"e_v2x_bm:pairwise: {what} in row {np.argmax(wrong)}, where the closed form does not hold"
+            )
     return closed_form(alert, np.ascontiguousarray(alert.car[:, BRAKING]), body)
