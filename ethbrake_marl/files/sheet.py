@@ -7,7 +7,7 @@ import io
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -29,6 +29,9 @@ class Estimate:
 
     value: float
     interval: tuple[float, float] | None  # low and high end; None if it cannot be computed, as for one world
+    # standard error, and its degrees of freedom; None where they are not known
+    error: float | None = field(default=None, compare=False)
+    freedom: float | None = field(default=None, compare=False)
 
     @property
     def ends(self) -> tuple[float, float]:

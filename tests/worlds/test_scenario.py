@@ -19,7 +19,7 @@ from ethbrake_marl.files.yaml import read_yaml
 from ethbrake_marl.worlds import catalogue, explain
 from ethbrake_marl.worlds.catalogue import group_of_scenarios, list_scenarios, load_scenario
 from ethbrake_marl.worlds.counters import numbers_of
-from ethbrake_marl.worlds.describe import clusters_of, kinds_of
+from ethbrake_marl.worlds.describe import clusters_of, columns_of, kinds_of
 from ethbrake_marl.worlds.rules import RULES
 from ethbrake_marl.worlds.scenario import Scenario
 from tests.fixtures.scenarios import SHIPPED
