@@ -76,6 +76,11 @@ class Result:
     def __repr__(self) -> str:
         return f"Result({self.about['scenario']!r}, {count_of(self.n, 'world')}: {', '.join(self.columns):.200})"
 
+    def measure_of(self, column: str) -> Measure:
+        """Return the measure that a column belongs to."""
+        mine = [each for each in self.measures if column == each.name or column.startswith(f"{each.name}_")]
+        return max(mine, key=lambda measure: len(measure.name))
+
     def take(self, rows: Any) -> Result:
         """Return the result in some of its worlds: row numbers, or a mask [n]."""
         columns = {team: {name: each[rows] for name, each in own.items()} for team, own in self.columns.items()}
@@ -201,9 +206,7 @@ def _driven(alert: State, name: str, team: Team, game: Game, measures: Sequence[
 def _joined(parts: Sequence[Columns]) -> Columns:
     """Return the columns of all chunks; one that is missing in a chunk is missing."""
     return {
-        name: np.concatenate([part[name] for part in parts])
-        for name in parts[0]
-        if all(name in part for part in parts)
+        name: np.concatenate([part[name] for part in parts]) for name in parts[0] if all(name in part for part in parts)
     }
 
 

@@ -42,7 +42,7 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.episode.terms import TERMS, TermFunction
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, describe_error, unknown_name
-from ethbrake_marl.motion.layout import COUNT, FORCE, SPEED
+from ethbrake_marl.motion.layout import COUNT, FIRST, FORCE, SPEED
 from ethbrake_marl.registry import Registry
 
 Values = NDArray[Any]
@@ -90,7 +90,7 @@ def flat(measure: Measure, given: Given, last: State) -> dict[str, Values]:
     if given is None:
         return {}
     parts: Mapping[str, Any] = given if isinstance(given, Mapping) else {"": given}
-    columns = {}
+    columns: dict[str, Values] = {}
     for ending, value in parts.items():
         name, values = "_".join(filter(None, (measure.name, ending))), np.asarray(value)
         each = {f"{name}_{i + 1}": column for i, column in enumerate(values.T)} if values.ndim == 2 else {name: values}
@@ -142,7 +142,12 @@ def harm(count: str, game: Game, alert: State, last: State) -> Given:
 
 def impacts(game: Game, alert: State, last: State) -> Given:
     """Number of impacts, those with an obstacle included."""
-    return last.line[:, COUNT].sum(axis=1).astype(np.int64)
+    return np.asarray(last.line[:, COUNT].sum(axis=1), np.int64)
+
+
+def hardest_impact_mps(game: Game, alert: State, last: State) -> Given:
+    """Largest closing speed of a pair's first impact."""
+    return np.asarray(np.sqrt(last.line[:, FIRST].max(axis=1)))
 
 
 def end_s(game: Game, alert: State, last: State) -> Given:
@@ -158,7 +163,7 @@ def ended(game: Game, alert: State, last: State) -> Given:
 
 def predicted_harm(game: Game, alert: State, last: State) -> Given:
     """Harm that the agent predicted at the alert, in the count that it minimises."""
-    memories = [last.memories.get(who) for who in ("shield", *game.rules.learners.tolist())]
+    memories: list[Any] = [last.memories.get(who) for who in ("shield", *game.rules.learners.tolist())]
     predictions = [memory.predicted_harm for memory in memories if hasattr(memory, "predicted_harm")]
     return predictions[0] if len(predictions) == 1 and np.isfinite(predictions[0]).all() else None
 
@@ -196,6 +201,7 @@ _BUILT_IN = (
         ),
     ),
     _built_in(impacts, "1"),
+    _built_in(hardest_impact_mps, "m/s"),
     _built_in(end_s, "s"),
     _built_in(ended, ""),
     _built_in(predicted_harm, "m2/s2", Statistic("predicted_harm", "mean", "Predicted harm", "Pre-\ndicted")),
@@ -213,7 +219,7 @@ def register_measure(
     shown: Iterable[Statistic] = (),
     watch: Callable[[Game, State], Watch | None] | None = None,
 ) -> None:
-    """Register a measure, which ``evaluate(measures=[name])`` reports. Entry points: ``ethbrake_marl.episode_measures``.
+    """Register a measure, for ``evaluate(measures=[name])``. Entry points: ``ethbrake_marl.episode_measures``.
 
     Raises ``AlreadyExists`` for a name in use, and ``InvalidInput`` for a bad name or a function without a docstring,
     which says what the measure means.

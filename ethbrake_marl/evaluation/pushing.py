@@ -167,6 +167,4 @@ SHOVED = Part(
         Statistic("vehicle_1_shoved_far_rate", "rate", "Vehicle 1 shoved > 5 m", "Shoved\n> 5 m", "far"),
     ),
 )  # fmt: skip
-SAMPLED = Part(
-    watch=sampled, unit="m2/s2", shown=(Statistic("sampled_harm", "mean", "Sampled harm", "Sampled\nharm"),)
-)
+SAMPLED = Part(watch=sampled, unit="m2/s2", shown=(Statistic("sampled_harm", "mean", "Sampled harm", "Sampled\nharm"),))

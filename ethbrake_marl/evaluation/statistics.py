@@ -24,6 +24,7 @@ In all functions ``values`` and ``baseline`` have one number per world, [n], for
 from __future__ import annotations
 
 from math import cbrt, fsum, sqrt
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +37,7 @@ UPPER = 0.975  # quantile at the upper end of a 95 % interval
 Z = float(ndtri(UPPER))
 LEAST_REST = 1e-6  # of the weight, outside each recording: nothing can be said of others without it
 
-Clusters = NDArray[np.str_] | None
+Clusters = NDArray[Any] | None
 
 
 def mean(values: Floats, clusters: Clusters = None) -> Estimate:
@@ -75,8 +76,9 @@ def rate(truths: Bools, clusters: Clusters = None) -> Estimate:
     """Return the share p of worlds that are true, with Wilson's score interval, which lies within [0, 1].
 
     The interval has the centre ``(p + z^2 / (2 n)) / (1 + z^2 / n)`` and the half-width
-    ``z sqrt(p (1 - p) / n + z^2 / (4 n^2)) / (1 + z^2 / n)``. With clusters, n is the number ``1 + p (1 - p) / error^2``
-    of independent worlds that would have the same standard error, at most the number of worlds, times ``(z / t)^2``
+    ``z sqrt(p (1 - p) / n + z^2 / (4 n^2)) / (1 + z^2 / n)``. With clusters, n is the number of
+    independent worlds that would have the same standard error, ``1 + p (1 - p) / error^2``, at most the number of
+    worlds, times ``(z / t)^2``
     (Korn and Graubard 1998). If all worlds are alike, it is ``1 / sum h_g^2`` times ``(z / t)^2``.
     """
     share, n = int(np.count_nonzero(truths)) / len(truths), float(len(truths))
@@ -84,7 +86,7 @@ def rate(truths: Bools, clusters: Clusters = None) -> Estimate:
     freedom: float | None = n - 1.0
     if clusters is not None:
         ones = np.ones(len(truths))
-        sums = _by_cluster(truths - share, ones, clusters)
+        sums = _by_cluster(np.asarray(truths - share, np.float64), ones, clusters)
         error, freedom, _ = _spread(*sums, n)
         if error is None or freedom is None:
             return Estimate(share, None)
@@ -143,10 +145,10 @@ def _around(ratio: float, residuals: Floats, weights: Floats, clusters: Clusters
     return Estimate(ratio, (ratio - below * error, ratio + above * error), error, freedom)
 
 
-def _by_cluster(residuals: Floats, weights: Floats, clusters: NDArray[np.str_]) -> tuple[Floats, Floats]:
+def _by_cluster(residuals: Floats, weights: Floats, clusters: NDArray[Any]) -> tuple[Floats, Floats]:
     """Return both sums over each cluster, [G]."""
     which = np.unique(clusters, return_inverse=True)[1]
-    return np.bincount(which, residuals), np.bincount(which, weights)
+    return np.bincount(which, residuals).astype(np.float64), np.bincount(which, weights).astype(np.float64)
 
 
 def _spread(residuals: Floats, weights: Floats, whole: float) -> tuple[float, float, float] | tuple[None, None, None]:
