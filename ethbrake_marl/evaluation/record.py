@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -41,7 +42,7 @@ OF_IMPACT = (NEXT_TIME, NEXT_CLOSING, NEW_COUNT, NEW_FIRST, NEW_TOTAL)
 
 @large
 def drive_each(line, car, wanted, start, until, scratch, rows, out):
-    """Advance every world in place, and write the ``rows`` of scratch memory to ``out`` [n, rows, N + 1]; 0 if apart."""
+    """Advance every world in place, and write ``rows`` of scratch memory to ``out`` [n, rows, N + 1]; 0 if apart."""
     for k in range(len(until)):
         met = drive(line[k], car[k], wanted[k], scratch, start[k], until[k])
         for r in range(len(rows)):
@@ -122,7 +123,7 @@ def record_episode(world: State, team: Team, game: Game, sample_s: float = SAMPL
     if not (isinstance(sample_s, int | float) and 0.0 < sample_s < math.inf):
         raise InvalidInput(f"record_episode: sample_s = {sample_s!r}: must be a finite number of seconds above 0")
     states = [world, *(state for _, state in play(game, world, team))]
-    pieces = [_between(before, after, sample_s) for before, after in zip(states, states[1:], strict=False)]
+    pieces = [_between(before, after, sample_s) for before, after in pairwise(states)]
     times, lines, wanted, impacts = (np.concatenate(part) for part in zip(*pieces, strict=True))
     way_m = np.cumsum(lines[:, 0, GAP, 0] - lines[:, 1, GAP, 0])  # of Vehicle 1, up to the end of each piece
     line = np.concatenate([lines[:, 0], lines[-1:, 1]])

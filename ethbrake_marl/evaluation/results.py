@@ -16,7 +16,7 @@ import numpy as np
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, naming_extras
 from ethbrake_marl.evaluation.evaluate import Columns, Result
 from ethbrake_marl.evaluation.measures import MEASURES, Measure, Values
-from ethbrake_marl.evaluation.summary import SummaryTable
+from ethbrake_marl.evaluation.summary import IDENTITY, SummaryTable
 from ethbrake_marl.files.plain import parse_strict_json, read_plain
 from ethbrake_marl.files.sheet import Estimate, parquet_file
 from ethbrake_marl.files.store import check_target, write_output
@@ -195,8 +195,7 @@ def _beside(file: Path, agents: Mapping[str, Mapping[str, Any]]) -> tuple[Result
         measures = tuple(
             MEASURES.loaded.get(name, Measure(name, unit=str(unit))) for name, unit in beside["measures"].items()
         )
-        about = {**own["parameters"], **{key: own.get(key) for key in own if key.endswith("_sha256")}}
-        about["versions"] = own["versions"]
+        about = {**own["parameters"], **{key: own[key] for key in IDENTITY if key in own}}
         return Result(
             columns, {name: each for name, each in described.items() if each is not None}, measures,
             {name: each["knows"] for name, each in agents.items()},

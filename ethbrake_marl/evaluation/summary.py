@@ -178,8 +178,8 @@ class SummaryTable(list[SummaryRow]):
 
     def to_json(self) -> list[dict[str, Any]]:
         """Return plain data: one object per team, with the digests, versions and ``parameters`` of the result."""
-        identity = {key: self.parameters[key] for key in _IDENTITY if key in self.parameters}
-        parameters = {key: value for key, value in self.parameters.items() if key not in _IDENTITY}
+        identity = {key: self.parameters[key] for key in IDENTITY if key in self.parameters}
+        parameters = {key: value for key, value in self.parameters.items() if key not in IDENTITY}
         return [{"kind": "evaluate", **row.to_json(), **identity, "parameters": parameters} for row in self]
 
     def to_pandas(self) -> Any:
@@ -206,7 +206,7 @@ class SummaryTable(list[SummaryRow]):
         return "\n\n".join([worlds, *self.notes()])
 
 
-_IDENTITY = ("worlds_sha256", "scenario_sha256", "physics_sha256", "versions")
+IDENTITY = ("worlds_sha256", "scenario_sha256", "physics_sha256", "versions")
 _PERCENT: dict[str, Any] = {"digits": 1, "scale": 100.0, "unit": " %"}
 _FORMATS = {"rate": _PERCENT, "decrease": _PERCENT}
 
