@@ -110,7 +110,8 @@ def _add(table: Registry[Entry], name: str, make: Any, about: str, knows: str, f
         raise InvalidInput(
             f"{table.kind} {name!r:.80}: the name must have the characters a-z, 0-9, _ and -, beginning with a letter"
         )
-    table.add(name, Entry(make, about, knows, form or f"{name}[:ARGUMENT]"), lambda other: other.make == make)
+    sign = "+" if table is WRAPPERS else ""
+    table.add(name, Entry(make, about, knows, form or f"{sign}{name}[:ARGUMENT]"), lambda other: other.make == make)
 
 
 AGENTS: Registry[Entry] = Registry("agent", "second.agents", register_agent)
@@ -343,7 +344,12 @@ def scripts_of(scenario: Scenario) -> Mapping[int, Script]:
     return scripts
 
 
-def agent_list() -> list[tuple[str, Entry]]:
-    """Return name and entry of all agents and wrappers that can be loaded; groups are left out."""
-    agents = [(name, entry) for name, entry in AGENTS.usable().items() if callable(entry.make)]
-    return agents + [(f"+{name}", entry) for name, entry in WRAPPERS.usable().items()]
+def listed_agents() -> list[Entry]:
+    """Return the entries of all agents and wrappers that can be loaded, without groups."""
+    return [entry for table in (AGENTS, WRAPPERS) for entry in table.usable().values() if callable(entry.make)]
+
+
+def why_not_listed() -> list[str]:
+    """Return why the other agents and wrappers cannot be loaded."""
+    reasons = (table.why_not(name) for table in (AGENTS, WRAPPERS) for name in table)
+    return [reason for reason in reasons if reason is not None]

@@ -13,8 +13,8 @@ from ethbrake_marl.agents.drive import Team, drive
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName
 from ethbrake_marl.names import (
     AgentSettings,
-    agent_list,
     group,
+    listed_agents,
     make_agent,
     make_teams,
     open_game,
@@ -234,8 +234,8 @@ def test_agents__that_are_none_are_refused(agents: Any, message: str):
 
 def test_the_list__has_all_agents_and_no_group():
     register_agent("both", ["coast", "full_brake"])
-    listed = dict(agent_list())
-    assert {"coast", "full_brake", "constant"} <= listed.keys() and "both" not in listed
+    forms = {entry.form for entry in listed_agents()}
+    assert {"coast", "full_brake", "constant:A"} <= forms and "both[:ARGUMENT]" not in forms
 
 
 def test_an_unknown_role__tells_its_place():

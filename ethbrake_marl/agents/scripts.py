@@ -49,3 +49,5 @@ COAST = Part(make_held, form="coast", about="neither brake nor drive", knows=SEN
 CONSTANT = Part(
     make_held, form="constant:A", about="constant deceleration A in m/s2; a negative A drives", knows=SENSORS
 )
+
+LADDER = ("coast", "full_brake", "e_v2x_bm:pairwise", "e_v2x_bm")  # agents that need no training, from bad to good

@@ -20,29 +20,19 @@ agent_group = typer.Typer(
 def agent_list(as_json: JsonOption = False) -> None:
     """List all agents, what they do and what they know.
 
-    In the list, a name that begins with + is appended to the name of an agent, as in full_brake+step. The name +search
-    comes before a shield, as in full_brake+search+step.
+    A name that begins with + is appended to the name of an agent, as in full_brake+step.
     """
     with Out(as_json=as_json) as out:
-        from ethbrake_marl.first_edition.agents.protocol import Knowledge
-        from ethbrake_marl.first_edition.agents.registry import agent_entries, agents_refused
+        from ethbrake_marl.names import listed_agents, why_not_listed
 
-        content, rows = [], []
-        for entry in agent_entries():
-            knows, added = Knowledge.of(entry), "also " if entry.form.startswith("+") else ""
-            content.append(
-                {"agent": entry.form, "about": entry.about, "knows": list(knows), "omniscient": knows.sees_through}
-            )
-            rows.append((entry.form, entry.about, f"{added}{knows.text}{' †' if knows.sees_through else ''}"))
-        for reason in agents_refused():
-            out.note(f"left out: {reason}")
+        entries = listed_agents()
         out.result(
-            content,
-            Sheet("", ("Agent", "Method", "Knows"), rows, gap=2),
-            "† omniscient: the agent reads values that no message carried. With :estimated after its name, an agent"
-            " uses only what its vehicle has received.",
+            [{"agent": each.form, "about": each.about, "knows": each.knows} for each in entries],
+            Sheet("", ("Agent", "Method", "Knows"), [(each.form, each.about, each.knows) for each in entries], gap=2),
             "ladder stands for all agents from coast to best_harm. See docs/evaluate.md and docs/shield.md.",
         )
+        for reason in why_not_listed():
+            out.note(f"left out: {reason}")
 
 
 @agent_group.command("export", epilog=example("agent export runs/early --onnx early.onnx"))
@@ -59,7 +49,7 @@ def agent_export(
     extra `export` installs.
     """
     with Out(force=force) as out:
-        from ethbrake_marl.first_edition.policies.shipped import load_named_policy
+        from ethbrake_marl.policies.bundle import load_named_policy
 
         out.check(onnx)
         out.write(onnx, load_named_policy(policy).to_onnx(), what="written")

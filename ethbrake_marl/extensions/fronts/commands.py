@@ -8,9 +8,9 @@ from typing import Annotated
 import typer
 
 from ethbrake_marl.cli.command import ForceOption, JobsOption, JsonOption, Out, SettingsOption, example
-from ethbrake_marl.cli.evaluate import read_task
 from ethbrake_marl.extensions.studies.commands import FolderOption
 from ethbrake_marl.first_edition.agents.spec import split_specs
+from ethbrake_marl.first_edition.training.commands import read_task
 from ethbrake_marl.registry import Part
 
 DEFAULT_AGENTS = "e_v2x_bm,universal"  # agents that are compared with the front if the scenario has one learner

@@ -16,7 +16,7 @@ from ethbrake_marl.cli.command import (
     SettingsOption,
     example,
 )
-from ethbrake_marl.cli.evaluate import make_drivers, read_task
+from ethbrake_marl.first_edition.training.commands import make_drivers, read_task
 from ethbrake_marl.registry import Part
 
 

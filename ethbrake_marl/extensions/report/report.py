@@ -24,15 +24,19 @@ from ethbrake_marl.files.sheet import Column, Estimate, Sheet, Shown
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.first_edition.agents.learned import TRAINED_POLICY, TRAINED_TEAM
 from ethbrake_marl.first_edition.agents.protocol import Driver
+from ethbrake_marl.first_edition.agents.spec import split_specs
+from ethbrake_marl.first_edition.evaluation.chunks import Lineup, evaluate_held
 from ethbrake_marl.first_edition.evaluation.conditions import Conditions
 from ethbrake_marl.first_edition.evaluation.evaluation import Evaluation
 from ethbrake_marl.first_edition.evaluation.notes import identity_line
 from ethbrake_marl.first_edition.evaluation.shield_modes import ShieldModes, compare_modes
 from ethbrake_marl.first_edition.evaluation.statistics import mean, share_of
-from ethbrake_marl.first_edition.evaluation.summary import SummaryTable
+from ethbrake_marl.first_edition.evaluation.summary import SummaryTable, summarise
 from ethbrake_marl.first_edition.evaluation.summary_row import SummaryRow
+from ethbrake_marl.first_edition.evaluation.trial import load_runnable
 from ethbrake_marl.first_edition.game.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.first_edition.scenario.task import Task
+from ethbrake_marl.first_edition.training.settings import read_settings
 
 SHIELD_WORLDS = 200  # number of worlds in which each replacement by a shield is simulated again
 
@@ -419,26 +423,32 @@ def _table(sheet: Sheet, caption: str, names: set[str]) -> Part:
 
 def write_evaluation(
     path: Path,
-    evaluation: Evaluation,
-    rows: SummaryTable,
-    agents: Mapping[str, Driver],
+    scenario_name: str,
     *,
-    harm_count: HarmCount,
+    agents: str,
+    episodes: int,
+    seed: int,
+    settings: Sequence[str],
     force: bool = False,
     tell: Callable[[int, int], None] | None = None,
 ) -> None:
     """Write the page of ``ethbrake evaluate --report`` to the file ``path``.
 
-    The agents drive some worlds again for the episode player. ``tell`` is called with the number of agents that have
-    done so, and the number of all agents. ``harm_count`` is the count that the agents minimise. Raises the exceptions
-    of ``Report.write``.
+    The first edition evaluates the agents once more; they drive some worlds again for the episode player. ``tell`` is
+    called with the number of agents that have done so, and the number of all agents. Raises the exceptions of
+    ``Report.write``.
     """
+    chosen = read_settings(settings, of_agents=("harm_count", "measures"))
+    loaded, harm_count = load_runnable(scenario_name, chosen.scenario, drives="some"), chosen.harm_count
+    lineup = Lineup.of(split_specs(agents), loaded, harm_count=harm_count, measures=chosen.measures)
+    evaluation = evaluate_held(lineup, loaded.sample(episodes, seed), seed)
+    rows, drivers = summarise(evaluation), lineup.make()
     done: list[str] = []
 
     def on_agent(agent: str) -> None:
         done.append(agent)
         if tell is not None:
-            tell(len(done), len(agents))
+            tell(len(done), len(drivers))
 
     scenario, names, asked = evaluation.scenario, ", ".join(row.agent for row in rows), rows[0].parameters
     scripts = ", ".join(f"{vehicle} by {script}" for vehicle, script in asked["scripts"].items())
@@ -459,4 +469,4 @@ def write_evaluation(
         },
         versions=rows[0].versions,
     )
-    report.driven(agents, on_agent=on_agent).write(path, force=force)
+    report.driven(drivers, on_agent=on_agent).write(path, force=force)

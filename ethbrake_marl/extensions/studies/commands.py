@@ -10,10 +10,10 @@ from typing import Annotated, Any
 import typer
 
 from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, SettingsOption, example
-from ethbrake_marl.cli.evaluate import read_task
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.first_edition import evaluation, training
+from ethbrake_marl.first_edition.training.commands import read_task
 
 REMAINS = "the same command continues the work in this folder"
 

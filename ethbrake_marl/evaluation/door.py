@@ -1,0 +1,83 @@
+"""The door to evaluation: scenarios, agents and measures by their names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.evaluation.evaluate import Result, evaluate as evaluate_teams
+from ethbrake_marl.evaluation.identity import about_scenario
+from ethbrake_marl.names import open_game, teams_of
+from ethbrake_marl.worlds.game import AnyScenario
+from ethbrake_marl.worlds.sampling import Drawn
+
+EPISODES, SEED = 10_000, 7  # the evaluation list
+
+
+def evaluate(
+    worlds: AnyScenario | Drawn | State | None = None,
+    agents: Any = "full_brake,e_v2x_bm",
+    *,
+    scenario: AnyScenario | None = None,
+    episodes: int = EPISODES,
+    seed: int = SEED,
+    harm_count: str = "first",
+    measures: Iterable[str] | str = (),
+    jobs: int = 1,
+    ray: str | None = None,
+    on_done: Callable[[int], None] | None = None,
+) -> Result:
+    """Let agents drive the same worlds, each once; return what they did.
+
+    ``eb.evaluate("paper-random", "full_brake,ppo+step")`` is the shortest form. The result is the same, to the last
+    bit, for any number of processes.
+
+    Args:
+        worlds: a scenario, whose evaluation list is driven (a shipped name, the path of a file, the content of one, or
+            a ``Scenario``); or worlds at the alert, which then need ``scenario``.
+        agents: names, or a mapping from names of your own to names, agents, or mappings from vehicles to agents:
+            ``{"mine": agent, "both": {"vehicle_2": agent, "vehicle_3": "coast"}}``.
+        scenario: of the worlds.
+        episodes: number of worlds of the list.
+        seed: of the list.
+        harm_count: what optimising agents minimise, harm of the ``first`` impact of each pair or ``total``.
+        measures: names of measures beside the usual ones (``evaluation.measures``).
+        jobs: number of processes.
+        ray: ``local``, or address of a Ray cluster.
+        on_done: called with the number of worlds that have been driven so far.
+
+    Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` for anything else that is wrong.
+
+    >>> import ethbrake_marl as eb
+    >>> result = eb.evaluate("paper-random", "full_brake", episodes=3)
+    >>> result["full_brake"]["total_harm"].round(2)
+    array([33.79, 77.19,  0.  ])
+
+    """
+    given = None
+    if isinstance(worlds, Drawn | State):
+        given = worlds
+    elif worlds is not None:
+        if scenario is not None:
+            raise InvalidInput("evaluate: scenario: is given twice; leave one of the two out")
+        scenario = worlds
+    if scenario is None:
+        if given is not None:
+            raise InvalidInput("evaluate: worlds need their scenario, for instance scenario='paper-random'")
+        scenario = "paper-random"
+    loaded, game = open_game(scenario)
+    if not loaded.learners:
+        raise InvalidInput(
+            f"scenario {loaded.name!r} has no learner that the agents could drive; make a vehicle one, for instance"
+            " scenario.with_learners(['vehicle_2'])"
+        )
+    about = about_scenario(loaded, None if given is not None else seed)
+    if given is None:
+        check_whole_number("episodes", episodes, 1)
+        given = loaded.draw(int(episodes), seed)
+    teams = teams_of(agents, loaded, harm_count=harm_count)
+    named = measures.split(",") if isinstance(measures, str) and measures else measures
+    about["agent_settings"] = {"harm_count": harm_count}
+    return evaluate_teams(given, teams, game, named, jobs, ray=ray, about=about, on_done=on_done)

@@ -1,0 +1,25 @@
+"""What commands of extensions still need: a task from words, and the agents of a list."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from ethbrake_marl.first_edition import evaluation
+from ethbrake_marl.first_edition.scenario.task import Task
+from ethbrake_marl.first_edition.training.settings import read_settings
+
+
+def read_task(scenario: str, settings: Sequence[str] | None) -> Task:
+    """Return the task of controlling the learners of a scenario, with settings ``KEY=VALUE``.
+
+    The settings may include ``harm_count=total``. Raises ``InvalidInput`` if the scenario has no learner.
+    """
+    chosen = read_settings(settings, of_agents=("harm_count",))
+    loaded = evaluation.load_runnable(scenario, chosen.scenario, drives="some")
+    return Task(loaded, loaded.learners, chosen.harm_count)
+
+
+def make_drivers(agents: str | Sequence[str], task: Task, *, bare: bool = False) -> dict[str, Any]:
+    """Return the agents named on a command line, by name (``make_lineup``, where ``agents`` are ``specs``)."""
+    return evaluation.make_lineup(agents, task.scenario, harm_count=task.harm_count, bare=bare)
