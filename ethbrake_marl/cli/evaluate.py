@@ -78,6 +78,7 @@ def evaluate_command(
         count = (GROUP_EPISODES if names else 10_000) if episodes is None else episodes
         results = {name: _result(out, name, chosen, agents, count, seed, jobs, ray) for name in names or [scenario]}
         if report and output is not None:
+            output.mkdir(parents=True, exist_ok=True)
             page_of("evaluation", "--report")(
                 output / REPORT, scenario, agents=agents, episodes=count, seed=seed, settings=chosen.texts, force=force
             )
