@@ -1,0 +1,82 @@
+"""Plans for a shield: what may follow an action, and what the learners do if nobody proposes anything.
+
+A plan [n, T, L] has the learners' actions at every decision. Nothing here is trusted: the shield asks for the price of
+each plan.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.agents.drive import Agent, propose, to_action
+from ethbrake_marl.agents.e_v2x_bm import coupled
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.play import descend, hold
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.motion.layout import BRAKING, Floats
+
+SHARES = np.linspace(0.0, 1.0, 21)  # of its brakes that each of several learners tries at the alert
+ROUNDS = 2  # in which they try them
+
+
+def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floats]:
+    """Return the plans at the alert, constant actions: [n, T, L] each.
+
+    One learner: E-V2X-BM. Several: full braking, E-V2X-BM of one while the others brake fully, and for each the best
+    share of its brakes, one after the other.
+    """
+    learners, n, horizon_s = game.rules.learners, state.n, game.rules.horizon_s
+    full = alert._replace(wanted=state.wanted.copy())
+    full.wanted[:, learners] = -alert.car[:, BRAKING, learners]
+    actions = []
+    for column, body in enumerate(learners.tolist()):
+        action = np.full((n, len(learners)), -1.0)
+        action[:, column] = to_action(alert, body, -coupled(full, body, count, horizon_s).deceleration_mps2)
+        actions.append(action)
+    if len(learners) > 1:
+        wanted, _ = descend(state, learners.tolist(), SHARES, ROUNDS, horizon_s, count)
+        descended = [to_action(alert, body, wanted[:, body]) for body in learners.tolist()]
+        actions += [np.stack(descended, axis=1), np.full((n, len(learners)), -1.0)]
+    decisions = int(np.ceil(horizon_s / game.rules.time_step_s)) + 1
+    return [np.repeat(action[:, np.newaxis], decisions, axis=1) for action in actions]
+
+
+def best_constant(game: Game, state: State, plans: Floats, count: str) -> tuple[Floats, Floats]:
+    """Return plans that hold the best of some constant actions, and their harm in one piece, [n] m2/s2."""
+    learners = game.rules.learners
+    actions = constants(len(learners))
+    commands = actions * state.car[:, np.newaxis, BRAKING, learners]
+    harm = hold(state, state.wanted, learners, commands, game.rules.horizon_s, count)[0]
+    best = harm.argmin(axis=1)
+    plans[:] = actions[best, np.newaxis]
+    return plans, harm[np.arange(state.n), best]
+
+
+@cache
+def constants(learners: int) -> Floats:
+    """Return braking actions of L learners to try, [C, L]: all alike, or evenly changing from the first to the last."""
+    actions = np.repeat(-np.arange(11)[:, np.newaxis] / 10, learners, axis=1)
+    if learners == 1:
+        return actions
+    share, ends = np.linspace(0.0, 1.0, learners), np.linspace(0.0, -1.0, 5)
+    return np.concatenate([actions, [first + share * (last - first) for first in ends for last in ends if first != last]])
+
+
+def rollout(
+    game: Game, drivers: Mapping[int, Agent], state: State, plans: Floats, count: str, most: Any = np.inf
+) -> Floats:
+    """Return the plans with the actions of agents that drive from now on, as long as the harm is at most ``most`` [n].
+
+    ``state`` has the agents' memories.
+    """
+    rows = np.arange(state.n)
+    while (~state.ended & (state.harm(count) <= most)).any():
+        actions, memories = propose(drivers, state, state.memories)
+        now = np.minimum(state.steps, plans.shape[1] - 1)
+        plans[rows, now] = actions
+        state, _ = game.follow(state._replace(memories=memories), actions)
+    return plans

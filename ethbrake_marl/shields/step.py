@@ -1,0 +1,256 @@
+"""The step shield: the harm of an episode is at most the bound announced at the alert, whatever is proposed.
+
+**Claim.** Let B be the price of the plan made at the alert. Whatever actions are proposed, the harm at the end of the
+episode is at most B, and the bound that is announced never rises. An episode ends at rest or at the horizon; the claim
+does not cover what happens later.
+
+**Induction.** A *plan* is an action of every learner for every decision up to the horizon. Its *price* is the harm of the
+whole episode if it is followed from now on. The price is computed by the episode's own step, so it is this harm to the
+last bit. Between two decisions the shield holds a plan; let c be its price. At the first decision c = B.
+
+1. *Proposals are applied* only if some plan that begins with them has a price of at most c. This plan is now held.
+2. *Otherwise the plan's own actions are applied.* Its play, which gave c, went through this very step, so the rest of
+   the plan still costs c.
+
+So c never rises. At the end no action is left, and c is the harm of the episode. The proof asks nothing of who
+proposes, or of how plans are found: a bad search replaces more actions, and does no more harm. ∎
+
+**Several learners.** An action is then one number per learner. The shield first tries all proposals together. If they
+are rejected it tries them one by one, front to rear, and keeps those that are accepted. Before and after each trial it
+holds a plan with a price of at most c.
+
+**Allowance.** With an allowance A > 0, a plan may cost up to max(c, B + A), which is then the bound until the end.
+
+It assumes that the physics of the state is true, and that all others follow the game's scripts; a script may look at
+the state. Every learner is shielded: a game has one shield.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.agents.drive import Agent, propose
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.play import played
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.motion.layout import FORCE, SPEED, Bools, Floats, Ints
+from ethbrake_marl.shields.fallbacks import best_constant, first_plans, rollout
+
+NEARLY = 1e-9  # harm (m2/s2) by which a fallback's estimate may be too high, because it is rounded differently
+
+
+class ShieldReason(IntEnum):
+    """Why an action was accepted or replaced.
+
+    >>> import ethbrake_marl as eb
+    >>> eb.ShieldReason(3).name
+    'NO_CERTIFICATE'
+
+    """
+
+    NO_DECISION = -1  # before the first step, and always for a vehicle that follows a script
+    SAME_AS_PLAN = 0  # accepted: it is the plan's action
+    PLAN_REMAINS = 1  # accepted: the price is kept if the rest of the plan follows
+    CONSTANT = 2  # accepted: the price is kept if constant actions follow
+    NO_CERTIFICATE = 3  # replaced: no plan that was tried after it keeps the price
+    NOT_A_NUMBER = 4  # replaced: nothing was proposed
+    ENDED = 5  # the episode is over
+    POLICY_ROLLOUT = 7  # accepted: the price is kept if the shield's own agents drive on
+
+
+NO_DECISION, SAME_AS_PLAN, PLAN_REMAINS, CONSTANT, NO_CERTIFICATE, NOT_A_NUMBER, ENDED, POLICY_ROLLOUT = map(
+    int, ShieldReason
+)
+
+
+class Memory(NamedTuple):
+    """What the shield remembers of n episodes with L learners."""
+
+    plan: Floats  # [n, T, L] actions at every decision; only those from now on count
+    price: Floats  # [n] harm of the episode under the plan (m2/s2)
+    first: Floats  # [n] price at the alert (m2/s2)
+    settles: Bools  # [n] whether all vehicles come to rest under the plan of the alert
+    agents: tuple[Any, ...]  # memory of each agent of the shield's own team
+    proposed: Floats  # [n, L] last proposals; NaN: none
+    applied: Floats  # [n, L] last actions
+    reason: Ints  # [n, L] why
+    margin: Floats  # [n, L] bound minus the least price that was tried after the proposal (m2/s2)
+    replaced: Ints  # [n] number of actions that have been replaced
+
+
+def constant(shield: StepShield, game: Game, after: State, plans: Floats, most: Floats) -> tuple[Floats, Floats]:
+    """Fallback: the best constant actions."""
+    plans, estimate = best_constant(game, after, plans, shield.count)
+    return plans, np.zeros(after.n) if game.scripts else estimate
+
+
+def agents_drive(shield: StepShield, game: Game, after: State, plans: Floats, most: Floats) -> tuple[Floats, Floats]:
+    """Fallback: the shield's own agents drive on."""
+    return rollout(game, shield.drivers, after, plans, shield.count, most), np.zeros(after.n)
+
+
+class StepShield:
+    """Shield of all learners of a game.
+
+    Args:
+        drivers: body -> agent: the learners' agents, for a shield that proposes by itself or rolls them out; or empty.
+        count: harm that is bounded: ``first`` (first impact of each pair) or ``total`` (every impact).
+        allowance: harm by which the bound is loosened, for fewer replaced actions (m2/s2).
+
+    """
+
+    M = 1  # number of states that a world may be in; a subclass with more overrides ``seen`` and ``price``
+
+    def __init__(
+        self, drivers: Mapping[int, Agent] | None = None, *, count: str = "first", allowance: float = 0.0
+    ) -> None:
+        self.drivers, self.count, self.allowance = dict(drivers or {}), count, allowance
+        self.rests = [(CONSTANT, constant), *([(POLICY_ROLLOUT, agents_drive)] if drivers else [])]
+
+    def seen(self, state: State) -> State:
+        """Return the states that the worlds may be in now, M rows for each world, the nominal one first."""
+        return state
+
+    def price(self, game: Game, states: State, plans: Floats, most: Any) -> Floats:
+        """Return the harm of plans, [n] m2/s2: the largest over the M ``states`` of each world, or above ``most``."""
+        return played(game, states, plans, self.count, most)[1]
+
+    def bound(self, memory: Memory) -> Floats:
+        """Return the bound on the harm of each episode, [n] m2/s2."""
+        return np.maximum(memory.price, memory.first + self.allowance) if self.allowance else memory.price
+
+    def begin(self, game: Game, alert: State, state: State) -> Memory:
+        """Return the memory at the first decision ``state``. The plan is the cheapest of the shield's first plans."""
+        agents = {body: agent.begin(alert, body) for body, agent in self.drivers.items()}
+        state = state._replace(memories={**state.memories, **agents})
+        plans = first_plans(game, alert, state, self.count)
+        if self.drivers:  # before the others: of two plans with one price, the agents' own
+            plans.insert(0, rollout(game, self.drivers, state, plans[0].copy(), self.count))
+        states, each, L = self.seen(state), np.arange(state.n), len(game.rules.learners)
+        prices = np.stack([self.price(game, states, plan, np.inf) for plan in plans])
+        plan, harm = np.stack(plans)[prices.argmin(axis=0), each], prices.min(axis=0)
+        last, _ = played(game, state, plan, self.count)
+        settles = ~last.line[:, SPEED].any(axis=1) & (last.line[:, FORCE] <= 0.0).all(axis=1)
+        nothing, undecided = np.zeros((state.n, L)), np.full((state.n, L), NO_DECISION)
+        return Memory(
+            plan, harm, harm.copy(), settles, tuple(agents.values()), nothing, nothing, undecided, nothing, each * 0
+        )
+
+    def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
+        """Return the actions to apply, [n, L], and the new memory."""
+        memory: Memory = state.memories["shield"]
+        proposed, state = self.asked(state, proposed)
+        if not donate:
+            memory = memory._replace(plan=memory.plan.copy(), price=memory.price.copy())
+        each, now = np.arange(state.n), np.minimum(state.steps, memory.plan.shape[1] - 1)
+        planned, silent, L = memory.plan[each, now], np.isnan(proposed), proposed.shape[1]
+        tried, bound = np.where(silent, planned, proposed), self.bound(memory)
+        deviates = (tried != planned) & ~state.ended[:, np.newaxis]
+        reason = np.where(deviates, NO_CERTIFICATE, np.where(silent, NOT_A_NUMBER, SAME_AS_PLAN))
+        reason[state.ended] = ENDED
+        margin = np.repeat((bound - memory.price)[:, np.newaxis], L, axis=1)
+        rejected = deviates.any(axis=1)
+        for some in [slice(None), *(slice(c, c + 1) for c in range(L) if L > 1)]:  # together, then one by one
+            rows = np.flatnonzero(rejected & deviates[:, some].any(axis=1))
+            if not len(rows):
+                continue
+            actions = memory.plan[rows, now[rows]]
+            actions[:, some] = tried[rows, some]
+            if some != slice(None):
+                others = (actions != tried[rows]).any(axis=1)  # otherwise they have been tried together
+                rows, actions = rows[others], actions[others]
+            why, least = self.accept(game, state, memory, rows, actions, now[rows])
+            mine = deviates[rows, some]
+            reason[rows, some] = np.where(mine, why[:, np.newaxis], reason[rows, some])
+            margin[rows, some] = np.where(mine, (bound[rows] - least)[:, np.newaxis], margin[rows, some])
+            if some == slice(None):
+                rejected[rows[why != NO_CERTIFICATE]] = False
+        applied = memory.plan[each, now]
+        replaced = ((applied != proposed) & ~state.ended[:, np.newaxis]).sum(axis=1)
+        agents = tuple(state.memories[body] for body in self.drivers)
+        return applied, memory._replace(
+            agents=agents, proposed=proposed, applied=applied, reason=reason, margin=margin,
+            replaced=memory.replaced + replaced,
+        )  # fmt: skip
+
+    def asked(self, state: State, proposed: Floats | None) -> tuple[Floats, State]:
+        """Return the proposals, [n, L], NaN for none, and the state with the memories of the shield's agents.
+
+        They propose what nobody else does. If one remembers, they are asked at every decision.
+        """
+        memories = {who: kept for who, kept in state.memories.items() if who != "shield"}
+        own = dict(zip(self.drivers, state.memories["shield"].agents, strict=True))
+        if not own and proposed is None:
+            raise InvalidInput("step: actions = None: this shield has no agents that could propose any")
+        if own and (proposed is None or np.isnan(proposed).any() or any(each is not None for each in own.values())):
+            theirs, own = propose(self.drivers, state, own)
+            proposed = theirs if proposed is None else np.where(np.isnan(proposed), theirs, proposed)
+        return proposed, state._replace(memories={**memories, **own})
+
+    def accept(
+        self, game: Game, state: State, memory: Memory, rows: Ints, actions: Floats, now: Ints
+    ) -> tuple[Ints, Floats]:
+        """Hold a plan that begins with the ``actions`` in each of the worlds ``rows`` where one keeps the bound.
+
+        Returns the reasons and the least price that was tried, [len(rows)] each.
+        """
+        most, plans = self.bound(memory)[rows], memory.plan[rows]
+        plans[np.arange(len(rows)), now] = actions
+        before = self.seen(state).take(self.members(rows))
+        least = self.price(game, before, plans, most)
+        reason, left = np.where(least <= most, PLAN_REMAINS, NO_CERTIFICATE), np.flatnonzero(least > most)
+        if len(left):
+            before = before.take(self.members(left))
+            after, _ = game.follow(before, np.repeat(actions[left], self.M, axis=0))
+            after = after.take(slice(None, None, self.M))
+        for code, rest in self.rests:
+            if not len(left):
+                break
+            tried, value = rest(self, game, after, plans[left], most[left])
+            tried[np.arange(len(left)), now[left]] = actions[left]
+            hopeful = np.flatnonzero(value <= most[left] + NEARLY)
+            if len(hopeful):
+                states = before.take(self.members(hopeful))
+                value[hopeful] = self.price(game, states, tried[hopeful], most[left[hopeful]])
+            good = value <= most[left]
+            least[left] = np.minimum(least[left], value)
+            reason[left[good]], plans[left[good]] = code, tried[good]
+            bad = np.flatnonzero(~good)
+            left, before, after = left[bad], before.take(self.members(bad)), after.take(bad)
+        good = reason != NO_CERTIFICATE
+        memory.plan[rows[good]], memory.price[rows[good]] = plans[good], least[good]
+        return reason, least
+
+    def members(self, rows: Ints) -> Any:
+        """Return the rows of ``seen`` that belong to these worlds."""
+        return (rows[:, np.newaxis] * self.M + np.arange(self.M)).ravel() if self.M > 1 else rows
+
+    def infos(self, game: Game, state: State) -> dict[str, Any]:
+        """Return what users may want to know: name -> [n] or [n, N]."""
+        memory: Memory = state.memories["shield"]
+        return {
+            "bound_harm": self.bound(memory), "settles": memory.settles,
+            **of_learners(game, state, memory.proposed, memory.applied),
+            "reason": spread(game, state, memory.reason, NO_DECISION), "margin": spread(game, state, memory.margin),
+        }  # fmt: skip
+
+
+def of_learners(game: Game, state: State, proposed: Floats, applied: Floats) -> dict[str, Any]:
+    """Return the infos of every shield on its last decision, [n, N] each."""
+    return {
+        "proposed_action": spread(game, state, proposed),
+        "applied_action": spread(game, state, applied),
+        "intervened": spread(game, state, applied != proposed, False),
+    }
+
+
+def spread(game: Game, state: State, columns: Any, other: Any = 0.0) -> Any:
+    """Return values of learners [n, L] as values of vehicles, [n, N]; ``other`` for those that follow scripts."""
+    wide = np.full((state.n, state.vehicles), other, columns.dtype)
+    wide[:, game.rules.learners - 1] = columns
+    return wide
