@@ -7,7 +7,6 @@ each plan.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from ethbrake_marl.motion.layout import BRAKING, Floats
 
 SHARES = np.linspace(0.0, 1.0, 21)  # of its brakes that each of several learners tries at the alert
 ROUNDS = 2  # in which they try them
+CHANGES = np.array([0.05, -0.05, 0.1, -0.1, 0.2, -0.2])  # of the plan's next actions, tried as constants
 
 
 def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floats]:
@@ -46,24 +46,18 @@ def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floa
 
 
 def best_constant(game: Game, state: State, plans: Floats, count: str) -> tuple[Floats, Floats]:
-    """Return plans that hold the best of some constant actions, and their harm in one piece, [n] m2/s2."""
-    learners = game.rules.learners
-    actions = constants(len(learners))
+    """Return plans that hold the best of some constant actions, and their harm in one piece, [n] m2/s2.
+
+    Tried are the plan's next actions, all of them a little harder or softer: deviations from a good plan are mended by
+    small changes far more often than by a fixed set of constants that spans all brakes.
+    """
+    learners, rows = game.rules.learners, np.arange(state.n)
+    planned = plans[rows, np.minimum(state.steps, plans.shape[1] - 1)]
+    actions = np.clip(planned[:, np.newaxis] + CHANGES[:, np.newaxis], -1.0, 0.0)
     commands = actions * state.car[:, np.newaxis, BRAKING, learners]
     harm = hold(state, state.wanted, learners, commands, game.rules.horizon_s, count)[0]
     best = harm.argmin(axis=1)
-    plans[:] = actions[best, np.newaxis]
-    return plans, harm[np.arange(state.n), best]
-
-
-@cache
-def constants(learners: int) -> Floats:
-    """Return braking actions of L learners to try, [C, L]: all alike, or evenly changing from the first to the last."""
-    actions = np.repeat(-np.arange(11)[:, np.newaxis] / 10, learners, axis=1)
-    if learners == 1:
-        return actions
-    share, ends = np.linspace(0.0, 1.0, learners), np.linspace(0.0, -1.0, 5)
-    return np.concatenate([actions, [first + share * (last - first) for first in ends for last in ends if first != last]])
+    return np.repeat(actions[rows, best, np.newaxis], plans.shape[1], axis=1), harm[rows, best]
 
 
 def rollout(

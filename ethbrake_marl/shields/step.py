@@ -29,6 +29,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from enum import IntEnum
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -148,33 +149,28 @@ class StepShield:
         if not donate:
             memory = memory._replace(plan=memory.plan.copy(), price=memory.price.copy())
         each, now = np.arange(state.n), np.minimum(state.steps, memory.plan.shape[1] - 1)
-        planned, silent, L = memory.plan[each, now], np.isnan(proposed), proposed.shape[1]
-        tried, bound = np.where(silent, planned, proposed), self.bound(memory)
-        deviates = (tried != planned) & ~state.ended[:, np.newaxis]
+        planned, silent, bound = memory.plan[each, now], np.isnan(proposed), self.bound(memory)
+        tried, running = np.where(silent, planned, proposed), ~state.ended[:, np.newaxis]
+        deviates = (tried != planned) & running
         reason = np.where(deviates, NO_CERTIFICATE, np.where(silent, NOT_A_NUMBER, SAME_AS_PLAN))
-        reason[state.ended] = ENDED
-        margin = np.repeat((bound - memory.price)[:, np.newaxis], L, axis=1)
-        rejected = deviates.any(axis=1)
-        for some in [slice(None), *(slice(c, c + 1) for c in range(L) if L > 1)]:  # together, then one by one
-            rows = np.flatnonzero(rejected & deviates[:, some].any(axis=1))
-            if not len(rows):
-                continue
-            actions = memory.plan[rows, now[rows]]
-            actions[:, some] = tried[rows, some]
-            if some != slice(None):
-                others = (actions != tried[rows]).any(axis=1)  # otherwise they have been tried together
-                rows, actions = rows[others], actions[others]
-            why, least = self.accept(game, state, memory, rows, actions, now[rows])
-            mine = deviates[rows, some]
-            reason[rows, some] = np.where(mine, why[:, np.newaxis], reason[rows, some])
-            margin[rows, some] = np.where(mine, (bound[rows] - least)[:, np.newaxis], margin[rows, some])
-            if some == slice(None):
-                rejected[rows[why != NO_CERTIFICATE]] = False
+        margin = np.repeat((bound - memory.price)[:, np.newaxis], proposed.shape[1], axis=1)
+        rejected = np.flatnonzero(deviates.any(axis=1))
+        for columns in trials(proposed.shape[1]):
+            mine, wanted = deviates[rejected] & columns, tried[rejected]
+            actions = np.where(mine, wanted, memory.plan[rejected, now[rejected]])
+            new = mine.any(axis=1) & (columns.all() | (actions != wanted).any(axis=1))  # else it is the first trial
+            rows, mine = rejected[new], mine[new]
+            if len(rows):
+                why, least = self.accept(game, state, memory, rows, actions[new], now[rows])
+                reason[rows] = np.where(mine, why[:, np.newaxis], reason[rows])
+                margin[rows] = np.where(mine, (bound[rows] - least)[:, np.newaxis], margin[rows])
+                if columns.all():
+                    rejected = rows[why == NO_CERTIFICATE]
         applied = memory.plan[each, now]
-        replaced = ((applied != proposed) & ~state.ended[:, np.newaxis]).sum(axis=1)
+        replaced = ((applied != proposed) & running).sum(axis=1)
         agents = tuple(state.memories[body] for body in self.drivers)
         return applied, memory._replace(
-            agents=agents, proposed=proposed, applied=applied, reason=reason, margin=margin,
+            agents=agents, proposed=proposed, applied=applied, reason=np.where(running, reason, ENDED), margin=margin,
             replaced=memory.replaced + replaced,
         )  # fmt: skip
 
@@ -201,34 +197,34 @@ class StepShield:
         """
         most, plans = self.bound(memory)[rows], memory.plan[rows]
         plans[np.arange(len(rows)), now] = actions
-        before = self.seen(state).take(self.members(rows))
+        before = self.part(self.seen(state), rows)
         least = self.price(game, before, plans, most)
-        reason, left = np.where(least <= most, PLAN_REMAINS, NO_CERTIFICATE), np.flatnonzero(least > most)
-        if len(left):
-            before = before.take(self.members(left))
-            after, _ = game.follow(before, np.repeat(actions[left], self.M, axis=0))
-            after = after.take(slice(None, None, self.M))
+        reason = np.where(least <= most, PLAN_REMAINS, NO_CERTIFICATE)
         for code, rest in self.rests:
+            left = np.flatnonzero(reason == NO_CERTIFICATE)
             if not len(left):
                 break
+            here = self.part(before, left)
+            after, _ = game.follow(here, actions[left].repeat(self.M, axis=0))
+            after = after if self.M == 1 else after.take(slice(None, None, self.M))
             tried, value = rest(self, game, after, plans[left], most[left])
-            tried[np.arange(len(left)), now[left]] = actions[left]
             hopeful = np.flatnonzero(value <= most[left] + NEARLY)
             if len(hopeful):
-                states = before.take(self.members(hopeful))
-                value[hopeful] = self.price(game, states, tried[hopeful], most[left[hopeful]])
-            good = value <= most[left]
+                at, tried = left[hopeful], tried[hopeful]
+                tried[np.arange(len(at)), now[at]] = actions[at]
+                value[hopeful] = self.price(game, self.part(here, hopeful), tried, most[at])
+                good = np.flatnonzero(value[hopeful] <= most[at])
+                plans[at[good]], reason[at[good]] = tried[good], code
             least[left] = np.minimum(least[left], value)
-            reason[left[good]], plans[left[good]] = code, tried[good]
-            bad = np.flatnonzero(~good)
-            left, before, after = left[bad], before.take(self.members(bad)), after.take(bad)
-        good = reason != NO_CERTIFICATE
+        good = np.flatnonzero(reason != NO_CERTIFICATE)
         memory.plan[rows[good]], memory.price[rows[good]] = plans[good], least[good]
         return reason, least
 
-    def members(self, rows: Ints) -> Any:
-        """Return the rows of ``seen`` that belong to these worlds."""
-        return (rows[:, np.newaxis] * self.M + np.arange(self.M)).ravel() if self.M > 1 else rows
+    def part(self, states: State, rows: Ints) -> State:
+        """Return the M states of each of the worlds ``rows``, which increase."""
+        if len(rows) * self.M == states.n:
+            return states
+        return states.take(rows if self.M == 1 else (rows[:, np.newaxis] * self.M + np.arange(self.M)).ravel())
 
     def infos(self, game: Game, state: State) -> dict[str, Any]:
         """Return what users may want to know: name -> [n] or [n, N]."""
@@ -238,6 +234,13 @@ class StepShield:
             **of_learners(game, state, memory.proposed, memory.applied),
             "reason": spread(game, state, memory.reason, NO_DECISION), "margin": spread(game, state, memory.margin),
         }  # fmt: skip
+
+
+@cache
+def trials(learners: int) -> Bools:
+    """Return which of L proposals are tried together, [1 or 1 + L, L]: all of them, then one by one from the front."""
+    alone = np.eye(learners, dtype=np.bool_)
+    return alone if learners == 1 else np.concatenate([alone.any(axis=0, keepdims=True), alone])
 
 
 def of_learners(game: Game, state: State, proposed: Floats, applied: Floats) -> dict[str, Any]:
