@@ -41,8 +41,13 @@ def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floa
         wanted, _ = descend(state, learners.tolist(), SHARES, ROUNDS, horizon_s, count)
         descended = [to_action(alert, body, wanted[:, body]) for body in learners.tolist()]
         actions += [np.stack(descended, axis=1), np.full((n, len(learners)), -1.0)]
-    decisions = int(np.ceil(horizon_s / game.rules.time_step_s)) + 1
-    return [np.repeat(action[:, np.newaxis], decisions, axis=1) for action in actions]
+    return [held(game, action) for action in actions]
+
+
+def held(game: Game, actions: Floats) -> Floats:
+    """Return the plans that repeat actions [n, L] up to the horizon."""
+    decisions = int(np.ceil(game.rules.horizon_s / game.rules.time_step_s)) + 1
+    return np.repeat(actions[:, np.newaxis], decisions, axis=1)
 
 
 def best_constant(game: Game, state: State, plans: Floats, count: str) -> tuple[Floats, Floats]:

@@ -28,7 +28,6 @@ the state. Every learner is shielded: a game has one shield.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from enum import IntEnum
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -40,28 +39,10 @@ from ethbrake_marl.episode.play import played
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import FORCE, SPEED, Bools, Floats, Ints
+from ethbrake_marl.shields.decision import ShieldReason, check_harm_count, check_learners, checked_drivers, spread
 from ethbrake_marl.shields.fallbacks import best_constant, first_plans, rollout
 
 NEARLY = 1e-9  # harm (m2/s2) by which a fallback's estimate may be too high, because it is rounded differently
-
-
-class ShieldReason(IntEnum):
-    """Why an action was accepted or replaced.
-
-    >>> import ethbrake_marl as eb
-    >>> eb.ShieldReason(3).name
-    'NO_CERTIFICATE'
-
-    """
-
-    NO_DECISION = -1  # before the first step, and always for a vehicle that follows a script
-    SAME_AS_PLAN = 0  # accepted: it is the plan's action
-    PLAN_REMAINS = 1  # accepted: the price is kept if the rest of the plan follows
-    CONSTANT = 2  # accepted: the price is kept if constant actions follow
-    NO_CERTIFICATE = 3  # replaced: no plan that was tried after it keeps the price
-    NOT_A_NUMBER = 4  # replaced: nothing was proposed
-    ENDED = 5  # the episode is over
-    POLICY_ROLLOUT = 7  # accepted: the price is kept if the shield's own agents drive on
 
 
 NO_DECISION, SAME_AS_PLAN, PLAN_REMAINS, CONSTANT, NO_CERTIFICATE, NOT_A_NUMBER, ENDED, POLICY_ROLLOUT = map(
@@ -81,6 +62,7 @@ class Memory(NamedTuple):
     applied: Floats  # [n, L] last actions
     reason: Ints  # [n, L] why
     margin: Floats  # [n, L] bound minus the least price that was tried after the proposal (m2/s2)
+    intervened: Bools  # [n, N] whether the last proposal was replaced
     replaced: Ints  # [n] number of actions that have been replaced
 
 
@@ -100,7 +82,7 @@ class StepShield:
 
     Args:
         drivers: body -> agent: the learners' agents, for a shield that proposes by itself or rolls them out; or empty.
-        count: harm that is bounded: ``first`` (first impact of each pair) or ``total`` (every impact).
+        harm_count: harm that is bounded: ``first`` (first impact of each pair) or ``total`` (every impact).
         allowance: harm by which the bound is loosened, for fewer replaced actions (m2/s2).
 
     """
@@ -108,9 +90,12 @@ class StepShield:
     M = 1  # number of states that a world may be in; a subclass with more overrides ``seen`` and ``price``
 
     def __init__(
-        self, drivers: Mapping[int, Agent] | None = None, *, count: str = "first", allowance: float = 0.0
+        self, drivers: Mapping[int, Agent] | None = None, *, harm_count: str = "first", allowance: float = 0.0
     ) -> None:
-        self.drivers, self.count, self.allowance = dict(drivers or {}), count, allowance
+        check_harm_count(harm_count)
+        if isinstance(allowance, bool) or not isinstance(allowance, int | float) or not 0.0 <= allowance < np.inf:
+            raise InvalidInput(f"shield: allowance = {allowance!r}: must be a finite number, at least 0 m2/s2")
+        self.drivers, self.count, self.allowance = checked_drivers(drivers), harm_count, float(allowance)
         self.rests = [(CONSTANT, constant), *([(POLICY_ROLLOUT, agents_drive)] if drivers else [])]
 
     def seen(self, state: State) -> State:
@@ -127,6 +112,8 @@ class StepShield:
 
     def begin(self, game: Game, alert: State, state: State) -> Memory:
         """Return the memory at the first decision ``state``. The plan is the cheapest of the shield's first plans."""
+        if self.drivers:
+            check_learners(game, self.drivers)
         agents = {body: agent.begin(alert, body) for body, agent in self.drivers.items()}
         state = state._replace(memories={**state.memories, **agents})
         plans = first_plans(game, alert, state, self.count)
@@ -139,8 +126,9 @@ class StepShield:
         settles = ~last.line[:, SPEED].any(axis=1) & (last.line[:, FORCE] <= 0.0).all(axis=1)
         nothing, undecided = np.zeros((state.n, L)), np.full((state.n, L), NO_DECISION)
         return Memory(
-            plan, harm, harm.copy(), settles, tuple(agents.values()), nothing, nothing, undecided, nothing, each * 0
-        )
+            plan, harm, harm.copy(), settles, tuple(agents.values()), nothing, nothing, undecided, nothing,
+            np.zeros((state.n, state.vehicles), np.bool_), np.zeros(state.n, np.int64),
+        )  # fmt: skip
 
     def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
         """Return the actions to apply, [n, L], and the new memory."""
@@ -167,11 +155,11 @@ class StepShield:
                 if columns.all():
                     rejected = rows[why == NO_CERTIFICATE]
         applied = memory.plan[each, now]
-        replaced = ((applied != proposed) & running).sum(axis=1)
-        agents = tuple(state.memories[body] for body in self.drivers)
+        differ = (applied != proposed) & running
         return applied, memory._replace(
-            agents=agents, proposed=proposed, applied=applied, reason=np.where(running, reason, ENDED), margin=margin,
-            replaced=memory.replaced + replaced,
+            agents=tuple(state.memories[body] for body in self.drivers), proposed=proposed, applied=applied,
+            intervened=spread(game, state, differ, False), replaced=memory.replaced + differ.sum(axis=1),
+            reason=np.where(running, reason, ENDED), margin=margin,
         )  # fmt: skip
 
     def asked(self, state: State, proposed: Floats | None) -> tuple[Floats, State]:
@@ -230,10 +218,14 @@ class StepShield:
         """Return what users may want to know: name -> [n] or [n, N]."""
         memory: Memory = state.memories["shield"]
         return {
-            "bound_harm": self.bound(memory), "settles": memory.settles,
-            **of_learners(game, state, memory.proposed, memory.applied),
-            "reason": spread(game, state, memory.reason, NO_DECISION), "margin": spread(game, state, memory.margin),
-        }  # fmt: skip
+            "bound_harm": self.bound(memory),
+            "settles": memory.settles,
+            "proposed_action": spread(game, state, memory.proposed),
+            "applied_action": spread(game, state, memory.applied),
+            "intervened": memory.intervened,
+            "reason": spread(game, state, memory.reason, NO_DECISION),
+            "margin": spread(game, state, memory.margin),
+        }
 
 
 @cache
@@ -241,19 +233,3 @@ def trials(learners: int) -> Bools:
     """Return which of L proposals are tried together, [1 or 1 + L, L]: all of them, then one by one from the front."""
     alone = np.eye(learners, dtype=np.bool_)
     return alone if learners == 1 else np.concatenate([alone.any(axis=0, keepdims=True), alone])
-
-
-def of_learners(game: Game, state: State, proposed: Floats, applied: Floats) -> dict[str, Any]:
-    """Return the infos of every shield on its last decision, [n, N] each."""
-    return {
-        "proposed_action": spread(game, state, proposed),
-        "applied_action": spread(game, state, applied),
-        "intervened": spread(game, state, applied != proposed, False),
-    }
-
-
-def spread(game: Game, state: State, columns: Any, other: Any = 0.0) -> Any:
-    """Return values of learners [n, L] as values of vehicles, [n, N]; ``other`` for those that follow scripts."""
-    wide = np.full((state.n, state.vehicles), other, columns.dtype)
-    wide[:, game.rules.learners - 1] = columns
-    return wide
