@@ -1,4 +1,4 @@
-"""E-V2X-BM: the constant deceleration of one vehicle that does the least harm. (A stand-in; another branch has the text.)"""
+"""E-V2X-BM: the constant deceleration of one vehicle that does the least harm. (A stand-in for another branch's.)"""
 
 from __future__ import annotations
 

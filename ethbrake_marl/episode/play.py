@@ -37,7 +37,7 @@ def copy(source, target):
 
 @large
 def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, horizon_s, total, scratch, out):
-    """Follow every plan [T, L], in place; write the harm to ``out`` [n]. The last decision repeats; stop above ``most``."""
+    """Follow every plan [T, L], in place; write the harm to ``out`` [n]; stop above ``most`` [n]."""
     for k in range(len(out)):
         harm = harm_so_far(line[k], total)
         while clock[k, ENDED] == 0.0 and harm <= most[k]:

@@ -216,7 +216,7 @@ def step(
 
 
 def numbers_of(rules: Rules, actions: Floats, n: int) -> Floats:
-    """Return the actions of all learners in n worlds as float64. Raises ``InvalidInput`` unless they are numbers [n, L]."""
+    """Return the learners' actions as float64. Raises ``InvalidInput`` unless they are numbers of the shape [n, L]."""
     shape = n, len(rules.learners)
     if not isinstance(actions, np.ndarray) or actions.shape != shape or actions.dtype.kind not in "fiu":
         raise InvalidInput(f"actions = {actions!r:.60}: must be an array of numbers with the shape {shape}")
@@ -224,7 +224,7 @@ def numbers_of(rules: Rules, actions: Floats, n: int) -> Floats:
 
 
 def proposals(rules: Rules, actions: Floats, n: int) -> Floats:
-    """Return proposed actions in [-1, 1], [n, L]. NaN: nothing is proposed. Raises ``InvalidInput`` for anything else."""
+    """Return proposed actions, [n, L] in [-1, 1] or NaN. Raises ``InvalidInput`` for anything else."""
     actions = numbers_of(rules, actions, n)
     beyond = np.abs(actions) > LARGEST_ACTION
     if beyond.any():

@@ -72,7 +72,7 @@ class EpisodeShield:
         backup = to_action(alert, body, -choice.deceleration_mps2)[:, np.newaxis]
         held_back = held(game, backup)
         own = state._replace(memories={**state.memories, body: remembered})
-        policy_harm = price(game, state, rollout(game, self.drivers, own, held_back.copy(), self.count), self.count)
+        policy_harm = price(game, state, rollout(game, self.drivers, own, held_back, self.count), self.count)
         bound_harm = price(game, state, held_back, self.count) if self.coupled else choice.harm
         nothing = np.zeros((state.n, 1))
         return Memory(

@@ -76,4 +76,4 @@ def intervention(before: State, step: Step, after: State) -> Floats:
     memory = before.memories.get("shield")
     if memory is None:
         raise InvalidInput("this game has no shield; give the environment one, eb.shield(env), or the weight 0")
-    return 0.0 - memory.intervened
+    return np.where(memory.intervened, -1.0, 0.0)

@@ -60,7 +60,7 @@ def best_constant(game: Game, state: State, plans: Floats, count: str) -> tuple[
     planned = plans[rows, np.minimum(state.steps, plans.shape[1] - 1)]
     actions = np.clip(planned[:, np.newaxis] + CHANGES[:, np.newaxis], -1.0, 0.0)
     commands = actions * state.car[:, np.newaxis, BRAKING, learners]
-    harm = hold(state, state.wanted, learners, commands, game.rules.horizon_s, count)[0]
+    harm = hold(state, state.wanted, learners.tolist(), commands, game.rules.horizon_s, count)[0]
     best = harm.argmin(axis=1)
     return np.repeat(actions[rows, best, np.newaxis], plans.shape[1], axis=1), harm[rows, best]
 
@@ -72,7 +72,7 @@ def rollout(
 
     ``state`` has the agents' memories.
     """
-    rows = np.arange(state.n)
+    plans, rows = plans.copy(), np.arange(state.n)
     while (~state.ended & (state.harm(count) <= most)).any():
         actions, memories = propose(drivers, state, state.memories)
         now = np.minimum(state.steps, plans.shape[1] - 1)

@@ -79,7 +79,7 @@ def shield(env: Any, policy: Any = None, mode: str = "step", **options: Any) -> 
 
 
 def agents_for(game: Game, policy: Any) -> dict[int, Agent]:
-    """Return body -> agent of the learners of a game, or nothing. Raises ``InvalidInput`` for a wrong set of vehicles."""
+    """Return learner -> agent, or nothing. Raises ``InvalidInput`` unless the policy drives exactly the learners."""
     if policy is None:
         return {}
     learners = game.rules.learners.tolist()
