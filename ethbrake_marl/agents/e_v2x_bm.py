@@ -1,125 +1,218 @@
-"""E-V2X-BM: the constant deceleration of one vehicle that does the least harm. (A stand-in for another branch's.)"""
+"""E-V2X-BM: brakes with the constant deceleration that does the least harm, chosen at the alert.
+
+``pairwise`` is the paper's closed form. ``coupled`` plays the whole line in the physics of the episode, with the
+changes of speed, later impacts and lasting contact that the closed form leaves out: its harm is the harm that happens.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.agents.drive import MODEL, NOBODY, STATE
+from ethbrake_marl.agents.pairwise import Choice, closed_form, pairwise
 from ethbrake_marl.episode.play import hold
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.episode.step import begin
-from ethbrake_marl.motion.layout import (
-    BRAKE_RATE,
-    BRAKING,
-    FAR_M,
-    GAP,
-    LATENCY,
-    LIMIT,
-    MASS,
-    RELEASE_RATE,
-    SPEED,
-    Floats,
+from ethbrake_marl.episode.step import Rules, begin, failure, step
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.motion.compiling import kernel, large
+from ethbrake_marl.motion.layout import BRAKING, Floats
+from ethbrake_marl.registry import Part
+from ethbrake_marl.worlds.roles import HELD, LEARNER
+
+FIRST_PARTS = 64  # number of parts into which all decelerations are split, and
+PARTS = 8  # into which a cell of them is split
+NARROWEST_MPS2 = 1e-5  # narrower cells are not split
+SMALL = 1e-3  # harm (m2/s2) that is not worth a further split
+TIE = 1e-9  # harms (m2/s2) closer than this count as equal
+
+
+def coupled(alert: State, body: int, count: str = "first", horizon_s: float = 8.0) -> Choice:
+    """Return the constant deceleration of vehicle ``body`` that does the least harm, in every world, and this harm.
+
+    All others hold ``alert.wanted``. ``count``: harm of the ``first`` impact of each pair, or ``total``. If the choice
+    of the closed form does no harm, it is the result. If several do equally little, the least harm of the other count
+    decides, then the middle one. As a function of the deceleration the harm has kinks and jumps: it is not proven that
+    no deceleration between two samples does less.
+    """
+    braking = np.maximum(-alert.wanted, 0.0)
+    braking[:, body] = alert.car[:, BRAKING, body]
+    best = closed_form(alert, braking, body).deceleration_mps2
+    harm = harms(alert, body, best[:, np.newaxis], count, horizon_s)[:, :, 0]
+    rows = np.flatnonzero(harm[1 if count == "first" else 0])
+    if len(rows):
+        best[rows], harm[0, rows], _ = search(alert.take(rows), body, count, horizon_s).T
+    failed = np.flatnonzero(np.isinf(harm[0]))  # for every deceleration
+    if len(failed):
+        raise failure(alert, failed[0], alert.time_s[failed[0]], horizon_s)
+    return Choice(best, harm[0])
+
+
+def harms(alert: State, body: int, tried: Floats, count: str, horizon_s: float) -> Floats:
+    """Return the harm of both counts, first the one asked for, [2, n, C], for decelerations ``tried`` [n, C]."""
+    return hold(alert, alert.wanted, [body], -tried[:, :, np.newaxis], horizon_s, count)
+
+
+def search(alert: State, body: int, count: str, horizon_s: float) -> Floats:
+    """Return the best decelerations and their harms under both counts, [n, 3].
+
+    All decelerations of a world are split into equal parts, then again and again the parts that may hold a better one.
+    A result is not within rounding of a jump, unless a jump is within rounding of one of these equal parts.
+    """
+    best = np.full((alert.n, 3), np.inf)
+    rows, step = np.arange(alert.n), alert.car[:, BRAKING, body] / FIRST_PARTS
+    at = step[:, np.newaxis] * np.arange(FIRST_PARTS + 1)
+    harm = harms(alert, body, at, count, horizon_s)
+    while len(rows):
+        cells = np.empty((2, at.size), np.int64)
+        row, part = cells[:, : find_cells(rows, at, harm, step, best, cells)]
+        left, right = harm[:, row, part, np.newaxis], harm[:, row, part + 1, np.newaxis]
+        rows, step = rows[row], step / PARTS
+        at = at[row, part, np.newaxis] + step[rows, np.newaxis] * np.arange(PARTS + 1)
+        inside = harms(alert.take(rows), body, at[:, 1:-1], count, horizon_s)
+        harm = np.concatenate([left, inside, right], axis=2)
+    return best
+
+
+@large
+def find_cells(rows, at, harm, step, best, cells):
+    """Update the best decelerations, and return the number of cells in which there may be better ones.
+
+    Row j of ``at`` [m, C] and ``harm`` [2, m, C] are samples of the world ``rows[j]``, ``step[rows[j]]`` m/s2 apart.
+    ``best`` [n, 3] are decelerations and their harms. A cell, the interval between two neighbouring samples, may hold a
+    better one if its lower end is above the best by less than the largest change of the harm in this cell and in the
+    cells beside it. ``cells`` [2, .] receives j and the number of the cell in row j.
+    """
+    count, last = 0, at.shape[1] - 1
+    for j in range(at.shape[0]):
+        known, better = best[rows[j]], False
+        for c in range(last + 1):
+            if compare(harm[:, j, c], known) < 0:
+                known[1], known[2], better = harm[0, j, c], harm[1, j, c], True
+        if better:
+            take_middle(at[j], harm[:, j], known)
+    for j in range(at.shape[0]):
+        if step[rows[j]] <= NARROWEST_MPS2:
+            continue
+        for c in range(last):
+            change = 0.0
+            for beside in range(max(c - 1, 0), min(c + 2, last)):
+                change = max(change, abs(harm[0, j, beside + 1] - harm[0, j, beside]))
+            if min(harm[0, j, c], harm[0, j, c + 1]) - change < best[rows[j], 1] - SMALL:
+                cells[0, count], cells[1, count] = j, c
+                count += 1
+    return count
+
+
+@kernel
+def take_middle(at, harm, known):
+    """Set ``known[0]`` to the middle one of the decelerations ``at`` [C] whose ``harm`` [2, C] is ``known[1:]``."""
+    ties = 0
+    for c in range(len(at)):
+        ties += 1 if compare(harm[:, c], known) == 0 else 0
+    for c in range(len(at)):
+        ties -= 2 if compare(harm[:, c], known) == 0 else 0
+        if ties <= 0:
+            known[0] = at[c]
+            return
+
+
+@kernel
+def compare(harm, known):
+    """Return -1 if ``harm`` [2] is less than ``known[1:]``, 0 if it is the same, 1 if it is more."""
+    for count in range(2):  # the other count decides ties
+        if abs(harm[count] - known[count + 1]) > TIE:
+            return -1 if harm[count] < known[count + 1] else 1
+    return 0
+
+
+class Memory(NamedTuple):
+    """What the agent decided at the alert."""
+
+    command: Floats  # [n] m/s2
+    predicted_harm: Floats  # [n] m2/s2
+
+
+class EV2XBM:
+    """Brakes with the choice of ``coupled``; assumes that the other learners brake fully.
+
+    The harm that it predicts is, to the last bit, the harm of the episode in which they do.
+
+    Args:
+        rules: of the episodes.
+        agents: body -> role of the vehicles that agents drive, whose commands are not known at the alert.
+        count: harm that is minimised, of the ``first`` impact of each pair or ``total``.
+
+    """
+
+    name, knows = "e_v2x_bm", MODEL
+
+    def __init__(self, rules: Rules, agents: Mapping[int, str] = MappingProxyType({}), count: str = "first") -> None:
+        self.rules, self.agents, self.count = rules, agents, count
+
+    def begin(self, alert: State, body: int) -> Memory:
+        """Choose. Raises ``InvalidInput`` if another vehicle is driven by an agent."""
+        for other, role in self.agents.items():
+            if other != body:
+                raise InvalidInput(
+                    f"agent {self.name!r}: vehicle_{other} is driven by {role!r}, whose commands are not known at the"
+                    " alert; use e_v2x_bm:pairwise, which assumes that its neighbours brake fully"
+                )
+        wanted, learners = alert.wanted.copy(), self.rules.learners
+        wanted[:, learners] = -alert.car[:, BRAKING][:, learners]
+        alert = alert._replace(wanted=wanted)
+        command = -coupled(alert, body, self.count, self.rules.horizon_s).deceleration_mps2
+        wanted[:, body] = command
+        return Memory(command, last_if_held(alert, self.rules).harm(self.count))
+
+    def act(self, state: State, memory: Memory, body: int) -> tuple[Floats, Memory]:
+        """Return the command, and the memory as it was."""
+        return memory.command, memory
+
+
+class EV2XBMPairwise:
+    """Brakes with the choice of ``pairwise``, the paper's closed form."""
+
+    name, knows = "e_v2x_bm:pairwise", STATE
+
+    def begin(self, alert: State, body: int) -> Memory:
+        """Choose. Raises ``InvalidInput`` where the closed form does not hold."""
+        deceleration, harm = pairwise(alert, body)
+        return Memory(-deceleration, harm)
+
+    def act(self, state: State, memory: Memory, body: int) -> tuple[Floats, Memory]:
+        """Return the command, and the memory as it was."""
+        return memory.command, memory
+
+
+def last_if_held(alert: State, rules: Rules) -> State:
+    """Return the last state of the episodes in which all vehicles hold ``alert.wanted``, decision by decision."""
+    state = begin(alert, rules.learners, rules.time_step_s, rules.horizon_s)
+    rules, nothing = rules._replace(learners=NOBODY), np.zeros((alert.n, 0))
+    while not state.ended.all():
+        state, _ = step(rules, {}, state, nothing, donate=True)
+    return state
+
+
+def make_e_v2x_bm(argument: str | None, settings: Any) -> EV2XBM | EV2XBMPairwise:
+    """Return the agent ``e_v2x_bm[:pairwise]``. Raises ``InvalidInput`` for another argument."""
+    if argument == "pairwise":
+        return EV2XBMPairwise()
+    if argument is not None:
+        raise InvalidInput(f"agent {settings.spec!r}: must be e_v2x_bm or e_v2x_bm:pairwise")
+    scenario = settings.needed_scenario()
+    roles = dict(enumerate(scenario.roles.values(), 1))
+    agents = {body: role for body, role in roles.items() if role.partition(":")[0] not in (LEARNER, *HELD)}
+    rules = Rules(np.array(scenario.learners, np.int64), scenario.time_step_s, scenario.horizon_s)
+    return EV2XBM(rules, agents, settings.harm_count)
+
+
+E_V2X_BM = Part(
+    make_e_v2x_bm,
+    form="e_v2x_bm[:pairwise]",
+    about="the constant deceleration of least simulated harm; pairwise: the paper's closed form, from the true state",
+    knows=MODEL,
 )
-
-FOREVER_S, TIE, GRID, MINIMA, ROUNDS = 1e6, 1e-9, 161, 4, 7
-TOUCH_MPS = 0.05
-AROUND = np.linspace(-1.0, 1.0, 17)
-
-
-class Choice(NamedTuple):
-    """Decelerations, and the harm that the method expects of them."""
-
-    deceleration_mps2: Floats  # [n]
-    harm: Floats  # [n] m2/s2
-
-
-def _pair(alert: State, p: int, body: int) -> Any:
-    line, car = np.zeros((alert.n, 7, 3)), np.zeros((alert.n, 10, 3))
-    line[:, SPEED, 1:], line[:, GAP, 0], line[:, GAP, 1] = alert.line[:, SPEED, p : p + 2], FAR_M, alert.line[:, GAP, p]
-    car[:, [LIMIT, BRAKE_RATE, RELEASE_RATE]] = np.inf
-    car[:, MASS, 0], car[:, MASS, 1:] = np.inf, 1.0
-    car[:, LATENCY, 1:] = alert.car[:, LATENCY, p : p + 2]
-    wanted = np.zeros((alert.n, 3))
-    wanted[:, 1:] = -alert.car[:, BRAKING, p : p + 2]
-    state = alert._replace(line=line, car=car)
-
-    def harm(a: Floats) -> Floats:
-        return hold(state, wanted, [body - p + 1], -a[:, :, np.newaxis], FOREVER_S, "first")[0]
-
-    return harm
-
-
-def _border(harm: Any, most: Floats, above: bool) -> Floats:
-    low, high, none = np.zeros_like(most), most.copy(), np.inf if above else -np.inf
-    ends = harm(np.concatenate([low, most], axis=1)) == 0.0
-    never, always = ~ends[:, [1 if above else 0]], ends[:, [0 if above else 1]]
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        inside = (harm(middle) == 0.0) == above
-        low, high = np.where(inside, low, middle), np.where(inside, middle, high)
-    return np.where(never, none, np.where(always, 0.0 if above else most, high if above else low))
-
-
-def pairwise(alert: State, body: int) -> Choice:
-    """Return the paper's choice."""
-    most, (line, car) = alert.car[:, BRAKING, [body]], alert[:2]
-    low, high, at, pairs = np.zeros_like(most), np.full_like(most, np.inf), [np.zeros_like(most), most], []
-    if body > 1:
-        pairs.append(_pair(alert, body - 1, body))
-        low, lead = _border(pairs[0], most, True), car[:, LATENCY, [body - 1]] - car[:, LATENCY, [body]]
-        closing = line[:, SPEED, [body]] - line[:, SPEED, [body - 1]]
-        gap = line[:, GAP, [body - 1]] - closing * car[:, LATENCY, [body]]
-        with np.errstate(all="ignore"):
-            early = [2.0 * (closing * lead - gap) / lead**2, (closing**2 - 4.0 * TOUCH_MPS**2) / (2.0 * gap)]
-        at += [np.where(lead > 0.0, a, 0.0) for a in early]
-    if body < line.shape[2] - 1:
-        pairs.append(_pair(alert, body, body))
-        high = _border(pairs[-1], most, False)
-    at = np.concatenate([*at, low, high], axis=1)
-    at[~((at >= 0.0) & (at <= most))] = 0.0
-    values = sum(harm(at) for harm in pairs)
-    best = values.min(axis=1, keepdims=True)
-    tied = values <= best + TIE
-    first = np.where(tied, at, np.inf).min(axis=1, keepdims=True)
-    middle = 0.5 * (first + np.where(tied, at, 0.0).max(axis=1, keepdims=True))
-    a = np.where(sum(harm(middle) for harm in pairs) <= best + TIE, middle, first)
-    top = np.minimum(high, most)
-    return Choice(np.where(low <= top, 0.5 * (low + top), a)[:, 0], np.where(low <= top, 0.0, best)[:, 0])
-
-
-def coupled(alert: State, body: int, count: str, horizon_s: float) -> Choice:
-    """Return the best choice in the episode's own physics; the other bodies hold ``alert.wanted``."""
-    most, wanted = alert.car[:, BRAKING, [body]], alert.wanted.copy()
-    wanted[:, body] = 0.0
-    state = begin(alert._replace(wanted=wanted), np.array([body]), 1.0, horizon_s)
-
-    def harms(a: Floats, rows: Any = slice(None)) -> Floats:
-        return hold(state.take(rows), wanted[rows], [body], -a[:, :, np.newaxis], horizon_s, count)
-
-    best = pairwise(alert, body).deceleration_mps2[:, np.newaxis]
-    harm = harms(best)
-    rows = np.flatnonzero(harm[0, :, 0] > 0.0)
-    if not len(rows):
-        return Choice(best[:, 0], harm[0, :, 0])
-    most, a = most[rows], np.concatenate([best[rows], most[rows] * np.linspace(0.0, 1.0, GRID)], axis=1)
-    value = harms(a, rows)
-    padded = np.pad(value[0, :, 1:], ((0, 0), (1, 1)), constant_values=np.inf)
-    lowest = (value[0, :, 1:] <= padded[:, :-2]) & (value[0, :, 1:] <= padded[:, 2:])
-    order = 1 + np.argsort(np.where(lowest, value[0, :, 1:], np.inf), axis=1, kind="stable")[:, :MINIMA]
-    centre, width = np.take_along_axis(a, order, 1), most / (GRID - 1)
-    for _ in range(ROUNDS):
-        near = np.clip(centre[:, :, np.newaxis] + (width * AROUND)[:, np.newaxis], 0.0, most[:, :, np.newaxis])
-        new = harms(near.reshape(len(rows), -1), rows)
-        pick = new[0].reshape(near.shape).argmin(axis=2)[:, :, np.newaxis]
-        centre, width = np.take_along_axis(near, pick, 2)[:, :, 0], width * 2.0 / (len(AROUND) - 1)
-        a, value = np.concatenate([a, near.reshape(len(rows), -1)], axis=1), np.concatenate([value, new], axis=2)
-    tied = value[0] <= value[0].min(axis=1, keepdims=True) + TIE
-    other = np.where(tied, value[1], np.inf)
-    tied &= other <= other.min(axis=1, keepdims=True) + TIE
-    first, last = np.where(tied, a, np.inf).min(axis=1), np.where(tied, a, -np.inf).max(axis=1)
-    two = np.stack([0.5 * (first + last), first], axis=1)
-    new = harms(two, rows)
-    pick = (new[0, :, 0] > value[0].min(axis=1) + TIE).astype(int)[:, np.newaxis]
-    best[rows], harm[0, rows] = np.take_along_axis(two, pick, 1), np.take_along_axis(new[0], pick, 1)
-    return Choice(best[:, 0], harm[0, :, 0])
