@@ -215,7 +215,7 @@ def step(
     return State(line, car, clock, know, wanted, memories), Step(reward, out, rules.time_step_s)
 
 
-def numbers_of(rules: Rules, actions: Floats, n: int) -> Floats:
+def numbers_of(rules: Rules, actions: Floats | None, n: int) -> Floats:
     """Return the learners' actions as float64. Raises ``InvalidInput`` unless they are numbers of the shape [n, L]."""
     shape = n, len(rules.learners)
     if not isinstance(actions, np.ndarray) or actions.shape != shape or actions.dtype.kind not in "fiu":

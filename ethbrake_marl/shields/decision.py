@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import Agent
+from ethbrake_marl.agents.drive import Agent, check_agent
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
@@ -43,11 +43,7 @@ class ShieldReason(IntEnum):
 def checked_drivers(drivers: Mapping[int, Agent] | None) -> dict[int, Agent]:
     """Return body -> agent from front to rear. Raises ``InvalidInput`` for what is no agent."""
     for body, agent in (drivers or {}).items():
-        if isinstance(agent, type) or not (hasattr(agent, "begin") and hasattr(agent, "act")):
-            raise InvalidInput(
-                f"shield: the policy of vehicle_{body} is {agent!r:.60}; must be an agent, with the methods begin and"
-                " act (eb.policy_agent makes one of a model or a function)"
-            )
+        check_agent(agent, f"shield: policy of vehicle_{body} = {agent!r:.60}")
     return dict(sorted((drivers or {}).items()))
 
 

@@ -37,12 +37,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import Agent, propose
+from ethbrake_marl.agents.drive import MODEL, Agent, Team, propose
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.play import played
 from ethbrake_marl.episode.state import State, take
+from ethbrake_marl.episode.step import begun
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import FORCE, SPEED, Bools, Floats, Ints
+from ethbrake_marl.registry import Part
 from ethbrake_marl.shields.decision import ShieldReason, check_harm_count, check_learners, checked_drivers, spread
 from ethbrake_marl.shields.fallbacks import best_constant, first_plans, rollout
 
@@ -132,7 +134,7 @@ class StepShield:
         prices = np.stack([self.price(game, states, plan) for plan in plans])
         plan, harm = np.stack(plans)[prices.argmin(axis=0), rows], prices.min(axis=0)
         caps = played(game, state, plan, self.count)[0].borne_harm(self.count) if self.cap else None
-        agents = {body: agent.begin(alert, body) for body, agent in self.drivers.items()}
+        agents = {body: begun(agent, alert, body) for body, agent in self.drivers.items()}
         if agents:
             check_learners(game, agents)
             own = rollout(game, self.drivers, state._replace(memories={**state.memories, **agents}), plan, self.count)
@@ -273,3 +275,11 @@ def constant(shield: StepShield, game: Game, after: State, plans: Floats, most: 
 def agents_drive(shield: StepShield, game: Game, after: State, plans: Floats, most: Floats) -> tuple[Floats, Floats]:
     """Fallback: the shield's own agents drive on."""
     return rollout(game, shield.drivers, after, plans, shield.count, most), np.zeros(after.n)
+
+
+def make_step(team: Team, argument: str | None, settings: Any) -> Team:
+    """Return the team ``TEAM+step``."""
+    return team._replace(shield=StepShield(team.drivers, harm_count=settings.harm_count))
+
+
+STEP = Part(make_step, form="step", about="shield: every action is certified, or replaced", knows=MODEL)

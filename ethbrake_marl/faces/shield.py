@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from inspect import signature
 from typing import Any
 
-from ethbrake_marl.agents.drive import Agent, Team
+from ethbrake_marl.agents.drive import Team
+from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.episode.game import Game, Shield
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.faces.rendering import make_renderer
 from ethbrake_marl.faces.stream import Stream
+from ethbrake_marl.names import team_of, teams_of
+from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.registry import Registry
 from ethbrake_marl.shields.algorithm_1 import EpisodeShield
 from ethbrake_marl.shields.step import StepShield
+from ethbrake_marl.worlds.catalogue import load_scenario
+from ethbrake_marl.worlds.game import AnyScenario
 
 MakeShield = Callable[..., Shield]  # (drivers, **options): body -> agent, perhaps empty; the options of the mode
 
@@ -29,7 +34,9 @@ MODES: Registry[MakeShield] = Registry(
 )
 
 
-def shield(env: Any, policy: Any = None, mode: str = "step", **options: Any) -> Any:
+def shield(
+    env: Any, policy: Any = None, mode: str = "step", *, scenario: AnyScenario | None = None, **options: Any
+) -> Any:
     """Return a shielded copy of an environment, of the same class, or a shielded team.
 
     The copy starts with ``reset``; ``env`` stays as it is. The shield decides inside: what wrappers of ``env`` do to an
@@ -37,13 +44,14 @@ def shield(env: Any, policy: Any = None, mode: str = "step", **options: Any) -> 
 
     Args:
         env: an environment of this package, parallel, in turns, Gymnasium, vector or ``VecEnv``, perhaps in wrappers of
-            its library; or a ``Team``, whose agents propose.
+            its library; or a ``Team``, or an agent, who propose.
         policy: proposes the actions that the caller leaves out (NaN, or no entry in a dictionary); the shield also
-            plans with it. An agent for all learners, a ``Team``, or vehicle name -> agent. None: without a proposal the
-            shield's own plan is followed.
+            plans with it. A name, an agent for all learners, a ``Team``, or vehicle -> agent. None: without a proposal
+            the shield's own plan is followed.
         mode: ``step``, ``episode`` (the paper's Algorithm 1), or the mode of an extension.
-        options: of the mode: ``harm_count`` (``first`` or ``total``) of both, ``allowance`` (m2/s2) of ``step``,
-            ``bound`` (``coupled`` or ``pairwise``) of ``episode``.
+        scenario: in which an agent drives; not for environments and teams.
+        options: of the mode: ``harm_count`` (``first`` or ``total``) of both, ``allowance`` (m2/s2) and ``cap`` (None
+            or ``baseline``) of ``step``, ``bound`` (``coupled`` or ``pairwise``) of ``episode``.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.shield(eb.parallel_env(scenario="paper-random"))
@@ -59,41 +67,32 @@ def shield(env: Any, policy: Any = None, mode: str = "step", **options: Any) -> 
     for name in options:
         if name not in known:
             raise unknown_name(f"option of a shield in mode {mode}", name, known)
-    if isinstance(env, Team):
-        if env.shield is not None or policy is not None:
-            what = "already has a shield" if env.shield is not None else "proposes by itself; leave out policy"
-            raise InvalidInput(f"shield: team {env.name!r} {what}")
+    if isinstance(env, Team) or hasattr(env, "act"):
+        if policy is not None:
+            raise InvalidInput(f"shield: {env.name!r} proposes by itself; leave out policy")
+        if not isinstance(env, Team):
+            if scenario is None:
+                raise InvalidInput(f"shield: agent {env.name!r}: pass scenario=..., in which it drives")
+            env = team_of(env, load_scenario(scenario))
+        if env.shield is not None:
+            raise InvalidInput(f"shield: team {env.name!r} already has a shield")
         return env._replace(name=f"{env.name}+{mode}", shield=make(env.drivers, **options))
     base = getattr(env, "unwrapped", None)
     game, stream = getattr(base, "game", None), getattr(base, "stream", None)
     if isinstance(env, type) or not isinstance(game, Game) or not isinstance(stream, Stream):
         raise InvalidInput(
-            f"shield: {env!r:.80}: must be a team, or an environment made by eb.parallel_env, eb.env, eb.EthBrakeEnv,"
-            " eb.EthBrakeVectorEnv or eb.make_sb3_vec_env, perhaps in wrappers"
+            f"shield: {env!r:.80}: must be a team, an agent, or an environment made by eb.parallel_env, eb.env,"
+            " eb.EthBrakeEnv, eb.EthBrakeVectorEnv or eb.make_sb3_vec_env, perhaps in wrappers"
         )
     if game.shield is not None:
         raise InvalidInput("shield: this environment already has a shield")
     if not len(game.rules.learners):
         raise InvalidInput(f"shield: scenario {game.name!r} has no learner to shield; pass learners=['vehicle_2']")
-    return guarded(env, base, game._replace(shield=make(agents_for(game, policy), **options)))
-
-
-def agents_for(game: Game, policy: Any) -> dict[int, Agent]:
-    """Return learner -> agent, or nothing. Raises ``InvalidInput`` unless the policy drives exactly the learners."""
     if policy is None:
-        return {}
-    learners = game.rules.learners.tolist()
-    if isinstance(policy, Team):
-        policy = {f"vehicle_{body}": agent for body, agent in policy.drivers.items()}
-    if not isinstance(policy, Mapping):
-        return dict.fromkeys(learners, policy)
-    names = {f"vehicle_{body}": body for body in learners}
-    if set(policy) != set(names):
-        given = ", ".join(map(str, policy)) or "nobody"
-        raise InvalidInput(
-            f"shield: policy drives {given}; must have one agent for each of {', '.join(names)}, and for no other"
-        )
-    return {body: policy[name] for name, body in names.items()}
+        return guarded(env, base, game._replace(shield=make(None, **options)))
+    policy = LearnedAgent(policy) if isinstance(policy, Policy) else policy
+    team = teams_of({"policy": policy}, base.scenario, harm_count=options.get("harm_count", "first"))["policy"]
+    return guarded(env, base, team._replace(shield=make(team.drivers, **options)).game(game))
 
 
 def guarded(env: Any, base: Any, game: Game) -> Any:
