@@ -77,7 +77,7 @@ def shield(
         if env.shield is not None:
             raise InvalidInput(f"shield: team {env.name!r} already has a shield")
         return env._replace(name=f"{env.name}+{mode}", shield=make(env.drivers, **options))
-    base = getattr(env, "unwrapped", None)
+    base: Any = getattr(env, "unwrapped", None)
     game, stream = getattr(base, "game", None), getattr(base, "stream", None)
     if isinstance(env, type) or not isinstance(game, Game) or not isinstance(stream, Stream):
         raise InvalidInput(
