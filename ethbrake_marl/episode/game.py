@@ -13,7 +13,6 @@ from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.reward import Rewarding
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Rules, Step
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Floats, Ints
 
 
@@ -63,7 +62,9 @@ class Game(NamedTuple):
         if self.scripts:
             wanted = wanted.copy()
             for body, script in self.scripts.items():
-                wanted[:, body], memories[body] = one_step.asked(script, alert, script.begin(alert, body), body)
+                wanted[:, body], memories[body] = one_step.asked(
+                    script, alert, one_step.begun(script, alert, body), body
+                )
         state = self.first_decision(alert._replace(wanted=wanted, memories=memories))
         memories = dict(state.memories)
         if self.rewarding.shaping is not None:
@@ -85,8 +86,6 @@ class Game(NamedTuple):
         if self.shield is not None:
             actions, memory = self.shield.decide(self, state, actions, donate=donate)
             state = state._replace(memories={**state.memories, "shield": memory})
-        if actions is None:
-            raise InvalidInput("step: actions = None: no shield proposes actions; give an array [n, L]")
         if self.rewarding.is_compiled:
             return self.follow(state, actions, donate=donate)
         after, step = self.follow(state, actions)
@@ -96,7 +95,7 @@ class Game(NamedTuple):
         """Return the episodes at their first decision, before shaping and shield. Scripts have decided."""
         return one_step.begin(alert, self.deciders, self.rules.time_step_s, self.rules.horizon_s)
 
-    def follow(self, state: State, actions: Floats, *, donate: bool = False) -> tuple[State, Step]:
+    def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
         """Return the state after one step, and what it did: ``step`` without shield and without terms of the reward."""
         return one_step.step(self.rules, self.scripts, state, actions, donate=donate)
 

@@ -22,7 +22,8 @@ from ethbrake_marl.faces.rendering import make_renderer
 from ethbrake_marl.faces.spaces import FeatureBox
 from ethbrake_marl.faces.stream import OPTIONS, Stream, checked_options, chosen_seed
 from ethbrake_marl.motion.layout import Bools
-from ethbrake_marl.worlds.game import AnyScenario, game_of
+from ethbrake_marl.names import open_game
+from ethbrake_marl.worlds.game import AnyScenario
 from ethbrake_marl.worlds.given import worlds_from_state
 from ethbrake_marl.worlds.scenario import Scenario
 
@@ -33,7 +34,7 @@ def make_sb3_vec_env(
     scenario: AnyScenario,
     n_envs: int,
     seed: int | None = None,
-    learners: Sequence[str | int] | None = None,
+    learners: Sequence[str] | None = None,
     reward: Any = "harm",
     observation: Any = None,
     horizon_is_end: bool = True,
@@ -60,7 +61,7 @@ def make_sb3_vec_env(
 
     """
     check_whole_number("n_envs", n_envs, 1)
-    opened = game_of(scenario, learners, reward, observation)
+    opened = open_game(scenario, learners, reward, observation)
     return EthBrakeVecEnv(*opened, int(n_envs), seed, horizon_is_end, appended, step_infos, render_mode, actions)
 
 

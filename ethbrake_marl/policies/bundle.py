@@ -26,13 +26,10 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
     if not isinstance(path, str | os.PathLike):
         raise InvalidInput(f"policy = {path!r:.60}: must be the path of a training run or of a policy bundle")
     folder = _bundle_in(Path(path).expanduser())
-    entries = {entry.name for entry in os.scandir(folder)}
-    for name in sorted({MANIFEST, WEIGHTS} - entries):
-        raise CorruptBundle(f"{folder / name}: is missing from the policy bundle")
-    for name in sorted(entries - {MANIFEST, WEIGHTS}):
-        raise CorruptBundle(
-            f"{folder / name}: does not belong in a bundle, which has only the files {MANIFEST} and {WEIGHTS}"
-        )
+    for name in sorted({MANIFEST, WEIGHTS} ^ _names_in(folder)):
+        wrong = f"does not belong in a bundle, which has only the files {MANIFEST} and {WEIGHTS}"
+        missing = name in (MANIFEST, WEIGHTS)
+        raise CorruptBundle(f"{folder / name}: {'is missing from the policy bundle' if missing else wrong}")
     manifest = _read_manifest(folder / MANIFEST)
     file = folder / WEIGHTS
     data = _read(file)
@@ -69,24 +66,32 @@ def _read(file: Path) -> bytes:
 
 
 def _bundle_in(path: Path) -> Path:
+    """Return the folder of the bundle: ``path``, or its folder ``policy``."""
     for folder in (path, path / "policy"):
-        try:
-            exists = (folder / MANIFEST).exists() or (folder / WEIGHTS).exists()
-        except (OSError, ValueError) as error:
-            raise InvalidInput(f"{str(path)!r:.120}: cannot be read ({error})") from None
-        if exists:
+        names = _names_in(folder)
+        if names & {MANIFEST, WEIGHTS}:
             if folder.is_symlink():
                 raise CorruptBundle(f"{folder}: is a symbolic link; give the folder to which the link points")
             return folder
-    members = sorted((path / "policy").glob("vehicle_*"))
+    members = sorted(name for name in names if name.startswith("vehicle_"))
     if members:
         raise InvalidInput(
-            f"{path}: has one policy for each learner; give the path of one of them, for instance {members[0]}"
+            f"{path}: has one policy for each learner; give the path of one of them, for instance {folder / members[0]}"
         )
     reason = "contains no policy" if path.is_dir() else "is not a folder"
     raise InvalidInput(
         f"{path}: {reason}; give the folder of a policy bundle ({MANIFEST}, {WEIGHTS}) or of a finished run"
     )
+
+
+def _names_in(folder: Path) -> set[str]:
+    """Return the names in a folder; none if there is no such folder."""
+    try:
+        return set(os.listdir(folder))
+    except (FileNotFoundError, NotADirectoryError):
+        return set()
+    except (OSError, ValueError) as error:
+        raise InvalidInput(f"{str(folder)!r:.120}: cannot be read ({error})") from None
 
 
 def shipped_policies() -> dict[str, Path]:

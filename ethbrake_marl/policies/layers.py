@@ -31,7 +31,7 @@ def layers_of(tensors: Mapping[str, Float32s], name: str, hidden: int) -> Layers
 
 
 @large
-def dense(weight, bias, x, y):
+def dense(weight: Float32s, bias: Float32s, x: Float32s, y: Float32s) -> None:
     """Write ``weight x + bias`` to ``y`` [O, rows]; ``weight`` is [O, K], ``x`` [K, rows], one column per observation.
 
     Products are added in groups of four, ``(a + b) + (c + d)``, always in this order: half the rounding error of one
@@ -53,7 +53,7 @@ def dense(weight, bias, x, y):
 
 
 @large
-def squash(values):
+def squash(values: Float32s) -> None:
     """Replace every entry of ``values`` [k, rows] by its tanh. The error is hardly above half a unit in the last place.
 
     ``tanh(a) = 1 - 2 / (e^(2 a) + 1)``

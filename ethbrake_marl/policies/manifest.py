@@ -6,7 +6,6 @@ import hashlib
 import json
 import math
 import platform
-import re
 from collections.abc import Mapping
 from importlib.metadata import version
 from typing import Annotated, Any, Literal
@@ -24,6 +23,8 @@ PACKAGES = ("ethbrake-marl", "gymnasium", "numba", "numpy", "safetensors", "stab
 PHYSICS = "physics"  # key of `versions`: digest of the physics; files of earlier versions lack it
 LONGEST_STEP_S = 1e6
 
+Learner = Annotated[str, Field(pattern=r"^vehicle_[1-9][0-9]?$")]
+
 
 def installed_versions() -> dict[str, str]:
     """Return name -> version of Python, of the physics, and of every package on which a training may depend."""
@@ -40,7 +41,7 @@ class Manifest(Finite):
     network: NetworkSpec
     observation: ObservationSchema
     action: Literal["fraction_of_own_capacity"] = "fraction_of_own_capacity"  # -1 is full braking
-    learners: Annotated[tuple[str, ...], Field(min_length=1)]  # vehicles that it has learned to control
+    learners: Annotated[tuple[Learner, ...], Field(min_length=1)]  # vehicles that it has learned to control
     scenario: dict[str, JsonValue]  # all values of the scenario of the training
     reward: dict[str, JsonValue]  # all settings of its reward
     seeds: dict[str, int]  # purpose -> seed
@@ -75,12 +76,8 @@ class Manifest(Finite):
                 f"scenario: time_step_s = {self.scenario.get('time_step_s')!r:.60}: must be a number of seconds above"
                 f" 0, because the policy observes {forecasts[0]}"
             )
-        if len(set(self.learners)) < len(self.learners):
-            raise ValueError(f"learners: {', '.join(self.learners)}: must name each vehicle only once")
         vehicles, roles = self.scenario.get("vehicles"), self.scenario.get("roles")
         for name in self.learners:
-            if re.fullmatch(r"vehicle_[1-9][0-9]?", name) is None:
-                raise ValueError(f"learners: {name!r}: must be a vehicle's name, such as vehicle_2")
             if isinstance(vehicles, int) and int(name.removeprefix("vehicle_")) > vehicles:
                 raise ValueError(f"learners: {name}: must be one of the {vehicles} vehicles of the scenario")
             if isinstance(roles, dict) and roles.get(name) != "learner":
