@@ -20,7 +20,7 @@ from difflib import get_close_matches
 from inspect import signature
 from typing import Any
 
-from ethbrake_marl.agents.drive import Agent, Team
+from ethbrake_marl.agents.drive import Agent, Team, check_agent
 from ethbrake_marl.episode.game import Game, Script
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, describe_error, refuse_shipped_path
 from ethbrake_marl.files.python_file import load_from_file
@@ -163,6 +163,36 @@ def make_teams(specs: str | Iterable[str], scenario: Scenario, *, harm_count: st
     return teams
 
 
+def teams_of(agents: Any, scenario: Scenario, *, harm_count: str = "first") -> dict[str, Team]:
+    """Return name -> team of whatever stands for agents: names, or a mapping of names to agents.
+
+    ``agents`` is a text or list as in ``make_teams``; or a mapping from names of your own to specs, agents, teams, or
+    mappings from vehicles to specs and agents: ``{"mine": {"vehicle_2": agent, "vehicle_3": "coast"}}``. Raises
+    ``InvalidInput`` for anything else.
+    """
+    if isinstance(agents, str) or (isinstance(agents, Iterable) and not isinstance(agents, Mapping)):
+        return make_teams(agents, scenario, harm_count=harm_count)
+    if not isinstance(agents, Mapping) or not agents:
+        raise InvalidInput(
+            f"agents = {agents!r:.80}: must be names, such as 'ppo,full_brake', or a mapping, such as {{'mine': agent}}"
+        )
+    teams = {}
+    for name, given in agents.items():
+        if isinstance(given, Mapping):
+            drivers = {vehicle: _driver(each, scenario, harm_count) for vehicle, each in given.items()}
+            teams[name] = Team.of(drivers, name)
+        else:
+            driver = _driver(given, scenario, harm_count)
+            if not isinstance(driver, Team):
+                check_agent(driver, f"agent {name!r} = {driver!r:.60}")
+            teams[name] = team_of(driver, scenario)._replace(name=name)
+    return teams
+
+
+def _driver(given: Any, scenario: Scenario, harm_count: str) -> Any:
+    return make_agent(given, scenario=scenario, harm_count=harm_count) if isinstance(given, str) else given
+
+
 def group(name: str) -> list[str]:
     """Return the specs of a group: of the entry ``NAME``, then of all ``NAME.MORE``; nothing for another name."""
     if name not in AGENTS or callable(AGENTS[name].make):
@@ -233,11 +263,8 @@ def _make(core: str, settings: AgentSettings) -> Driver:
         if not callable(make):
             raise InvalidInput(f"agent {core!r}: is the name of a group of agents; write the name of one agent")
     driver: Driver = _called(core, make, argument or None, settings)
-    missing = [what for what in ("name", "knows", "begin", "act") if not hasattr(driver, what)]
-    if missing and not isinstance(driver, Team):
-        raise InvalidInput(
-            f"agent {core!r}: {type(driver).__name__} is not an agent, because it has no {' and no '.join(missing)}"
-        )
+    if not isinstance(driver, Team):
+        check_agent(driver, f"agent {core!r} = {driver!r:.60}")
     return driver
 
 

@@ -21,6 +21,7 @@ from ethbrake_marl.names import (
     register_agent,
     register_shield,
     split_specs,
+    teams_of,
 )
 from ethbrake_marl.worlds.catalogue import load_scenario
 
@@ -146,7 +147,9 @@ def test_a_name__belongs_to_one_agent():
 
 def test_what_is_no_agent__is_refused_with_what_it_lacks():
     register_agent("theirs", lambda argument, settings: object())
-    with pytest.raises(InvalidInput, match="object is not an agent, because it has no name and no knows and no begin"):
+    with pytest.raises(
+        InvalidInput, match=r"agent 'theirs' = <object object.*: has no name and no knows and no begin and no act"
+    ):
         make_agent("theirs")
 
 
@@ -197,6 +200,36 @@ def test_a_team__drives_every_learner_with_one_agent():
     scenario, game = open_game("cooperation-3-pair")
     team = make_teams(["full_brake"], scenario)["full_brake"]
     assert np.isfinite(drive(game, scenario.sample(5, 7), team).harm()).all()
+
+
+def test_agents__are_given_as_names_or_as_mappings_of_names_agents_and_vehicles():
+    scenario, coast = load_scenario("cooperation-3-pair"), make_agent("coast")
+    assert list(teams_of("coast,full_brake", scenario)) == list(teams_of(["coast", "full_brake"], scenario))
+    mixed = {
+        "a": "coast", "b": coast, "c": Team("x", {2: coast, 3: coast}), "d": {"vehicle_3": coast, "vehicle_2": "coast"}
+    }  # fmt: skip
+    for name, team in teams_of(mixed, scenario).items():
+        assert team.name == name and list(team.drivers) == [2, 3]
+        assert all(agent == coast for agent in team.drivers.values())
+
+
+@pytest.mark.parametrize(
+    ("agents", "message"),
+    [
+        ({}, "must be names, such as"),
+        (None, "must be names, such as"),
+        (3, "must be names, such as"),
+        ({"a": 3}, "agent 'a' = 3: has no name"),
+        ({"a": print}, "agent 'a' = <built-in function print>: has no name"),
+        ({"a": {"vehicle": "coast"}}, "team 'a': 'vehicle': must be the name of a vehicle"),
+        ({"a": {2: "coast"}}, "team 'a': 2: must be the name of a vehicle"),
+        ({"a": {"vehicle_2": Team("x", {})}}, "team 'a': vehicle_2 = Team.*has no knows"),
+        (["coast", 3], "must be a name, for instance"),
+    ],
+)
+def test_agents__that_are_none_are_refused(agents: Any, message: str):
+    with pytest.raises(InvalidInput, match=message):
+        teams_of(agents, PAPER)
 
 
 def test_the_list__has_all_agents_and_no_group():

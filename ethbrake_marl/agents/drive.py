@@ -26,8 +26,13 @@ NOBODY = np.zeros(0, np.int64)
 class Agent(Protocol):
     """Drives one vehicle: a script, a policy, a search. It sees the whole state, and decides when the learners do."""
 
-    name: str  # in tables and messages
-    knows: str  # what it has to know, for tables: one of the texts above
+    @property
+    def name(self) -> str:
+        """Name in tables and messages."""
+
+    @property
+    def knows(self) -> str:
+        """What it has to know, for tables: one of the texts above."""
 
     def begin(self, alert: State, body: int) -> Any:
         """Return the memory for new episodes: None, an array with one row per world, or a tuple of memories."""
@@ -52,15 +57,9 @@ class Team(NamedTuple):
         for vehicle, agent in drivers.items():
             if not isinstance(vehicle, str) or re.fullmatch("vehicle_[1-9][0-9]?", vehicle) is None:
                 raise InvalidInput(f"team {name!r}: {vehicle!r:.60}: must be the name of a vehicle, such as vehicle_2")
-            missing = [each for each in ("name", "knows", "begin", "act") if not hasattr(agent, each)]
-            if missing:
-                raise InvalidInput(
-                    f"team {name!r}: {vehicle} = {agent!r:.60}: has no {' and no '.join(missing)}; must be an agent,"
-                    " which has name, knows, begin(alert, body) and act(state, memory, body); make one with"
-                    " policy_agent(model) or LearnedAgent(policy)"
-                )
+            check_agent(agent, f"team {name!r}: {vehicle} = {agent!r:.60}")
             bodies[int(vehicle.removeprefix("vehicle_"))] = agent
-        return Team(name, bodies, shield)
+        return Team(name, dict(sorted(bodies.items())), shield)
 
     def game(self, game: Game) -> Game:
         """Return ``game`` with this team's shield. Raises ``InvalidInput`` unless the team drives all its learners."""
@@ -72,6 +71,16 @@ class Team(NamedTuple):
             if hasattr(agent, "check"):
                 agent.check(game, body)
         return game._replace(shield=self.shield)
+
+
+def check_agent(agent: Any, where: str) -> None:
+    """Raise ``InvalidInput``, which begins with ``where``, unless this is an agent."""
+    missing = [each for each in ("name", "knows", "begin", "act") if not hasattr(agent, each)]
+    if missing:
+        raise InvalidInput(
+            f"{where}: has no {' and no '.join(missing)}; must be an agent, which has name, knows, begin(alert, body)"
+            " and act(state, memory, body); make one with make_agent(name), policy_agent(model) or LearnedAgent(policy)"
+        )
 
 
 def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Iterator[tuple[Step | None, State]]:

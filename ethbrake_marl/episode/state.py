@@ -77,10 +77,10 @@ class State(NamedTuple):
 
     def read_only(self) -> State:
         """Return the same episodes, whose arrays cannot be changed by mistake."""
-        views = [array.view() for array in self[:5]]
-        for view in views:
+        line, car, clock, know, wanted = (array.view() for array in self[:5])
+        for view in (line, car, clock, know, wanted):
             view.setflags(write=False)
-        return State(*views, self.memories)
+        return State(line, car, clock, know, wanted, self.memories)
 
     @property
     def n(self) -> int:

@@ -106,7 +106,7 @@ class Gives:
 )
 def test_bad_commands__are_refused_with_the_vehicle(commands: Any):
     with pytest.raises(
-        InvalidInput, match="agent 'gives'.*vehicle_2.*(its commands are|must be in|act fails|act returned)"
+        InvalidInput, match=r"agent .gives.*vehicle_2.*(its commands are|must be in|act fails|act returned)"
     ):
         drive(GAME, PAPER.sample(2, 7), Team("gives", {2: Gives(commands)}))
 

@@ -610,7 +610,7 @@ def test_team_of_vehicles__drives() -> None:
     [
         ({"vehicle_2": small_net()}, "team 't': vehicle_2 = Sequential("),
         ({"vehicle_2": "coast"}, "has no name and no knows and no begin and no act; must be an agent, which has name"),
-        ({"vehicle_2": brake}, "make one with policy_agent(model) or LearnedAgent(policy)"),
+        ({"vehicle_2": brake}, "policy_agent(model) or LearnedAgent(policy)"),
         ({2: Held("full_brake")}, "team 't': 2: must be the name of a vehicle, such as vehicle_2"),
         ({"vehicle_0": Held("full_brake")}, "team 't': 'vehicle_0': must be the name of a vehicle"),
     ],
