@@ -20,7 +20,7 @@ from typer.exceptions import TyperException
 from typer.main import get_command
 
 from ethbrake_marl import __version__
-from ethbrake_marl.cli import agent, doctor, evaluate, scenario, train
+from ethbrake_marl.cli import agent, doctor, evaluate, run, scenario, train
 from ethbrake_marl.cli.command import EVERY_S, Out, example
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, describe_error, naming_extras
 from ethbrake_marl.kernel_store import is_temporary, on_first_compilation
@@ -35,7 +35,7 @@ app = typer.Typer(
 )
 _NAMES = "Names that can be used in --set, recipes and scenarios: ethbrake scenario parts"
 for name, command, shown in (
-    ("run", train.run_command, "run --steps 200000 --seed 1"),
+    ("run", run.run_command, "run --steps 200000 --seed 1"),
     ("train", train.train_command, "train --recipe sac --output runs/sac"),
     ("evaluate", evaluate.evaluate_command, "evaluate --agents full_brake,constant:3.5,e_v2x_bm --episodes 1000"),
     ("compare", evaluate.compare_command, "compare before/results.json after/results.json"),

@@ -203,7 +203,7 @@ def scenario_parts(as_json: JsonOption = False) -> None:
     from ethbrake_marl.episode.features import FEATURES, GROUPS, WHOLE_GROUPS
     from ethbrake_marl.episode.objectives import OBJECTIVES
     from ethbrake_marl.episode.terms import BUILT_IN, TERMS
-    from ethbrake_marl.first_edition import training
+    from ethbrake_marl.training.recipe import ALGORITHMS, usable_recipes
     from ethbrake_marl.worlds.channel import CHANNELS
 
     features = FEATURES.usable().items()
@@ -213,8 +213,8 @@ def scenario_parts(as_json: JsonOption = False) -> None:
         "V2X presets": [*CHANNELS],
         "Objectives": [kind.form for kind in OBJECTIVES.usable().values()],
         "Terms": [*BUILT_IN, *TERMS],
-        "Algorithms": [*training.algorithm_names()],
-        "Recipes": [*training.TrainingRecipe.usable()],
+        "Algorithms": [*ALGORITHMS],
+        "Recipes": [*usable_recipes()],
     }
     with Out(as_json=as_json) as out:
         out.result(

@@ -1,38 +1,26 @@
-"""The commands ``run`` and ``train``, which train policies."""
+"""The command ``train``."""
 
 from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.text import Text
 
-from ethbrake_marl.cli.command import (
-    ForceOption,
-    JsonOption,
-    Out,
-    ScenarioOption,
-    SettingsOption,
-    StepsOption,
-    schema_option,
-)
+from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, SettingsOption, StepsOption, schema_option
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.sheet import Column, Sheet
-from ethbrake_marl.first_edition import evaluation, scenario as scenarios, training
-from ethbrake_marl.progress import Progress
+
+if TYPE_CHECKING:
+    from ethbrake_marl.progress import Progress
+    from ethbrake_marl.training.recipe import TrainingRecipe
+    from ethbrake_marl.training.train import TrainResult
 
 REMAINS = (
     "if the training had begun, the last good policy is in the run's folder; ethbrake train --resume FOLDER continues"
     " an unfinished training"
 )
-
-RUNS = Path("runs")
-
-QUICKEST = ("quick", "ppo")  # `ethbrake run` trains the first of these recipes whose algorithm is installed
-
-QUICKEST_TEAM = ("cooperation", "cooperation-ppo")  # the same for scenarios with several learners
 
 TrainingSeedOption = Annotated[
     int | None, typer.Option(help="Seed of the training run.", show_default="as in the recipe")
@@ -42,91 +30,6 @@ OutputOption = Annotated[
     Path | None,
     typer.Option(metavar="FOLDER", help="Folder to write the run to.", show_default="runs/SCENARIO-RECIPE-seedSEED"),
 ]
-
-
-def run_folder(scenario: scenarios.Scenario, recipe: training.TrainingRecipe, seed: int | None) -> Path:
-    """Return the default folder of a run: ``runs/SCENARIO-RECIPE-seedSEED``.
-
-    If the recipe has a scheme for several learners, the name is ``runs/SCENARIO-RECIPE-SCHEME-seedSEED``. Without
-    ``seed``, the name has the recipe's seed.
-    """
-    plan = recipe.name if recipe.scheme is None else f"{recipe.name}-{recipe.scheme}"
-    return RUNS / f"{scenario.name}-{plan}-seed{recipe.seed if seed is None else seed}"
-
-
-def run_command(
-    scenario: ScenarioOption = "paper-random",
-    steps: StepsOption = None,
-    seed: TrainingSeedOption = None,
-    episodes: Annotated[int, typer.Option(help="Number of worlds in the evaluation list.")] = 10_000,
-    list_seed: Annotated[int, typer.Option(help="Seed of the evaluation list.")] = 7,
-    recipe: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME|PATH",
-            help="Name of a shipped recipe, or path of a YAML file.",
-            show_default=f"{QUICKEST[0]}, or {QUICKEST_TEAM[0]} for several learners; {QUICKEST[1]} or"
-            f" {QUICKEST_TEAM[1]} if their algorithm is not installed",
-        ),
-    ] = None,
-    settings: SettingsOption = None,
-    output: OutputOption = None,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
-) -> None:
-    """Train a policy, shield it, compare it, and write a report.
-
-    Trains a single learner or a team. Writes a run's folder with policies, results as CSV and JSON, results per world,
-    three figures and report.html. If the scenario is one of the three tests (paper-random, paper-random-brake-only,
-    paper-random-obstacle), the policy is also evaluated on the other two. For a team, the report also shows the harm
-    that each vehicle bears. For a team, the command also trains each learner alone and a team without messages, to show
-    the effect of each learner and of the messages. Ctrl-C ends the training early and evaluates the policy trained so
-    far; a second Ctrl-C stops at once.
-    """
-    with Out(as_json=as_json, force=force, remains=REMAINS) as out:
-        # torch takes seconds to load, here and in the other commands that learn
-        from ethbrake_marl.first_edition.training.experiment import HYBRID, SHIELDED_TEAM, run_experiment
-        from ethbrake_marl.first_edition.training.progress import objective_in_words
-
-        plan = training.load_recipe(recipe or quickest())
-        changes = training.read_settings(settings, [plan])
-        chosen = evaluation.load_runnable(scenario, changes.scenario, drives="some")
-        if recipe is None and len(chosen.learners) > 1:
-            plan = training.load_recipe(quickest(several=True))
-            changes = training.read_settings(settings, [plan])
-        plan = changes.change(plan, out.note)
-        result = run_experiment(
-            chosen,
-            output or run_folder(chosen, plan, seed),
-            recipe=plan,
-            steps=steps,
-            seed=seed,
-            episodes=episodes,
-            list_seed=list_seed,
-            force=out.force,
-            settings=changes.texts,
-            on_progress=out.show_progress,
-        )
-        trained = result.trained
-        own = objective_in_words(trained.training)
-        count = "total" if plan.reward.harm_count == "total" else "first-impact"
-        what = "policy" if len(chosen.learners) == 1 else f"team (scheme {trained.training.scheme})"
-        shielded = HYBRID if len(chosen.learners) == 1 else SHIELDED_TEAM
-        headline = (
-            f"Trained by recipe {plan.name}, seed {plan.seed if seed is None else seed}: {trained.steps:,} decisions in"
-            f" {trained.wall_s:.0f} s ({trained.status}). {shielded}: the trained {what} with a shield. All agents"
-            f" minimise {count} harm{f', except that the trained {what} minimises {own}' if own else ''}.\n"
-        )
-        out.result(result.results, Text(headline), *result.tables)
-        for note in result.notes:
-            out.note(note)
-        _end(out, trained)
-
-
-def quickest(*, several: bool = False) -> str:
-    """Return the name of the default recipe of `ethbrake run`, for one learner or for ``several`` learners."""
-    usable = training.TrainingRecipe.usable()
-    return next(name for name in (QUICKEST_TEAM if several else QUICKEST) if name in usable)
 
 
 def train_command(
@@ -156,7 +59,7 @@ def train_command(
             help="With --resume: continue even if the run used other package versions; numbers may differ.",
         ),
     ] = False,
-    schema: schema_option("ethbrake_marl.first_edition.training", "TrainingRecipe", "recipe") = False,  # type: ignore[valid-type]  # built by a function
+    schema: schema_option("ethbrake_marl.training.recipe", "TrainingRecipe", "recipe") = False,  # type: ignore[valid-type]  # built by a function
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -168,83 +71,113 @@ def train_command(
     bit for bit, as without the interruption.
     """
     with Out(as_json=as_json, force=force, remains=REMAINS) as out:
+        # torch takes seconds to load
+        from ethbrake_marl.cli.settings import read_settings
+        from ethbrake_marl.training.recipe import load_recipe
+        from ethbrake_marl.training.train import resume as go_on, train
+        from ethbrake_marl.training.training import Training
+
         if resume is not None:
             asked = {
-                "--scenario": scenario,
-                "--recipe": recipe,
-                "--set": settings,
-                "--steps": steps,
-                "--output": output,
-            }
-            for option in (
-                name for name, value in {**asked, "--seed": seed, "--force": force or None}.items() if value is not None
-            ):
+                "--scenario": scenario, "--recipe": recipe, "--set": settings, "--steps": steps, "--seed": seed,
+                "--output": output, "--force": force or None,
+            }  # fmt: skip
+            for option in (name for name, value in asked.items() if value is not None):
                 raise InvalidInput(
                     f"{option}: cannot be combined with --resume, which uses the settings in the run's folder; leave"
                     " one of the two options out"
                 )
-            _show(out, training.resume(resume, on_progress=out.show_progress, other_versions=other_versions))
+            show_trained(out, go_on(resume, on_progress=out.show_progress, other_versions=other_versions))
             return
         if other_versions:
             raise InvalidInput("--other-versions: has no effect on a new run; use it only with --resume FOLDER")
-        plan = training.load_recipe(recipe or "ppo")
-        changes = training.read_settings(settings, [plan])
-        chosen = evaluation.load_runnable(scenario or "paper-random", changes.scenario)
-        plan = changes.change(plan, out.note)
-        begun = [training.Training.of(plan, chosen).who_drives()]
+        plan = load_recipe(recipe or "ppo")
+        changes = read_settings(settings, [*type(plan).model_fields])
+        chosen = changes.change_scenario(scenario or "paper-random")
+        plan = changed(plan, changes.recipe, out)
+        begun = [Training.of(plan, chosen).who_drives()]
 
         def tell(progress: Progress) -> None:
             if begun:  # at the first progress report all input has been checked
                 out.note(begun.pop())
             out.show_progress(progress)
 
-        folder = output or run_folder(chosen, plan, seed)
-        result = training.train(
+        folder = output or run_folder(chosen.name, plan.name, plan.scheme, plan.seed if seed is None else seed)
+        result = train(
             plan, chosen, folder, steps=steps, seed=seed, force=force, on_progress=tell, settings=changes.texts
         )
-        _show(out, result, scenario)
+        show_trained(out, result, scenario)
 
 
-def _show(out: Out, result: training.TrainResult, scenario: str | None = None) -> None:
-    """Print the harm of the trained agent and of full braking on stdout, and how the training ended on stderr.
+def run_folder(scenario: str, recipe: str, scheme: str | None, seed: int) -> Path:
+    """Return the default folder of a run, ``runs/SCENARIO-RECIPE[-SCHEME]-seedSEED``."""
+    plan = recipe if scheme is None else f"{recipe}-{scheme}"
+    return Path("runs") / f"{scenario}-{plan}-seed{seed}"
 
-    Also prints the command that evaluates the agent in ``scenario`` (name or path); None: the scenario of the training.
+
+def changed(plan: TrainingRecipe, overrides: Any, out: Out) -> TrainingRecipe:
+    """Return the recipe with settings of the command line; say if only one of two keys that should agree is set."""
+    from ethbrake_marl.files.overrides import Override
+
+    if not overrides:
+        return plan
+    new = plan.replace(**Override.put(plan.model_dump(mode="json"), overrides))
+    together = {"gamma": new.gamma, "reward.shaping_discount": new.reward.shaping_discount}
+    set_here = [key for key in together if key in {each.key for each in overrides}]
+    if len(set_here) == 1 and len({*together.values()}) > 1:
+        (key,), (other,) = set_here, together.keys() - set(set_here)
+        out.note(
+            f"note: {key} = {together[key]:g} differs from {other} = {together[other]:g}. Reward shaping then changes"
+            f" which policy is best; make both equal (--set {other}={together[key]:g})"
+        )
+    return new
+
+
+def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> None:
+    """Print the harm of the trained agent and of full braking, how the training ended, and what to do next.
+
+    ``scenario`` (name or path) stands in the command that evaluates the agent; None: the name in the run's folder.
     """
-    from ethbrake_marl.first_edition.training.fixed_list import measure_full_braking
-    from ethbrake_marl.first_edition.training.progress import objective_in_words
+    from ethbrake_marl.agents.drive import Team
+    from ethbrake_marl.agents.scripts import Held
+    from ethbrake_marl.cli.settings import read_settings
+    from ethbrake_marl.files.plain import read_object
+    from ethbrake_marl.names import open_game
+    from ethbrake_marl.training.fixed_list import OBJECTIVE, drive_to_the_end, metrics_of
 
-    plan, run = result.training.recipe, training.RunDirectory(result.directory)
+    training, plan = result.training, result.training.recipe
+    loaded, game = open_game(training.scenario)
+    brake = Team("full_brake", {body: Held("full_brake") for body in loaded.learners})
+    worlds = loaded.sample(plan.evaluation.worlds, plan.evaluation.seed)
     columns = [
-        Column("Agent", "agent", text=True),
+        Column("Agent", "agent", text=True, whole=True),
         Column("First-impact harm", "first_impact_harm"),
         Column("Total harm", "total_harm"),
         Column("Collisions", "collision_rate", digits=1, scale=100.0, unit=" %"),
     ]
-    if objective := objective_in_words(result.training):
-        columns.append(Column(objective[0].upper() + objective[1:], "objective"))
-    measured = {"full_brake": measure_full_braking(result.training), result.agent: result.metrics or {}}
+    measured = {"full_brake": metrics_of(training, *drive_to_the_end(game, worlds, brake))}
+    measured[result.agent] = dict(result.metrics or {})
+    if OBJECTIVE in measured["full_brake"]:
+        columns.append(Column("Objective", OBJECTIVE))
     rows = [(agent, *(metrics.get(each.name) for each in columns[1:])) for agent, metrics in measured.items()]
     note = (
         f"Means per world; harm in m²/s². The means are over the {plan.evaluation.worlds:,} worlds of seed"
         f" {plan.evaluation.seed} with which the training selected its policy."
     )
     table = Sheet("", columns, rows, note)
-    settings = [
-        each for each in run.read_config().get("settings", ()) if training.read_settings([each], [plan]).scenario
-    ]
-    settings += ["harm_count=total"] if plan.reward.harm_count == "total" else []
-    words = ["--scenario", scenario or result.training.scenario.name, "--agents", f"full_brake,{result.agent}"]
-    command = shlex.join(["ethbrake", "evaluate", *words, *(word for each in settings for word in ("--set", each))])
+    settings = read_object(result.directory / "config.json").get("settings", ())
+    own = [each for each in settings if read_settings([each], [*type(plan).model_fields]).scenario]
+    own += ["harm_count=total"] if plan.reward.harm_count == "total" else []
+    words = ["--scenario", scenario or loaded.name, "--agents", f"full_brake,{result.agent}"]
+    command = shlex.join(["ethbrake", "evaluate", *words, *(word for each in own for word in ("--set", each))])
     out.result(
         {
             "directory": str(result.directory),
             "status": result.status,
-            "start": result.training.begins,
             "steps": result.steps,
-            "scheme": result.training.scheme,
-            "drivers": dict(result.training.drivers),
-            "evaluation": result.evaluations[-1] if result.evaluations else None,
-            "policy_steps": result.trained.steps,
+            "scheme": training.scheme,
+            "drivers": dict(training.drivers),
+            "evaluation": dict(result.evaluations[-1]) if result.evaluations else None,
             "agent": result.agent,
             "fixed_list": {"worlds": plan.evaluation.worlds, "seed": plan.evaluation.seed, "results": table.json()},
             "next_command": command,
@@ -252,12 +185,12 @@ def _show(out: Out, result: training.TrainResult, scenario: str | None = None) -
         table,
         f"\nThe agent is {result.agent}. Evaluate it on other worlds:\n  {command}",
     )
-    _end(out, result)
+    tell_end(out, result.status, result.steps, result.directory)
 
 
-def _end(out: Out, result: training.TrainResult) -> None:
+def tell_end(out: Out, status: str, steps: int, directory: Path) -> None:
     """Print how the training ended, and the folder of the run; if it was interrupted, exit with status 130."""
-    if result.status == "interrupted":
-        left = f"the policy so far is saved; continue with: ethbrake train --resume {result.directory}"
-        out.interrupted(f"interrupted after {result.steps:,} training steps; {left}")
-    out.note(f"{result.status} after {result.steps:,} training steps: {result.directory}")
+    if status == "interrupted":
+        left = f"the policy so far is saved; continue with: ethbrake train --resume {directory}"
+        out.interrupted(f"interrupted after {steps:,} training steps; {left}")
+    out.note(f"{status} after {steps:,} training steps: {directory}")

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import ethbrake_marl.first_edition as eb
-from ethbrake_marl.cli.train import quickest
+from ethbrake_marl.cli.run import quickest
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.first_edition.training.experiment import run_experiment
 from ethbrake_marl.first_edition.training.recipe import TrainingRecipe, algorithm_names, load_recipe
