@@ -17,103 +17,75 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ethbrake_marl.doors import names_behind
-from ethbrake_marl.first_edition.envs.registration import register_environments
+from ethbrake_marl.faces.registration import register_environments
 from ethbrake_marl.errors import naming_extras
 
 if TYPE_CHECKING:
     # Environments
-    from ethbrake_marl.first_edition.engine.engine import Engine as Engine
-    from ethbrake_marl.first_edition.envs.making import make_engine as make_engine
-    from ethbrake_marl.first_edition.envs.pettingzoo import (
+    from ethbrake_marl.faces.pettingzoo import (
         EthBrakeParallelEnv as EthBrakeParallelEnv,
         env as env,
         parallel_env as parallel_env,
         raw_env as raw_env,
     )
-    from ethbrake_marl.first_edition.envs.sb3 import (
-        EthBrakeVecEnv as EthBrakeVecEnv,
-        make_sb3_vec_env as make_sb3_vec_env,
-    )
-    from ethbrake_marl.first_edition.envs.gymnasium import EthBrakeEnv as EthBrakeEnv
-    from ethbrake_marl.first_edition.envs.vector import CostEnv as CostEnv, EthBrakeVectorEnv as EthBrakeVectorEnv
+    from ethbrake_marl.faces.sb3 import EthBrakeVecEnv as EthBrakeVecEnv, make_sb3_vec_env as make_sb3_vec_env
+    from ethbrake_marl.faces.gymnasium import EthBrakeEnv as EthBrakeEnv
+    from ethbrake_marl.faces.vector import EthBrakeVectorEnv as EthBrakeVectorEnv
+    from ethbrake_marl.faces.shield import shield as shield
+    from ethbrake_marl.shields.decision import ShieldReason as ShieldReason
 
     # Scenarios, and the worlds drawn from them
-    from ethbrake_marl.first_edition.scenario.catalogue import (
-        list_scenarios as list_scenarios,
-        load_scenario as load_scenario,
-    )
-    from ethbrake_marl.first_edition.scenario.sample import Sample as Sample
-    from ethbrake_marl.first_edition.scenario.schema import Scenario as Scenario
-    from ethbrake_marl.first_edition.scenario.tables import (
-        read_worlds as read_worlds,
-        worlds_from_table as worlds_from_table,
-    )
-    from ethbrake_marl.first_edition.physics.advance import advance as advance
-    from ethbrake_marl.first_edition.physics.state import Worlds as Worlds, make_worlds as make_worlds
+    from ethbrake_marl.worlds.catalogue import list_scenarios as list_scenarios, load_scenario as load_scenario
+    from ethbrake_marl.worlds.scenario import Scenario as Scenario
+    from ethbrake_marl.worlds.given import read_worlds as read_worlds, worlds_from_table as worlds_from_table
 
-    # Observations and rewards
-    from ethbrake_marl.first_edition.game.observations import (
-        ObservationSpec as ObservationSpec,
-        choose_observation as choose_observation,
-    )
-    from ethbrake_marl.first_edition.game.observed import observation_for as observation_for
-    from ethbrake_marl.first_edition.game.rewards import RewardParams as RewardParams
+    # The game: its state, its one step, what would happen
+    from ethbrake_marl.names import open_game as open_game
+    from ethbrake_marl.episode.game import Game as Game
+    from ethbrake_marl.episode.state import State as State
+    from ethbrake_marl.episode.step import Step as Step
+    from ethbrake_marl.episode.play import hold as hold, price as price
+    from ethbrake_marl.episode.observe import View as View
+    from ethbrake_marl.episode.reward import RewardParams as RewardParams
 
     # Agents, teams and policies
-    from ethbrake_marl.first_edition.agents.foreign import policy_agent as policy_agent
-    from ethbrake_marl.first_edition.agents.learned import LearnedAgent as LearnedAgent
-    from ethbrake_marl.first_edition.agents.protocol import Agent as Agent, Team as Team
-    from ethbrake_marl.first_edition.agents.making import make_agent as make_agent
-    from ethbrake_marl.first_edition.agents.registry import agent_names as agent_names
-    from ethbrake_marl.first_edition.agents.settings import AgentSettings as AgentSettings
-    from ethbrake_marl.first_edition.policies.bundle import load_policy as load_policy
-    from ethbrake_marl.first_edition.policies.policy import Policy as Policy
-    from ethbrake_marl.first_edition.policies.shipped import load_shipped as load_shipped
-
-    # Shields: for any interface, and one for each
-    from ethbrake_marl.first_edition.shields.wrappers import shield as shield
-    from ethbrake_marl.first_edition.shields.reasons import ShieldReason as ShieldReason
-    from ethbrake_marl.first_edition.shields.contract import ShieldMode as ShieldMode
-    from ethbrake_marl.first_edition.shields.options import ShieldOptions as ShieldOptions
-    from ethbrake_marl.first_edition.shields.wrappers import (
-        HybridShield as HybridShield,
-        ShieldedEnv as ShieldedEnv,
-        ShieldedVectorEnv as ShieldedVectorEnv,
-        shielded_aec as shielded_aec,
-    )
-    from ethbrake_marl.first_edition.shields.sb3 import ShieldedVecEnv as ShieldedVecEnv
+    from ethbrake_marl.names import AgentSettings as AgentSettings, make_agent as make_agent
+    from ethbrake_marl.agents.drive import Agent as Agent, Team as Team, drive as drive, play as play
+    from ethbrake_marl.agents.policy_agent import LearnedAgent as LearnedAgent, policy_agent as policy_agent
+    from ethbrake_marl.policies.bundle import load_policy as load_policy, load_shipped as load_shipped
+    from ethbrake_marl.policies.policy import Policy as Policy
 
     # Training
-    from ethbrake_marl.first_edition.training.recipe import TrainingRecipe as TrainingRecipe, load_recipe as load_recipe
-    from ethbrake_marl.first_edition.training.session import (
-        TrainResult as TrainResult,
-        resume as resume,
-        train as train,
-    )
+    from ethbrake_marl.training.recipe import TrainingRecipe as TrainingRecipe, load_recipe as load_recipe
+    from ethbrake_marl.training.train import TrainResult as TrainResult, resume as resume, train as train
     from ethbrake_marl.progress import Progress as Progress
 
     # Evaluation
-    from ethbrake_marl.first_edition.evaluation.evaluation import Evaluation as Evaluation
-    from ethbrake_marl.first_edition.evaluation.outcome import Outcome as Outcome
-    from ethbrake_marl.first_edition.evaluation.record import (
-        EpisodeRecord as EpisodeRecord,
-        record_episode as record_episode,
+    from ethbrake_marl.evaluation.door import evaluate as evaluate
+    from ethbrake_marl.evaluation.evaluate import Result as Result
+    from ethbrake_marl.evaluation.record import EpisodeRecord as EpisodeRecord, record_episode as record_episode
+    from ethbrake_marl.evaluation.summary import (
+        SummaryRow as SummaryRow,
+        SummaryTable as SummaryTable,
+        summarise as summarise,
+        summarise_by as summarise_by,
     )
-    from ethbrake_marl.first_edition.evaluation.rollout import evaluate as evaluate
-    from ethbrake_marl.first_edition.evaluation.summary import SummaryTable as SummaryTable, summarise as summarise
-    from ethbrake_marl.first_edition.evaluation.summary_row import SummaryRow as SummaryRow
-    from ethbrake_marl.first_edition.evaluation.comparison import compare_results as compare_results
-    from ethbrake_marl.first_edition.evaluation.per_world import read_result as read_result
-    from ethbrake_marl.first_edition.evaluation.groups import summarise_by as summarise_by
+    from ethbrake_marl.evaluation.compare import compare_results as compare_results
+    from ethbrake_marl.evaluation.results import (
+        read_result as read_result,
+        write_results as write_results,
+        write_rows as write_rows,
+    )
 
     # Your own parts
-    from ethbrake_marl.first_edition.agents.registry import register_agent as register_agent
-    from ethbrake_marl.first_edition.game.measures import register_measure as register_measure
-    from ethbrake_marl.first_edition.training.recipe import register_algorithm as register_algorithm
-    from ethbrake_marl.first_edition.game.objectives import register_objective as register_objective
-    from ethbrake_marl.first_edition.game.features import register_feature as register_feature
-    from ethbrake_marl.first_edition.scenario.catalogue import register_scenarios as register_scenarios
-    from ethbrake_marl.first_edition.scenario.channel import register_preset as register_preset
+    from ethbrake_marl.names import register_agent as register_agent, register_shield as register_shield
+    from ethbrake_marl.evaluation.measures import register_measure as register_measure
+    from ethbrake_marl.episode.terms import register_term as register_term
+    from ethbrake_marl.training.recipe import register_algorithm as register_algorithm
+    from ethbrake_marl.episode.objectives import register_objective as register_objective
+    from ethbrake_marl.episode.features import register_feature as register_feature
+    from ethbrake_marl.worlds.catalogue import register_scenarios as register_scenarios
+    from ethbrake_marl.worlds.channel import register_preset as register_preset
     from ethbrake_marl.registry import Part as Part
 
     # Errors
@@ -123,7 +95,7 @@ __version__ = "0.5.0"
 
 
 _HOMES = names_behind(__file__)
-_NEED_TRAIN = ("EthBrakeVecEnv", "ShieldedVecEnv", "TrainResult", "make_sb3_vec_env", "resume", "train")
+_NEED_TRAIN = ("EthBrakeVecEnv", "TrainResult", "make_sb3_vec_env", "resume", "train")
 
 
 def _usable() -> list[str]:

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from ethbrake_marl.first_edition.envs.pettingzoo import env, parallel_env, raw_env
+from ethbrake_marl.faces.pettingzoo import env, parallel_env, raw_env
 
 __all__ = ["env", "parallel_env", "raw_env"]

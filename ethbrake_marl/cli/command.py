@@ -18,7 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.segment import Segment
 
 from ethbrake_marl.errors import InvalidInput, one_line, plain_text
-from ethbrake_marl.first_edition.envs.registration import register_environments
+from ethbrake_marl.faces.registration import register_environments
 from ethbrake_marl.progress import Progress as PartProgress
 
 # special characters allowed in results; the no-break space is used between a number and its unit

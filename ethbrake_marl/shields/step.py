@@ -89,6 +89,7 @@ class StepShield:
 
     """
 
+    knows = MODEL
     M = 1  # number of states that a world may be in; a subclass with more overrides ``seen`` and ``price``
 
     def __init__(

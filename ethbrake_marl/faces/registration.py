@@ -1,0 +1,35 @@
+"""Register the environments in Gymnasium and PettingZoo, without importing the modules of the environments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ethbrake_marl.errors import MissingExtra
+
+GYMNASIUM_ID = "EthBrake-v1"
+MO_GYMNASIUM_ID = "EthBrakeMO-v1"  # with vector rewards, for MO-Gymnasium
+PETTINGZOO_ID = "ethbrake/ethbrake-v1"
+ENTRIES: dict[str, Any] = {
+    "entry_point": "ethbrake_marl.faces.gymnasium:EthBrakeEnv",
+    "vector_entry_point": "ethbrake_marl.faces.vector:EthBrakeVectorEnv",
+}
+
+
+def register_environments() -> None:
+    """Register the environments' ids. Further calls have no effect. Raises ``MissingExtra`` for an old PettingZoo."""
+    import gymnasium  # imported here, because the import takes time
+    import pettingzoo
+
+    for id_ in (GYMNASIUM_ID, f"ethbrake/{GYMNASIUM_ID}"):
+        if id_ not in gymnasium.registry:
+            gymnasium.register(id_, **ENTRIES)
+    if MO_GYMNASIUM_ID not in gymnasium.registry:  # Gymnasium's checker would warn about array rewards
+        gymnasium.register(MO_GYMNASIUM_ID, **ENTRIES, disable_env_checker=True, kwargs={"reward_vector": "vehicles"})
+    if not hasattr(pettingzoo, "parallel_registry"):
+        raise MissingExtra(
+            f"needs pettingzoo 1.27 or newer; {getattr(pettingzoo, '__version__', 'an older one')} is installed"
+        )
+    if PETTINGZOO_ID not in pettingzoo.parallel_registry:
+        pettingzoo.register("parallel", PETTINGZOO_ID, "ethbrake_marl.ethbrake_v1:parallel_env")
+    if PETTINGZOO_ID not in pettingzoo.aec_registry:
+        pettingzoo.register("aec", PETTINGZOO_ID, "ethbrake_marl.ethbrake_v1:env")
