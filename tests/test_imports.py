@@ -141,7 +141,7 @@ for name in eb.__all__:
     getattr(eb, name)
 help(eb)
 eb.env(), eb.parallel_env(), eb.EthBrakeEnv(), eb.EthBrakeVectorEnv(2)
-for name in ("train", "resume", "TrainResult", "make_sb3_vec_env", "EthBrakeVecEnv", "ShieldedVecEnv"):
+for name in ("train", "resume", "TrainResult", "make_sb3_vec_env", "EthBrakeVecEnv"):
     assert name not in dir(eb) and name not in eb.__all__
     try:
         getattr(eb, name)

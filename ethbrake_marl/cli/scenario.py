@@ -157,7 +157,10 @@ def _share(part: int, whole: int, things: str = "worlds") -> str:
 
 @scenario_group.command("explain", epilog=example("scenario explain paper-random"))
 def scenario_explain(scenario: NameArgument, as_json: JsonOption = False) -> None:
-    """Describe a scenario in plain sentences: the line, its roles, and what each key of the file says and means."""
+    """Describe a scenario in plain sentences.
+
+    They tell the line, its roles, and what each key of the file says and means.
+    """
     from ethbrake_marl.worlds.catalogue import load_scenario
     from ethbrake_marl.worlds.explain import sentences
 
@@ -176,9 +179,9 @@ def scenario_new(
     output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for the new scenario file.")] = Path(),
     force: ForceOption = False,
 ) -> None:
-    """Write a new scenario file, NAME.yaml, with every key and a comment on each.
+    """Write a new scenario file with comments.
 
-    If the scenario has a table, its rows are written to NAME.csv in the same folder.
+    The file NAME.yaml has every key of a scenario. If the scenario has a table, its rows are written to NAME.csv in the same folder.
     """
     from ethbrake_marl.worlds.catalogue import load_scenario
     from ethbrake_marl.worlds.explain import new_scenario_text
@@ -224,7 +227,10 @@ def scenario_parts(as_json: JsonOption = False) -> None:
 
 @scenario_group.command("schema", epilog=example("scenario schema > scenario.schema.json"))
 def scenario_schema() -> None:
-    """Print the JSON Schema of scenario files, with which editors complete and check YAML."""
+    """Print the JSON Schema of scenario files.
+
+    Editors complete and check YAML with it.
+    """
     from ethbrake_marl.worlds.explain import scenario_json_schema
 
     with Out() as out:

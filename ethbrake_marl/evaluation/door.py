@@ -70,8 +70,9 @@ def evaluate(
     loaded, game = open_game(scenario)
     if not loaded.learners:
         raise InvalidInput(
-            f"scenario {loaded.name!r} has no learner that the agents could drive; make a vehicle one, for instance"
-            " scenario.with_learners(['vehicle_2'])"
+            f"scenario {loaded.name!r} has no learner that the agents could drive; choose the scenario that the agents"
+            " were trained for, or make a vehicle a learner: scenario.with_learners(['vehicle_2']), on the command line"
+            " --set roles.vehicle_2=learner"
         )
     about = about_scenario(loaded, None if given is not None else seed)
     if given is None:

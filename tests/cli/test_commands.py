@@ -83,12 +83,12 @@ def test_results__stand_alone_on_stdout_whatever_a_file_of_the_users_prints(ethb
 
 def test_defect_of_the_program__keeps_its_traceback_and_missing_memory_is_one_line(ethbrake, monkeypatch) -> None:
     monkeypatch.setattr(
-        "ethbrake_marl.first_edition.scenario.catalogue.list_scenarios", Mock(side_effect=RuntimeError("a defect"))
+        "ethbrake_marl.worlds.catalogue.list_scenarios", Mock(side_effect=RuntimeError("a defect"))
     )
     with pytest.raises(RuntimeError, match="a defect"):
         ethbrake("scenario", "list")
     short = Mock(side_effect=MemoryError("Unable to allocate 9 TiB"))
-    monkeypatch.setattr("ethbrake_marl.first_edition.evaluation.chunks.evaluate_held", short)
+    monkeypatch.setattr("ethbrake_marl.evaluation.door.evaluate", short)
     check_refused(ethbrake("evaluate"), "not enough memory (Unable to allocate 9 TiB)", "fewer worlds")
 
 
@@ -141,7 +141,7 @@ def test_command__ctrl_c_is_one_line_and_the_status_of_an_interruption(capsys) -
 
 AGENT = """
 import numpy as np
-import ethbrake_marl.first_edition as eb
+import ethbrake_marl as eb
 
 
 def make_gentle(argument: str, settings):
@@ -158,7 +158,6 @@ def test_agents_from_a_file__drive_on_the_command_line_behind_a_shield(ethbrake,
     spec = f"{tmp_path / 'my_agents.py'}:make_gentle:0.3"
     answer = ethbrake("evaluate", "--episodes", "10", "--agents", f"{spec},{spec}+step", "--json")
     assert [row["agent"] for row in json.loads(answer.out)] == [spec, f"{spec}+step"]
-    assert ethbrake("shield", "--episodes", "10", "--agents", spec).status == 0
 
 
 def test_stdout__has_results_alone_whatever_writes_past_python(capfd, monkeypatch) -> None:

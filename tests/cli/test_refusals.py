@@ -48,7 +48,7 @@ def test_scenario_command__is_refused(line: str, message: str, refuse: Refuse) -
 
 EVALUATIONS = [
     ("evaluate --set harm_count=both", "harm_count = 'both': must be 'first' or 'total'"),
-    ("evaluate --episodes 100000000000000", "episodes = 100000000000000: must be a whole number in 1..1000000000000"),
+    ("evaluate --episodes 100000000000000", "number of worlds = 100000000000000: must be at most 10,000,000"),
     ("evaluate --set recipe.gamma=1", "--set recipe.gamma: this command uses no recipe; remove this setting"),
     ("evaluate --agents ladder,coast", "agent 'coast' is listed twice; list each agent once"),
     (
@@ -61,7 +61,7 @@ EVALUATIONS = [
     ),
     (
         "evaluate --agents team@.",
-        ".: has no file team.json, so it is not the folder of a team; give the folder of a training run",
+        ".: contains no policy; give the folder of a policy bundle",
     ),
     ("evaluate --agents policy@shipped+step", "'policy@shipped' is now written universal (the policies"),
     ("evaluate --output /proc/out", "/proc/out: cannot be written to (No such file or directory)"),
@@ -80,10 +80,6 @@ TRAININGS = [
         "scheme single: scenario 'cooperation-3-pair' has 2 learners; use the scheme shared, independent or",
     ),
     ("train --resume .", ".: is not the folder of a run; name the folder of a run, for instance"),
-    (
-        "shield --agents ppo+episode",
-        "agent 'ppo+episode' already has a shield, and this command adds its own; name the agent without a",
-    ),
 ]
 
 

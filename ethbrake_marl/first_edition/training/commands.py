@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ethbrake_marl.first_edition import evaluation
-from ethbrake_marl.first_edition.scenario.task import Task
-from ethbrake_marl.first_edition.training.settings import read_settings
+from ethbrake_marl.first_edition import evaluation, training
+
+if TYPE_CHECKING:
+    from ethbrake_marl.first_edition.scenario.task import Task
 
 
 def read_task(scenario: str, settings: Sequence[str] | None) -> Task:
@@ -15,7 +16,9 @@ def read_task(scenario: str, settings: Sequence[str] | None) -> Task:
 
     The settings may include ``harm_count=total``. Raises ``InvalidInput`` if the scenario has no learner.
     """
-    chosen = read_settings(settings, of_agents=("harm_count",))
+    from ethbrake_marl.first_edition.scenario.task import Task
+
+    chosen = training.read_settings(settings, of_agents=("harm_count",))
     loaded = evaluation.load_runnable(scenario, chosen.scenario, drives="some")
     return Task(loaded, loaded.learners, chosen.harm_count)
 
