@@ -155,7 +155,8 @@ def features_of(policy: Any, ask: Ask) -> tuple[str, ...] | None:
     if ask is ask_onnx:
         listed = session_of(policy).get_modelmeta().custom_metadata_map.get("features")
         return tuple(listed.split(",")) if listed else None
-    return getattr(getattr(policy, "observation_space", None), "features", None)
+    names = getattr(getattr(policy, "observation_space", None), "features", None)
+    return names if isinstance(names, tuple) else None
 
 
 def count_of_actions(policy: Any, given: int | None, who: str) -> int | None:

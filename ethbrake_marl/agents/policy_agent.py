@@ -118,8 +118,11 @@ class PolicyAgent:
         if self.initial_state is None:
             answer = self.ask(self.policy, seen)
         else:
-            answer, memory = self.policy(seen, self._memory(memory, state.n))
-            memory = self._memory(memory, state.n)
+            both = self.policy(seen, self._memory(memory, state.n))
+            if not isinstance(both, tuple) or len(both) != 2:
+                right = "with initial_state must return a pair of actions and state"
+                raise AgentFailed(self.name, None, f"vehicle_{body}: returned {both!r:.60}; {right}")
+            answer, memory = both[0], self._memory(both[1], state.n)
         return to_command(state, body, self._actions(answer, state, body)), memory
 
     def _memory(self, memory: Any, n: int) -> Any:

@@ -567,6 +567,12 @@ def test_memory__has_one_row_for_each_world(memory: Any) -> None:
         harms(policy_agent(lambda seen, kept: (brake(seen), memory(len(seen))), initial_state=np.zeros))
 
 
+@pytest.mark.parametrize("both", [lambda seen, kept: brake(seen), lambda seen, kept: (brake(seen), kept, kept)])
+def test_function_with_a_memory__returns_a_pair(both: Any) -> None:
+    with refused("with initial_state must return a pair of actions and state", AgentFailed):
+        harms(policy_agent(both, initial_state=np.zeros))
+
+
 def raising(seen: Any) -> Any:
     raise KeyError("weights")
 
