@@ -65,8 +65,8 @@ class LearnedAgent:
         then, now = self.policy.manifest.versions.get(PHYSICS), physics_digest()
         if then not in (None, now):
             warnings.warn(
-                f"{self.name}: was trained on other physics ({then:.16}) than this installation's ({now}), so it may"
-                " drive worse than reported; train it again",
+                f"{self.name}: was trained on other physics ({then!r:.20}) than this installation's ({now!r}), so it"
+                " may drive worse than reported; train it again",
                 Unfamiliar,
                 stacklevel=2,
             )
