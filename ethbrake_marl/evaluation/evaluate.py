@@ -141,19 +141,13 @@ def evaluate(
         (drive_chunk, alert.take(slice(first, first + CHUNK)), dict(agents), game, chosen)
         for first in range(0, n, CHUNK)
     )
+    if jobs not in (None, 1) or ray is not None:
+        _check_can_be_sent(agents, chosen)
     parts: list[dict[str, Columns]] = []
-    try:
-        for part in run_each(calls, jobs, ray):
-            parts.append(part)
-            if on_done is not None:
-                on_done(min(len(parts) * CHUNK, n))
-    except (pickle.PicklingError, AttributeError, TypeError) as error:
-        if jobs in (None, 1) and ray is None:
-            raise
-        raise InvalidInput(
-            f"evaluate: jobs = {jobs}: an agent or a measure cannot be sent to another process ({error}); define its"
-            " class or function in a module, or use jobs=1"
-        ) from error
+    for part in run_each(calls, jobs, ray):
+        parts.append(part)
+        if on_done is not None:
+            on_done(min(len(parts) * CHUNK, n))
     learners = game.rules.learners.tolist()
     columns = columns_of(drawn)
     return Result(
@@ -227,6 +221,17 @@ def known_by(team: Team) -> str:
     """Return what a team has to know, as one text: ``messages + true model``."""
     each = {getattr(one, "knows", UNSTATED) for one in (*team.drivers.values(), *filter(None, (team.shield,)))}
     return " + ".join(sorted(each, key=lambda word: (*KNOWLEDGE, word).index(word)))
+
+
+def _check_can_be_sent(agents: Mapping[str, Team], measures: Sequence[Measure]) -> None:
+    for name, part in (*agents.items(), *((measure.name, measure) for measure in measures)):
+        try:
+            pickle.dumps(part)
+        except Exception as error:
+            raise InvalidInput(
+                f"evaluate: {name!r:.60} cannot be sent to another process ({error}); define its classes and functions"
+                " in a module, or use jobs=1"
+            ) from error
 
 
 def _check(alert: State, agents: Mapping[str, Team], game: Game) -> None:

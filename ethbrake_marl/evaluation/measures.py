@@ -18,7 +18,11 @@ of a state                               what it is (``episode.state.State``)
 ``braking_capacity_mps2``, ``driving_``  [n, N] m/s2 on this road
 ``time_s``, ``steps``, ``ended``         [n] s since the alert; steps taken; whether the episode has ended
 ``memories``                             body -> memory of its agent; ``"shield"`` -> memory of the shield
+``car``, ``line``                        [n, rows, N + 1] all parameters, all that changes (``motion.layout``)
 =======================================  ===============================================================================
+
+A ``Watch`` also sees what each step did (``episode.step.Step``): ``first_impact_harm`` and ``total_harm`` of the line,
+[n] m2/s2; ``reward`` [n, N] and its ``terms``; ``terminated``, ``truncated`` and ``safe_end``, [n].
 
 Every evaluation has DEFAULT. All other measures cost something and are computed if they are named: registered ones, the
 sum over all steps of any term of a reward (``episode.terms``), and the value of an objective (``social:45``), in both
