@@ -10,11 +10,12 @@ from typing import Any, Literal
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.captions import EXPLOITS
+from ethbrake_marl.evaluation.captions import by_recording
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.results import HARMS, Saved
 from ethbrake_marl.evaluation.statistics import difference, unpaired
 from ethbrake_marl.evaluation.summary import summarise
+from ethbrake_marl.evaluation.summary_row import EXPLOITS
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet
 
 SAME = {  # what two results must have in common -> what differs otherwise
@@ -73,7 +74,7 @@ class Comparison:
         how = "paired by world"
         if self.unpaired_because:
             how = f"NOT paired by world, so wider than paired intervals: {self.unpaired_because}"
-        by = f"; 95 % intervals by {self.recordings:,} recordings" if self.recordings else ""
+        by = by_recording(self.recordings)
         notes = [f"Second minus first, mean per world in m²/s²; in brackets: 95 % intervals, {how}{by}."]
         damage = [
             f"{each.agent} ({' and '.join(exploits)}, {which} result)"
