@@ -1,1 +1,349 @@
-"""Names of agents, shields and policies become things here: ``constant:3``, ``policy@runs/mine``, ``ppo+step``."""
+"""Names become things here: ``full_brake``, ``constant:3``, ``policy@runs/mine``, ``mine.py:make``, ``ppo+step``.
+
+::
+
+    spec    = agent, then any number of "+" wrapper
+    agent   = NAME[:ARGUMENT][@PATH], or FILE.py:FUNCTION[:ARGUMENT][@PATH]
+    wrapper = NAME[:ARGUMENT], a search or a shield around what stands before it
+
+Two tables hold the names, agents and wrappers; packages add to them by entry points, as this one does. An entry
+``NAME.ARGUMENT`` stands for this argument alone. An agent's entry may also be a list of specs (a group, ``ladder``).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from difflib import get_close_matches
+from inspect import signature
+from typing import Any
+
+from ethbrake_marl.agents.drive import Agent, Team, check_agent
+from ethbrake_marl.episode.game import Game, Script
+from ethbrake_marl.errors import EthBrakeError, InvalidInput, describe_error, refuse_shipped_path
+from ethbrake_marl.files.python_file import load_from_file
+from ethbrake_marl.registry import Registry
+from ethbrake_marl.worlds.catalogue import load_scenario
+from ethbrake_marl.worlds.game import AnyScenario, game_of
+from ethbrake_marl.worlds.roles import HELD, LEARNER, check_role
+from ethbrake_marl.worlds.scenario import Scenario
+
+NAME = re.compile(r"[a-z][a-z0-9_-]*(\.[a-z0-9_-]+)*")
+IN_FILE = re.compile(r"(?P<file>.+?\.py):(?P<name>[A-Za-z_]\w*)(:(?P<argument>[^@]+))?(@(?P<policy>.+))?")
+PLAIN = re.compile(r"(?P<name>[^:@+]*)(:(?P<argument>[^@]*))?(@(?P<policy>.*))?")
+
+Driver = Agent | Team
+
+
+@dataclass(frozen=True, slots=True)
+class AgentSettings:
+    """What a function that makes an agent may want to know, beside the argument in the agent's name."""
+
+    spec: str  # as the user has written it
+    policy: str | None = None  # path after the @
+    scenario: Scenario | None = None  # in which the agent drives; None: not known
+    harm_count: str = "first"  # what optimising agents minimise: harm of the first impact of each pair, or ``total``
+
+    def needed_scenario(self) -> Scenario:
+        """Return the scenario. Raises ``InvalidInput`` if it is not known."""
+        if self.scenario is None:
+            raise InvalidInput(
+                f"agent {self.spec!r}: needs a scenario, for instance make_agent({self.spec!r},"
+                " scenario='paper-random')"
+            )
+        return self.scenario
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A line of a table."""
+
+    make: Callable[..., Any]  # (argument, settings) -> agent or team; of a wrapper: (team, argument, settings) -> team
+    about: str
+    knows: str
+    form: str  # how the name is written, such as ``constant:A``; without a colon it takes no argument
+
+
+def register_agent(
+    name: str,
+    make: Callable[[str | None, AgentSettings], Driver] | Sequence[str],
+    *,
+    about: str = "an agent of your own",
+    knows: str = "not stated",
+    form: str | None = None,
+) -> None:
+    """Give an agent a name, for every place that takes names. Entry points: ``ethbrake_marl.second.agents``.
+
+    Raises ``AlreadyExists`` for a name in use, and ``InvalidInput`` for a bad one.
+
+    Args:
+        name: characters ``a-z``, ``0-9``, ``_``, ``-``, beginning with a letter.
+        make: ``make(argument, settings)`` returns the agent, or a team; ``argument`` is the text after the colon, or
+            None. Instead: the specs of a group.
+        about: one line.
+        knows: what it has to know (``agents.drive``).
+        form: as ``NAME[:ARGUMENT][@PATH]``; None: the name, with or without an argument.
+
+    """
+    _add(AGENTS, name, make, about, knows, form)
+
+
+def register_shield(
+    name: str,
+    make: Callable[[Team, str | None, AgentSettings], Team],
+    *,
+    about: str = "a wrapper of your own",
+    knows: str = "",
+    form: str | None = None,
+) -> None:
+    """Give a shield, or a search, a name that can stand after a ``+``. Entry points: ``ethbrake_marl.second.shields``.
+
+    ``make(team, argument, settings)`` returns the wrapped team; the rest is as in ``register_agent``.
+    """
+    _add(WRAPPERS, name, make, about, knows, form)
+
+
+def _add(table: Registry[Entry], name: str, make: Any, about: str, knows: str, form: str | None) -> None:
+    if not isinstance(name, str) or NAME.fullmatch(name) is None:
+        raise InvalidInput(
+            f"{table.kind} {name!r:.80}: the name must have the characters a-z, 0-9, _ and -, beginning with a letter"
+        )
+    table.add(name, Entry(make, about, knows, form or f"{name}[:ARGUMENT]"), lambda other: other.make == make)
+
+
+AGENTS: Registry[Entry] = Registry("agent", "second.agents", register_agent)
+WRAPPERS: Registry[Entry] = Registry("shield or search", "second.shields", register_shield)
+
+
+def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: str = "first") -> Driver:
+    """Return the agent, or the team of a training run or shield, that a name stands for (this module's first lines).
+
+    ``scenario`` is needed by teams, wrappers and agents that look ahead. A Python file that is named runs with all your
+    rights. Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` for a bad argument.
+
+    >>> import ethbrake_marl as eb
+    >>> eb.make_agent("constant:3.5").name
+    'constant:3.5'
+
+    """
+    if harm_count not in ("first", "total"):
+        raise InvalidInput(f"harm_count = {harm_count!r}: must be 'first' or 'total'")
+    loaded = None if scenario is None else load_scenario(scenario)
+    core, wrappers = _split(spec)
+    settings = AgentSettings(core, None, loaded, harm_count)
+    driver = _make(core, settings)
+    for wrapper in wrappers:
+        settings = replace(settings, spec=f"{settings.spec}+{wrapper}")
+        team = team_of(driver, settings.needed_scenario())
+        entry, argument = _look_up(WRAPPERS, *wrapper.partition(":")[::2])
+        driver = _called(settings.spec, entry.make, team, argument, settings)._replace(name=settings.spec)
+    return driver
+
+
+def team_of(driver: Driver, scenario: Scenario) -> Team:
+    """Return a team for all learners of a scenario. A single agent drives each of them, with memories of their own."""
+    if isinstance(driver, Team):
+        return driver
+    return Team(driver.name, dict.fromkeys((body for body in scenario.learners), driver))
+
+
+def make_teams(specs: str | Iterable[str], scenario: Scenario, *, harm_count: str = "first") -> dict[str, Team]:
+    """Return the teams that names stand for, spec -> team. A text may list several, with commas; groups are resolved.
+
+    Raises the errors of ``make_agent``, and ``InvalidInput`` for a spec that is listed twice.
+    """
+    teams: dict[str, Team] = {}
+    for each in split_specs(specs) if isinstance(specs, str) else specs:
+        for spec in group(each) or [each]:
+            if spec in teams:
+                raise InvalidInput(f"agent {spec!r} is listed twice; list each agent once")
+            teams[spec] = team_of(make_agent(spec, scenario=scenario, harm_count=harm_count), scenario)
+    return teams
+
+
+def teams_of(agents: Any, scenario: Scenario, *, harm_count: str = "first") -> dict[str, Team]:
+    """Return name -> team of whatever stands for agents: names, or a mapping of names to agents.
+
+    ``agents`` is a text or list as in ``make_teams``; or a mapping from names of your own to specs, agents, teams, or
+    mappings from vehicles to specs and agents: ``{"mine": {"vehicle_2": agent, "vehicle_3": "coast"}}``. Raises
+    ``InvalidInput`` for anything else.
+    """
+    if isinstance(agents, str) or (isinstance(agents, Iterable) and not isinstance(agents, Mapping)):
+        return make_teams(agents, scenario, harm_count=harm_count)
+    if not isinstance(agents, Mapping) or not agents:
+        raise InvalidInput(
+            f"agents = {agents!r:.80}: must be names, such as 'ppo,full_brake', or a mapping, such as {{'mine': agent}}"
+        )
+    teams = {}
+    for name, given in agents.items():
+        if isinstance(given, Mapping):
+            drivers = {vehicle: _driver(each, scenario, harm_count) for vehicle, each in given.items()}
+            teams[name] = Team.of(drivers, name)
+        else:
+            driver = _driver(given, scenario, harm_count)
+            if not isinstance(driver, Team):
+                check_agent(driver, f"agent {name!r} = {driver!r:.60}")
+            teams[name] = team_of(driver, scenario)._replace(name=name)
+    return teams
+
+
+def _driver(given: Any, scenario: Scenario, harm_count: str) -> Any:
+    return make_agent(given, scenario=scenario, harm_count=harm_count) if isinstance(given, str) else given
+
+
+def group(name: str) -> list[str]:
+    """Return the specs of a group: of the entry ``NAME``, then of all ``NAME.MORE``; nothing for another name."""
+    if name not in AGENTS or callable(AGENTS[name].make):
+        return []
+    listed: list[Any] = [AGENTS[each].make for each in AGENTS if each == name or each.startswith(f"{name}.")]
+    return [spec for specs in listed for spec in specs]
+
+
+def split_specs(text: str) -> list[str]:
+    """Split a list of specs at its commas, except those in the path of something that exists."""
+    parts, specs = text.split(","), []
+    while parts:
+        joined = (k for k in range(len(parts), 1, -1) if _path_exists(",".join(parts[:k])))
+        count = next(joined, 1)
+        specs.append(",".join(parts[:count]))
+        parts = parts[count:]
+    return specs
+
+
+def _path_exists(text: str) -> bool:
+    """Return whether a spec ends with a path that exists."""
+    core = text
+    while core.rpartition("+")[2].partition(":")[0] in WRAPPERS:
+        core = core.rpartition("+")[0]
+    head, _, path = core.partition("@")
+    if not path:
+        head, path = "", core.partition(".py:")[0] + ".py"
+    return "," in path and "," not in head and os.path.lexists(os.path.expanduser(path))
+
+
+def _split(spec: object) -> tuple[str, list[str]]:
+    """Return the agent and its wrappers, from the inside. A ``+`` in the path of something that exists is the path's.
+
+    Raises ``UnknownName`` for a wrapper that is not known.
+    """
+    if not isinstance(spec, str) or not spec:
+        raise InvalidInput(f"agent {spec!r:.80}: must be a name, for instance full_brake, policy@runs/mine or ppo+step")
+    core, wrappers = spec, list[str]()
+    while True:
+        before, plus, last = core.rpartition("+")
+        path = core.partition("@")[2] or (core.partition(":")[0] if ".py:" in core else "")
+        if not plus or os.path.lexists(os.path.expanduser(path)):
+            return core, wrappers
+        word = last.partition(":")[0]
+        if word not in WRAPPERS:
+            if not path or get_close_matches(word, WRAPPERS, n=1):
+                raise WRAPPERS.unknown(word)
+            return core, wrappers
+        core, wrappers = before, [last, *wrappers]
+
+
+def _make(core: str, settings: AgentSettings) -> Driver:
+    in_file = IN_FILE.fullmatch(core)
+    match = in_file or PLAIN.fullmatch(core)
+    if match is None:
+        raise InvalidInput(f"agent {core!r}: must be NAME[:ARGUMENT][@PATH] or FILE.py:FUNCTION[:ARGUMENT][@PATH]")
+    name, argument, policy = match["name"], match["argument"], match["policy"]
+    if policy is not None:
+        refuse_shipped_path(policy, name)
+        if not policy:
+            raise InvalidInput(f"agent {core!r}: a path must follow '@'")
+        settings = replace(settings, policy=os.path.expanduser(policy))
+    if in_file:
+        make = _in_file(in_file, settings)
+    else:
+        entry, argument = _look_up(AGENTS, name, argument or "", policy)
+        make = entry.make
+        if not callable(make):
+            raise InvalidInput(f"agent {core!r}: is the name of a group of agents; write the name of one agent")
+    driver: Driver = _called(core, make, argument or None, settings)
+    if not isinstance(driver, Team):
+        check_agent(driver, f"agent {core!r} = {driver!r:.60}")
+    return driver
+
+
+def _look_up(table: Registry[Entry], name: str, argument: str, policy: str | None = None) -> tuple[Entry, str | None]:
+    """Return the entry of a name and the argument that is left for it."""
+    if argument and f"{name}.{argument}" in table:
+        return table[f"{name}.{argument}"], None
+    if name not in table and policy is not None and table is AGENTS:
+        return AGENTS["policy"], name  # ppo@PATH: the algorithm that trained the policy
+    if name not in table:
+        raise table.unknown(name)
+    entry = table[name]
+    if argument and ":" not in entry.form:
+        raise InvalidInput(f"{table.kind} {name}:{argument}: {name} takes no argument")
+    if policy is not None and "@" not in entry.form:
+        raise InvalidInput(f"agent {name}@{policy}: {name} uses no policy; leave out @ and what follows")
+    return entry, argument or None
+
+
+def _in_file(match: re.Match[str], settings: AgentSettings) -> Callable[..., Any]:
+    """Return the function of a Python file that makes an agent."""
+    function = load_from_file(os.path.expanduser(match["file"]), match["name"], reads=settings.policy)
+    if not callable(function):
+        raise InvalidInput(f"agent {settings.spec!r}: {match['name']!r} is not a function that makes the agent")
+    if not signature(function).parameters:
+        if match["argument"] or match["policy"]:
+            raise InvalidInput(
+                f"agent {settings.spec!r}: the function {match['name']} has no parameters; write the name without an"
+                " argument and without a policy"
+            )
+        return lambda argument, settings: function()
+    return function  # type: ignore[no-any-return]  # checked by its call
+
+
+def _called(spec: str, make: Callable[..., Any], *given: Any) -> Any:
+    """Call what makes an agent; whatever goes wrong in a user's code is one ``InvalidInput``."""
+    try:
+        return make(*given)
+    except EthBrakeError:
+        raise
+    except Exception as error:
+        raise InvalidInput(f"agent {spec!r}: {describe_error(error)}") from error
+
+
+def open_game(
+    scenario: AnyScenario,
+    learners: Iterable[str] | None = None,
+    reward: Any = "harm",
+    observation: Any = None,
+    reward_vector: Any = None,
+) -> tuple[Scenario, Game]:
+    """Return a scenario and its game, in which roles that name agents are played by these (``worlds.game.game_of``)."""
+    loaded = load_scenario(scenario)
+    if learners is not None:
+        loaded = loaded.with_learners(learners)
+    return game_of(loaded, None, reward, observation, reward_vector, scripts_of(loaded))
+
+
+def scripts_of(scenario: Scenario) -> Mapping[int, Script]:
+    """Return the scripts of a scenario that look at the state, body -> agent."""
+    scripts = {}
+    for body, (vehicle, role) in enumerate(scenario.roles.items(), 1):
+        if role.partition(":")[0] not in (LEARNER, *HELD):
+            where = f"scenario {scenario.name!r}: roles.{vehicle} = {role}"
+            check_role(role)
+            try:
+                agent = make_agent(role, scenario=scenario)
+            except InvalidInput as error:
+                raise type(error)(f"{where}: {error}") from None
+            if isinstance(agent, Team):
+                raise InvalidInput(
+                    f"{where}: is a team, or has a shield or a search; a vehicle that does not learn must be driven by"
+                    " a single agent"
+                )
+            scripts[body] = agent
+    return scripts
+
+
+def agent_list() -> list[tuple[str, Entry]]:
+    """Return name and entry of all agents and wrappers that can be loaded; groups are left out."""
+    agents = [(name, entry) for name, entry in AGENTS.usable().items() if callable(entry.make)]
+    return agents + [(f"+{name}", entry) for name, entry in WRAPPERS.usable().items()]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.envs.making import make_engine
 from ethbrake_marl.first_edition.game.actions import action_to_command, checked_action, command_to_action
 from ethbrake_marl.first_edition.game.harm import Ledger, empty_ledger, split

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.game.contact_features import FORECAST_S
 from ethbrake_marl.first_edition.game.features import GROUPS
 from ethbrake_marl.first_edition.game.observations import ObservationSpec, choose_observation, observe

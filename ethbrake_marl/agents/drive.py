@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple, Protocol
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from ethbrake_marl.episode.game import Game, Shield
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.episode.step import Step, asked
+from ethbrake_marl.episode.step import Step, asked, begun
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
 
@@ -25,14 +26,21 @@ NOBODY = np.zeros(0, np.int64)
 class Agent(Protocol):
     """Drives one vehicle: a script, a policy, a search. It sees the whole state, and decides when the learners do."""
 
-    name: str  # in tables and messages
-    knows: str  # what it has to know, for tables: one of the texts above
+    @property
+    def name(self) -> str:
+        """Name in tables and messages."""
+
+    @property
+    def knows(self) -> str:
+        """What it has to know, for tables: one of the texts above."""
 
     def begin(self, alert: State, body: int) -> Any:
         """Return the memory for new episodes: None, an array with one row per world, or a tuple of memories."""
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
         """Return the commands of vehicle ``body`` (1: Vehicle 1), [n] m/s2, and the new memory."""
+
+    # An agent may have ``check(game, body)``, which warns, or raises ``InvalidInput``, where it should not drive.
 
 
 class Team(NamedTuple):
@@ -42,13 +50,37 @@ class Team(NamedTuple):
     drivers: Mapping[int, Agent]  # body -> agent
     shield: Shield | None = None  # asks its own team, the drivers, what they propose
 
+    @staticmethod
+    def of(drivers: Mapping[str, Agent], name: str, shield: Shield | None = None) -> Team:
+        """Return the team ``{"vehicle_2": agent, ...}``. Raises ``InvalidInput`` for what is no vehicle or no agent."""
+        bodies = {}
+        for vehicle, agent in drivers.items():
+            if not isinstance(vehicle, str) or re.fullmatch("vehicle_[1-9][0-9]?", vehicle) is None:
+                raise InvalidInput(f"team {name!r}: {vehicle!r:.60}: must be the name of a vehicle, such as vehicle_2")
+            check_agent(agent, f"team {name!r}: {vehicle} = {agent!r:.60}")
+            bodies[int(vehicle.removeprefix("vehicle_"))] = agent
+        return Team(name, dict(sorted(bodies.items())), shield)
+
     def game(self, game: Game) -> Game:
         """Return ``game`` with this team's shield. Raises ``InvalidInput`` unless the team drives all its learners."""
         driven, wanted = sorted(self.drivers), sorted(game.rules.learners.tolist())
         if driven != wanted:
             theirs, right = (", ".join(f"vehicle_{i}" for i in each) or "nobody" for each in (driven, wanted))
             raise InvalidInput(f"team {self.name!r}: drives {theirs}; must drive exactly {right}")
+        for body, agent in self.drivers.items():
+            if hasattr(agent, "check"):
+                agent.check(game, body)
         return game._replace(shield=self.shield)
+
+
+def check_agent(agent: Any, where: str) -> None:
+    """Raise ``InvalidInput``, which begins with ``where``, unless this is an agent."""
+    missing = [each for each in ("name", "knows", "begin", "act") if not hasattr(agent, each)]
+    if missing:
+        raise InvalidInput(
+            f"{where}: has no {' and no '.join(missing)}; must be an agent, which has name, knows, begin(alert, body)"
+            " and act(state, memory, body); make one with make_agent(name), policy_agent(model) or LearnedAgent(policy)"
+        )
 
 
 def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Iterator[tuple[Step | None, State]]:
@@ -61,7 +93,7 @@ def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Itera
     game = team.game(game)
     if game.shield is None:
         state = game.begin(alert)
-        memories = {body: agent.begin(alert, body) for body, agent in team.drivers.items()}
+        memories = {body: begun(agent, alert, body) for body, agent in team.drivers.items()}
         state = state._replace(memories={**state.memories, **memories})
         game = driven_by(game, team.drivers)
         actions = np.zeros((alert.n, 0))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from ethbrake_marl.agents.drive import SENSORS
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
+from ethbrake_marl.registry import Part
 from ethbrake_marl.worlds.roles import check_role, first_command
 
 
@@ -37,11 +38,14 @@ class Held(NamedTuple):
         return memory, memory
 
 
-FULL_BRAKE, COAST = Held("full_brake"), Held("coast")
+def make_held(argument: str | None, settings: Any) -> Held:
+    """Return the script with the name ``settings.spec``. Raises ``InvalidInput`` unless its argument is right."""
+    check_role(settings.spec)
+    return Held(settings.spec)
 
 
-def constant(deceleration_mps2: float) -> Held:
-    """Return the script ``constant:a``. Raises ``InvalidInput`` unless the deceleration is finite."""
-    role = f"constant:{deceleration_mps2!r}"
-    check_role(role)
-    return Held(role)
+FULL_BRAKE = Part(make_held, form="full_brake", about="full braking, the paper's non-ethical strategy", knows=SENSORS)
+COAST = Part(make_held, form="coast", about="neither brake nor drive", knows=SENSORS)
+CONSTANT = Part(
+    make_held, form="constant:A", about="constant deceleration A in m/s2; a negative A drives", knows=SENSORS
+)

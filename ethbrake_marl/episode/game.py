@@ -13,7 +13,6 @@ from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.reward import Rewarding
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Rules, Step
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Floats, Ints
 
 
@@ -34,7 +33,10 @@ class Shield(Protocol):
         """Return the memory for new episodes, whose first decision is ``state``."""
 
     def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Any]:
-        """Return the actions to apply, [n, L], and the new memory. ``proposed`` None: its own agents propose."""
+        """Return the actions to apply, [n, L], and the new memory.
+
+        ``proposed`` [n, L] are in [-1, 1]; NaN: nothing is proposed. None: its own agents propose.
+        """
 
     def infos(self, game: Game, state: State) -> dict[str, Any]:
         """Return what users may want to know of it: name -> [n]."""
@@ -63,7 +65,9 @@ class Game(NamedTuple):
         if self.scripts:
             wanted = wanted.copy()
             for body, script in self.scripts.items():
-                wanted[:, body], memories[body] = one_step.asked(script, alert, script.begin(alert, body), body)
+                wanted[:, body], memories[body] = one_step.asked(
+                    script, alert, one_step.begun(script, alert, body), body
+                )
         state = self.first_decision(alert._replace(wanted=wanted, memories=memories))
         memories = dict(state.memories)
         if self.rewarding.shaping is not None:
@@ -79,14 +83,15 @@ class Game(NamedTuple):
     def step(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
         """Return the state after one step of all worlds, and what the step did.
 
-        ``actions`` [n, L] of the learners, in [-1, 1]; None: the shield's own agents propose them. ``donate``: the
-        memory of ``state`` may be reused. What raises leaves ``state`` as it was.
+        ``actions`` [n, L] of the learners, in [-1, 1]; behind a shield they are proposals, NaN where there is none, and
+        None lets the shield's own agents propose. ``donate``: the memory of ``state`` may be reused. What raises leaves
+        ``state`` as it was. Raises ``InvalidInput`` for bad actions.
         """
         if self.shield is not None:
+            if actions is not None:
+                actions = one_step.proposals(self.rules, actions, state.n)
             actions, memory = self.shield.decide(self, state, actions, donate=donate)
             state = state._replace(memories={**state.memories, "shield": memory})
-        if actions is None:
-            raise InvalidInput("step: actions = None: no shield proposes actions; give an array [n, L]")
         if self.rewarding.is_compiled:
             return self.follow(state, actions, donate=donate)
         after, step = self.follow(state, actions)
@@ -96,7 +101,7 @@ class Game(NamedTuple):
         """Return the episodes at their first decision, before shaping and shield. Scripts have decided."""
         return one_step.begin(alert, self.deciders, self.rules.time_step_s, self.rules.horizon_s)
 
-    def follow(self, state: State, actions: Floats, *, donate: bool = False) -> tuple[State, Step]:
+    def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
         """Return the state after one step, and what it did: ``step`` without shield and without terms of the reward."""
         return one_step.step(self.rules, self.scripts, state, actions, donate=donate)
 

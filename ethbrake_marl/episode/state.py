@@ -75,6 +75,13 @@ class State(NamedTuple):
         line, car, clock, know, wanted = (merged(each) for each in zip(*(part[:5] for part in parts), strict=True))
         return State(line, car, clock, know, wanted, memories)
 
+    def read_only(self) -> State:
+        """Return the same episodes, whose arrays cannot be changed by mistake."""
+        line, car, clock, know, wanted = (array.view() for array in self[:5])
+        for view in (line, car, clock, know, wanted):
+            view.setflags(write=False)
+        return State(line, car, clock, know, wanted, self.memories)
+
     @property
     def n(self) -> int:
         """Number of worlds."""

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.episode.state import CLOCK_COLUMNS, ENDED, FIRST_DECISION, LAST, NUMBER, STEPS, TIME, State
-from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.errors import AgentFailed, EthBrakeError, InvalidInput, PhysicsError, describe_error
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.drive import FAILED, MET, drive
 from ethbrake_marl.motion.layout import (
@@ -189,7 +189,7 @@ def begin(alert: State, deciders: Ints, time_step_s: float, horizon_s: float) ->
 
 
 def step(
-    rules: Rules, scripts: Mapping[int, Any], state: State, actions: Floats, *, donate: bool = False
+    rules: Rules, scripts: Mapping[int, Any], state: State, actions: Floats | None, *, donate: bool = False
 ) -> tuple[State, Step]:
     """Return the state after one step, and what the step did.
 
@@ -197,10 +197,7 @@ def step(
     decision. Raises ``InvalidInput`` for a bad action. ``state`` does not change, unless its memory is donated.
     """
     line, car, clock, know, wanted, memories = state
-    shape = len(clock), len(rules.learners)
-    if not isinstance(actions, np.ndarray) or actions.shape != shape or actions.dtype.kind not in "fiu":
-        raise InvalidInput(f"actions = {actions!r:.60}: must be an array of numbers with the shape {shape}")
-    actions = actions.astype(np.float64, copy=False)
+    actions = numbers_of(rules, actions, len(clock))
     commands = {}
     if scripts:
         memories = dict(memories)
@@ -218,16 +215,70 @@ def step(
     return State(line, car, clock, know, wanted, memories), Step(reward, out, rules.time_step_s)
 
 
+def numbers_of(rules: Rules, actions: Floats | None, n: int) -> Floats:
+    """Return the learners' actions as float64. Raises ``InvalidInput`` unless they are numbers of the shape [n, L]."""
+    shape = n, len(rules.learners)
+    if not isinstance(actions, np.ndarray) or actions.shape != shape or actions.dtype.kind not in "fiu":
+        raise InvalidInput(f"actions = {actions!r:.60}: must be an array of numbers with the shape {shape}")
+    return actions.astype(np.float64, copy=False)
+
+
+def proposals(rules: Rules, actions: Floats, n: int) -> Floats:
+    """Return proposed actions, [n, L] in [-1, 1] or NaN. Raises ``InvalidInput`` for anything else."""
+    actions = numbers_of(rules, actions, n)
+    beyond = np.abs(actions) > LARGEST_ACTION
+    if beyond.any():
+        row = actions[beyond.any(axis=1)][0]
+        _check_actions(rules, np.where(np.isnan(row), 0.0, row))
+    return np.clip(actions, -1.0, 1.0)
+
+
+def begun(script: Any, alert: State, body: int) -> Any:
+    """Return the memory of a script for new episodes. Raises ``AgentFailed`` if the script raises something."""
+    return _called(script, "begin", alert, body)
+
+
 def asked(script: Any, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
-    """Return the commands of a script, [n] m/s2, and its new memory. Raises ``InvalidInput`` for bad commands."""
-    given, memory = script.act(state, memory, body)
+    """Return the commands of a script, [n] m/s2, and its new memory.
+
+    Raises ``AgentFailed`` for commands that are no numbers or beyond a capacity of the vehicle, and if the script
+    raises something.
+    """
+    name = getattr(script, "name", type(script).__name__)
+    answer = _called(script, "act", state, memory, body)
+    if not isinstance(answer, tuple) or len(answer) != 2:
+        raise AgentFailed(name, None, f"vehicle_{body}: act returned {answer!r:.60}; must return commands and memory")
+    given, memory = answer
     commands = np.asarray(given)
-    if commands.shape != (state.n,) or commands.dtype.kind not in "fiu" or not np.isfinite(commands).all():
-        raise InvalidInput(
-            f"script of vehicle_{body}: its commands are {given!r:.60}; must be finite numbers of the shape"
-            f" ({state.n},), in m/s2"
+    if commands.shape != (state.n,) or commands.dtype.kind not in "fiu":
+        raise AgentFailed(
+            name, None, f"vehicle_{body}: its commands are {given!r:.60}; must be numbers of the shape ({state.n},)"
+        )
+    low, high = -state.car[:, BRAKING, body], state.car[:, DRIVING, body]
+    good = (commands >= low) & (commands <= high)
+    if not good.all():
+        k = int(np.argmin(good))
+        number = int(state.clock[k, NUMBER])
+        raise AgentFailed(
+            name,
+            k if number < 0 else number,
+            f"vehicle_{body} at {state.time_s[k]:.2f} s: command {commands[k]:g} m/s2; must be in"
+            f" [{low[k]:g}, {high[k]:g}] m/s2",
         )
     return commands, memory
+
+
+def _called(script: Any, method: str, state: State, *given: Any) -> Any:
+    """Call a method of a script; somebody else's cannot change the state by mistake, and its errors name it."""
+    if not type(script).__module__.startswith("ethbrake_marl."):
+        state = state.read_only()
+    try:
+        return getattr(script, method)(state, *given)
+    except EthBrakeError:
+        raise
+    except Exception as error:
+        name, body = getattr(script, "name", type(script).__name__), given[-1]
+        raise AgentFailed(name, None, f"vehicle_{body}: {method} fails: {describe_error(error)}") from error
 
 
 def _check_actions(rules: Rules, actions: Floats) -> None:

@@ -88,7 +88,7 @@ class Comparison:
             if agents:
                 notes.append(f"Only in the {which} result: {', '.join(agents)}.")
         for name, (one, other) in self.changed.items():
-            if "SHA-256" in f"{one}{other}" or name.endswith("sha256"):
+            if "SHA-256" in f"{one}{other}" or name == "physics_digest":
                 notes.append(f"Note: {name} differs.")
             else:
                 notes.append(f"Note: {name}: {one} in the first result, {other} in the second.")
@@ -170,4 +170,4 @@ def _recorded(saved: Saved, key: str) -> Any:
 
 def _noted(saved: Saved) -> dict[str, Any]:
     parts = [each for key in NOTED if isinstance(each := saved.about.get(key), dict)]
-    return {"physics_sha256": saved.about.get("physics_sha256"), **{k: v for part in parts for k, v in part.items()}}
+    return {"physics_digest": saved.about.get("physics_digest"), **{k: v for part in parts for k, v in part.items()}}

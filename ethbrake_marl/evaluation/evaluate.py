@@ -20,7 +20,7 @@ from ethbrake_marl.episode.state import STEPS, TIME, State
 from ethbrake_marl.errors import InvalidInput, count_of, naming_extras, unknown_name
 from ethbrake_marl.evaluation.identity import policies_of, versions, worlds_sha256
 from ethbrake_marl.evaluation.measures import DEFAULT, Measure, Values, measured, measures_called
-from ethbrake_marl.motion.compiling import physics_sha256
+from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import LATENCY, OWN_LATENCY, Bools
 from ethbrake_marl.parallel import run_each
 from ethbrake_marl.worlds.describe import clusters_of, columns_of
@@ -166,7 +166,7 @@ def evaluate(
             "rejected_draws": drawn.rejected,
             **(about or {}),
             "worlds_sha256": worlds_sha256(alert),
-            "physics_sha256": physics_sha256(),
+            "physics_digest": physics_digest(),
             "versions": versions(),
         },
     )
@@ -219,7 +219,8 @@ def hidden_from(alert: State, learners: Sequence[int]) -> Bools:
 
 def known_by(team: Team) -> str:
     """Return what a team has to know, as one text: ``messages + true model``."""
-    each = {getattr(one, "knows", UNSTATED) for one in (*team.drivers.values(), *filter(None, (team.shield,)))}
+    each = {getattr(agent, "knows", UNSTATED) for agent in team.drivers.values()}
+    each |= {getattr(team.shield, "knows", MODEL)} if team.shield is not None else set()
     return " + ".join(sorted(each, key=lambda word: (*KNOWLEDGE, word).index(word)))
 
 

@@ -173,9 +173,11 @@ def predicted_harm(game: Game, alert: State, last: State) -> Given:
 
 
 def replaced(game: Game, alert: State, last: State) -> Given:
-    """Number of actions that the shield replaced, and whether it replaced none."""
-    number = getattr(last.memories.get("shield"), "replaced", None)
-    return None if number is None else {"actions": number, "none": number == 0}
+    """Number of actions that the shield replaced; whether it replaced none, or let the policy drive (Algorithm 1)."""
+    memory = last.memories.get("shield")
+    if hasattr(memory, "chosen"):
+        return {"none": memory.chosen}
+    return {"actions": memory.replaced, "none": memory.replaced == 0} if hasattr(memory, "replaced") else None
 
 
 def _built_in(of: Callable[[Game, State, State], Given], unit: str, *shown: Statistic) -> Measure:

@@ -152,7 +152,7 @@ class SummaryTable(list[SummaryRow]):
         return "\n\n".join([worlds, *self.notes()])
 
 
-IDENTITY = ("worlds_sha256", "scenario_sha256", "physics_sha256", "versions")
+IDENTITY = ("worlds_sha256", "scenario_sha256", "physics_digest", "versions")
 _PERCENT: dict[str, Any] = {"digits": 1, "scale": 100.0, "unit": " %"}
 _FORMATS = {"rate": _PERCENT, "decrease": _PERCENT}
 

@@ -12,12 +12,18 @@ from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.motion.layout import Floats
 
 
+class Indices(Discrete):
+    """Indices of actions that are evenly spaced from -1 to 1; a model that stores its spaces shows it."""
+
+    evenly_spaced = True
+
+
 def action_space(count: int | None) -> Any:
     """Return the space of one learner: a box [1] from -1 (full braking) to 1 (full driving), or ``count`` indices."""
     if count is None:
         return Box(-1.0, 1.0, (1,), np.float32)
     check_whole_number("actions", count, 2)
-    return Discrete(int(count))
+    return Indices(int(count))
 
 
 def checked_actions(actions: ArrayLike, shape: tuple[int, ...], whose: str, count: int | None = None) -> Floats:

@@ -22,7 +22,8 @@ from ethbrake_marl.faces.actions import action_space, checked_actions
 from ethbrake_marl.faces.rendering import make_renderer, render_metadata
 from ethbrake_marl.faces.spaces import FeatureBox, reward_box
 from ethbrake_marl.faces.stream import Stream
-from ethbrake_marl.worlds.game import AnyScenario, game_of
+from ethbrake_marl.names import open_game
+from ethbrake_marl.worlds.game import AnyScenario
 from ethbrake_marl.worlds.scenario import Scenario
 
 
@@ -33,7 +34,7 @@ class OneLearner:
     _spec: EnvSpec | None = None
 
     def _open(self, scenario: AnyScenario, learners: Any, reward: Any, observation: Any, vector: Any) -> None:
-        self.scenario, self.game = game_of(scenario, learners, reward, observation, vector)
+        self.scenario, self.game = open_game(scenario, learners, reward, observation, vector)
         check_one_learner(
             self.scenario.name,
             [self.scenario.vehicle_names[i - 1] for i in self.game.rules.learners],
@@ -109,7 +110,7 @@ class EthBrakeEnv(OneLearner, gymnasium.Env[NDArray[Any], NDArray[Any]]):
         self,
         scenario: AnyScenario = "paper-random",
         render_mode: str | None = None,
-        learners: Sequence[str | int] | None = None,
+        learners: Sequence[str] | None = None,
         reward: Any = "harm",
         observation: Any = None,
         actions: int | None = None,

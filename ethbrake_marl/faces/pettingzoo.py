@@ -22,7 +22,8 @@ from ethbrake_marl.faces.rendering import make_renderer, render_metadata
 from ethbrake_marl.faces.spaces import FeatureBox, reward_box
 from ethbrake_marl.faces.stream import Stream
 from ethbrake_marl.motion.layout import Floats
-from ethbrake_marl.worlds.game import AnyScenario, game_of
+from ethbrake_marl.names import open_game
+from ethbrake_marl.worlds.game import AnyScenario
 
 Infos = dict[str, dict[str, Any]]
 
@@ -43,7 +44,7 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, Any]):  # type: ignore[
     Args:
         scenario: a shipped name, the path of a YAML file, the content of one, or a ``Scenario``.
         render_mode: a mode of ``metadata["render_modes"]``; None: no pictures.
-        learners: vehicles that learn, by name or number (0 = front); None: the scenario's.
+        learners: names of the vehicles that learn; None: the scenario's.
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
         observation: features that every vehicle observes, or vehicle -> features; None: the scenario's.
         agents: which vehicles are agents: ``all``, or the ``learners`` (for libraries that train every agent).
@@ -68,7 +69,7 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, Any]):  # type: ignore[
         self,
         scenario: AnyScenario = "paper-random",
         render_mode: str | None = None,
-        learners: Sequence[str | int] | None = None,
+        learners: Sequence[str] | None = None,
         reward: Any = "harm",
         observation: Any = None,
         agents: str = "all",
@@ -79,7 +80,7 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, Any]):  # type: ignore[
         if max_cycles is not None:
             check_whole_number("max_cycles", max_cycles, 1)
         self.max_cycles, self.actions, self.render_mode = max_cycles, actions, render_mode
-        self.scenario, self.game = game_of(scenario, learners, reward, observation, reward_vector)
+        self.scenario, self.game = open_game(scenario, learners, reward, observation, reward_vector)
         self.stream, self.renderer = Stream(self.scenario, self.game), make_renderer(self, render_mode)
         names, learning = self.scenario.vehicle_names, self.game.rules.learners
         if agents not in ("all", "learners"):

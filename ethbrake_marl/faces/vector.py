@@ -53,7 +53,7 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         num_envs: int = 1,
         scenario: AnyScenario = "paper-random",
         render_mode: str | None = None,
-        learners: Sequence[str | int] | None = None,
+        learners: Sequence[str] | None = None,
         reward: Any = "harm",
         observation: Any = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,

@@ -82,6 +82,8 @@ def _run(content: bytes, path: Path, sha256: str, what: str) -> ModuleType:
         raise InvalidInput(f"{what}: loads itself")
     _BEING_RUN.add(path)
     sys.modules[module.__name__] = module
+    if str(path.parent) not in sys.path:
+        sys.path.append(str(path.parent))  # the file may import its neighbours, as where Python itself runs it
     try:
         exec(compile(content, str(path), "exec", dont_inherit=True), module.__dict__)
     except (Exception, SystemExit) as error:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,9 @@ from ethbrake_marl.episode.state import NUMBER, State
 from ethbrake_marl.motion.layout import RESTITUTION, Floats
 from ethbrake_marl.worlds.rules import CAR_ROWS, RECORDING, RULES, USUAL
 from ethbrake_marl.worlds.sampling import Drawn, Texts
+
+if TYPE_CHECKING:
+    from ethbrake_marl.worlds.scenario import Scenario
 
 
 def columns_of(drawn: Drawn) -> dict[str, NDArray[np.generic]]:
@@ -40,6 +43,13 @@ def quantities_of(worlds: State, friction: Floats | float = np.nan) -> dict[str,
         if key in USUAL or there.get(key)
         for i, column in enumerate(values[key].T)
     }
+
+
+def fixed_columns(scenario: Scenario) -> set[str]:
+    """Return the columns of ``quantities_of`` that are the same in every world; gaps and speeds never are."""
+    keys = [key for key in CAR_ROWS if key in USUAL or scenario.declares(key)] + ["restitution"]
+    ends = {RULES[key].column_of(i): each for key in keys for i, each in enumerate(scenario.bounds(key))}
+    return {name for name, (low, high) in ends.items() if low == high}
 
 
 def kinds_of(drawn: Drawn) -> dict[str, Texts]:

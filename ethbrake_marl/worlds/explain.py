@@ -107,7 +107,8 @@ def new_scenario_text(name: str, based_on: str = "paper-random", *, rows_file: s
     }
     values["source"] = f"Values of {base.name}, to be changed. Its own source: {base.source}"
     if base.table is not None and rows_file:
-        values["table"] = {**values["table"], "file": rows_file}
+        weights = {"weights": "weight"} if base.table.weights is not None else {}
+        values["table"] = {"file": rows_file, "columns": list(base.table.columns), **weights}
     text = _HEAD.format(name=name, based_on=base.name) + schema_lines("scenario", "scenario schema")
     for key in listed_keys():
         example = RULES[key.name].example if key.name in RULES else _EXAMPLES.get(key.name, key.default)

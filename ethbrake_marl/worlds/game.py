@@ -40,7 +40,7 @@ class Pool:
 
 def game_of(
     scenario: AnyScenario,
-    learners: Iterable[str | int] | None = None,
+    learners: Iterable[str] | None = None,
     reward: Reward = "harm",
     observation: Any = None,
     reward_vector: Any = None,
@@ -50,7 +50,7 @@ def game_of(
 
     Args:
         scenario: a shipped name, the path of a YAML file, the content of one, or a ``Scenario``.
-        learners: vehicles that learn, by name or number (0 = front); None: the scenario's.
+        learners: names of the vehicles that learn; None: the scenario's.
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
         observation: features of all vehicles, or vehicle -> features; None: the scenario's.
         reward_vector: components of a vector reward (``episode.terms``).

@@ -340,15 +340,14 @@ class Scenario(Part):
         """
         return Scenario(**changed_content(self.declared(), changes))
 
-    def with_learners(self, learners: Iterable[str | int]) -> Scenario:
-        """Return the scenario with exactly these learners, by name (``vehicle_2``) or number (0 = front).
+    def with_learners(self, learners: Iterable[str]) -> Scenario:
+        """Return the scenario with exactly these learners, such as ``["vehicle_2"]``.
 
         A learner that is not listed brakes fully. Raises ``InvalidInput`` for an unknown vehicle, or one listed twice.
         """
         if isinstance(learners, str) or not isinstance(learners, Iterable):
             raise InvalidInput(f"learners = {learners!r}: must be a list of vehicles, for instance ['vehicle_2']")
-        numbered: dict[Any, str] = dict(enumerate(self.vehicle_names))
-        chosen = [str(each if isinstance(each, bool) else numbered.get(each, each)) for each in learners]
+        chosen = list(learners)
         if unknown := [name for name in chosen if name not in self.vehicle_names]:
             raise unknown_name("vehicle", unknown[0], self.vehicle_names)
         if twice := {name for name in chosen if chosen.count(name) > 1}:

@@ -102,6 +102,14 @@ class Table(Part):
                 if not good:
                     refuse(("rows", k, c), cell, right)
 
+    def to_csv(self) -> str:
+        """Return the rows as the text of a CSV file; its column ``weight`` has their weights."""
+        weighed = isinstance(self.weights, tuple)
+        rows = [[*row, self.weights[k]] if weighed else row for k, row in enumerate(self.rows or ())]  # type: ignore[index]
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([[*self.columns, *(["weight"] if weighed else [])], *rows])
+        return text.getvalue()
+
     def column_values(self) -> dict[str, TableColumn]:
         """Return the columns by name, ``recording`` among them."""
         rows = self.rows or ()

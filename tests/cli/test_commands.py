@@ -141,7 +141,7 @@ def test_command__ctrl_c_is_one_line_and_the_status_of_an_interruption(capsys) -
 
 AGENT = """
 import numpy as np
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 
 
 def make_gentle(argument: str, settings):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.scenario.catalogue import load_scenario, shipped_folder
 from ethbrake_marl.first_edition.scenario.tables import read_worlds
 from ethbrake_marl.first_edition.training.recipe import TrainingRecipe, load_recipe
@@ -19,7 +19,7 @@ TUTORIAL = (ROOT / "docs" / "first-ten-minutes.md").read_text("utf-8")
 
 SCRIPTS = """
 import numpy as np
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 
 
 class Own:

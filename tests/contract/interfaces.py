@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.envs.gymnasium import EthBrakeEnv
 from ethbrake_marl.first_edition.envs.pettingzoo import EthBrakeParallelEnv, InTurns
 from ethbrake_marl.first_edition.envs.vector import EthBrakeVectorEnv

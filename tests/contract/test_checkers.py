@@ -14,7 +14,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.env_util import make_vec_env
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.envs.gymnasium import EthBrakeEnv
 from ethbrake_marl.first_edition.envs.pettingzoo import env, parallel_env
 from ethbrake_marl.first_edition.envs.rendering import HEIGHT, WIDTH

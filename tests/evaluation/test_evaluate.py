@@ -189,7 +189,7 @@ def test_identity__changes_with_worlds_and_scenario_alone() -> None:
         evaluated("paper-random", n, [agent]).about for n, agent in ((5, FULL_BRAKE), (5, GENTLE), (6, GENTLE))
     )
     assert one == again and one["worlds_sha256"] != other["worlds_sha256"]
-    assert one["scenario_sha256"] == other["scenario_sha256"] and len(one["physics_sha256"]) == 64
+    assert one["scenario_sha256"] == other["scenario_sha256"] and len(one["physics_digest"]) == 16
     assert {"python", "ethbrake-marl", "numba", "numpy"} <= one["versions"].keys()
     slow = game_of("paper-random")[0].replace(horizon_s=5.0)
     assert evaluated(slow.declared(), 5).about["scenario_sha256"] != one["scenario_sha256"]

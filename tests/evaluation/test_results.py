@@ -212,12 +212,12 @@ def test_comparison__without_rows_uses_the_stored_errors(n: int, tmp_path: Path)
 
 def test_comparison__notes_other_settings_versions_and_physics(tmp_path: Path) -> None:
     result = evaluated(PAIR, 4)
-    about = {**result.about, "physics_sha256": "0" * 64, "versions": {**result.about["versions"], "numpy": "1.0"}}
+    about = {**result.about, "physics_digest": "0" * 64, "versions": {**result.about["versions"], "numpy": "1.0"}}
     other = Result(result.columns, result.worlds, result.measures, result.knows, result.policies, about)
     one = written(tmp_path / "one", result, more={"agent_settings": {"harm_count": "first"}})
     two = written(tmp_path / "two", other, more={"agent_settings": {"harm_count": "total"}})
     notes = compare_results(read_result(one), read_result(two)).notes()
-    assert "Note: physics_sha256 differs." in notes
+    assert "Note: physics_digest differs." in notes
     assert "Note: harm_count: first in the first result, total in the second." in notes
     assert any(note.startswith("Note: numpy: ") and note.endswith("1.0 in the second.") for note in notes)
 

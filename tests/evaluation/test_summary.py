@@ -78,7 +78,7 @@ def test_json__has_estimates_with_interval_and_error_and_the_identity(result: Re
     ]  # fmt: skip
     assert row["kind"] == "evaluate" and row["agent"] == "constant:4.0" and row["knows"] == "own sensors"
     assert row["predicted_harm"] is None and row["predicted_harm_error"] is None
-    assert {"worlds_sha256", "scenario_sha256", "physics_sha256", "versions"} <= row.keys()
+    assert {"worlds_sha256", "scenario_sha256", "physics_digest", "versions"} <= row.keys()
     parameters = row["parameters"]
     assert (parameters["scenario"], parameters["seed"], parameters["count"]) == ("paper-random", 7, 100)
     assert parameters["restitution"] == 0.1 and parameters["mass_t"] == [4.5, 5.5, 5.9]

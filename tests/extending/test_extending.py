@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.first_edition.evaluation.statistics import mean
@@ -30,7 +30,7 @@ RURAL = {"preset": "nominal", "lost": 0.3, "message_period_s": 0.2}
 LISTED = ["own", "front_1", "rear_1.known", "urgency", "rear_1.load"]
 MINE = f'''
 import numpy as np
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 
 
 def urgency(worlds, vehicle):

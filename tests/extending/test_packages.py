@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName
 from ethbrake_marl.registry import versions_used
@@ -19,7 +19,7 @@ HILLS = '''
 import numpy as np
 import typer
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.training.recipes import PpoRecipe
 
 

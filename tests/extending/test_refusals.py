@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import AlreadyExists, UnknownName
 from ethbrake_marl.first_edition.game.features import FEATURES
 from ethbrake_marl.first_edition.game.rewards import reward_params

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.engine.engine import Engine
 from ethbrake_marl.first_edition.evaluation.own_measures import load_measures
 from tests.contract.interfaces import CRASH
@@ -178,7 +178,7 @@ def test_built_in__in_parts_and_behind_a_shield_and_with_an_objective() -> None:
 
 MINE = '''
 import numpy as np
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 
 
 def hardest(episodes):

@@ -321,8 +321,8 @@ CALLS: dict[str, Callable[[], object]] = {
     "scenario 'paper-random': mass_t[0] (vehicle_1) = -1: must be finite": lambda: PAPER.replace(mass_t=[-1, 2, 3]),
     "scenario 'paper-random': objective = frontfirst: unknown objective": lambda: PAPER.replace(objective="frontfirst"),
     "objective 'maximin:3': maximin takes no argument": lambda: PAPER.replace(objective="maximin:3"),
-    "unknown vehicle '3'; known: vehicle_1, vehicle_2, vehicle_3": lambda: PAPER.with_learners([3]),
-    "learners: vehicle_2 is listed twice": lambda: PAPER.with_learners(["vehicle_2", 1]),
+    "unknown vehicle 3; known: vehicle_1, vehicle_2, vehicle_3": lambda: PAPER.with_learners([3]),
+    "learners: vehicle_2 is listed twice": lambda: PAPER.with_learners(["vehicle_2", "vehicle_2"]),
     "learners = 'vehicle_2': must be a list of vehicles": lambda: PAPER.with_learners("vehicle_2"),
     "scenario 'paper-random': does not declare gaps_m; if gaps_m follows from other quantities": lambda: PAPER.replace(
         time_gaps_s=1

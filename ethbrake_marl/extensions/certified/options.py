@@ -42,7 +42,7 @@ class RobustOptions(ShieldOptions):
 
     Raises ``InvalidInput`` and ``UnknownName`` as ``eb.ShieldOptions`` does.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> eb.ShieldOptions(uncertainty="gaps_m=0.5").mode
     'robust'
 

@@ -136,7 +136,7 @@ def find_equilibria(
     equilibrium of open-loop profiles; it is only approximate because a search tries only ``budget`` profiles. A world
     may have further equilibria. The result for a world does not depend on the other worlds or on ``threads``.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> from ethbrake_marl.extensions.cooperation import compare_starts, find_equilibria
     >>> level = eb.load_scenario("cooperation-3-pair")
     >>> ends = find_equilibria(level, level.sample(5, seed=7).worlds, "own", budget=300)

@@ -118,7 +118,7 @@ def search_front(
     learners, if ``weights`` is not a table of numbers with a column for each vehicle, or if a row of it cannot be the
     scenario's ``harm_weight``.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> from ethbrake_marl.extensions.fronts.front import search_front
     >>> scenario = eb.load_scenario("paper-random")
     >>> front = search_front(scenario, scenario.sample(3, 7).worlds, [[1, 1, 1], [1, 0, 0]], budget=300)

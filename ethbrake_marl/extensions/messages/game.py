@@ -60,7 +60,7 @@ class GameWithMessages(Game):
             return state
         return _remembering(state, begun(alert, state.time_s, self.rules.time_step_s))
 
-    def follow(self, state: State, actions: Floats, *, donate: bool = False) -> tuple[State, Step]:
+    def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
         """Return the state after one step, and what the step did. The memory of ``state`` is not reused."""
         after, step = super().follow(state, actions)
         return believed_after(state, after), step

@@ -36,7 +36,7 @@ class Searched(AgentAround):
         candidates: number of command sequences that the search simulates in each world.
         harm_count: harm count to minimise, ``first`` or ``total``.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> scenario = eb.load_scenario("paper-random")
     >>> searched = eb.make_agent("constant:5+search", scenario=scenario)
     >>> outcome = eb.evaluate(scenario.sample(2, seed=7), {"searched": searched}, scenario=scenario).outcome("searched")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-import ethbrake_marl as eb
+from ethbrake_marl import __version__
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,5 +45,5 @@ def this_machine() -> Machine:
         platform.python_version(),
         version("numpy"),
         version("numba"),
-        eb.__version__,
+        __version__,
     )

@@ -249,7 +249,7 @@ def policy_agent(
     Raises ``InvalidInput`` if ``policy`` is of another kind, if it was trained with another number of features than the
     observation has, or if wrappers of its training environment may have changed observations or actions.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> agent = eb.policy_agent(lambda observation: -observation[:, :1].clip(0, 1), name="mine")
     >>> scenario = eb.load_scenario("paper-random")
     >>> eb.evaluate(scenario.sample(5, 7), {"mine": agent}, scenario=scenario).worlds.n

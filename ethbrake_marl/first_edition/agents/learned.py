@@ -35,7 +35,7 @@ class LearnedAgent(ByPolicy):
 
     ``name`` is the name of the agent in tables and error messages.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> eb.LearnedAgent(eb.load_shipped("ppo"), name="mine").name
     'mine'
 

@@ -59,7 +59,7 @@ def make_agent(
     Raises ``UnknownName`` for an unknown name, with a similar name as a suggestion. Raises ``InvalidInput`` for an
     invalid argument, harm count or horizon, or if the agent needs a scenario but no scenario is passed.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> eb.make_agent("ppo+step", scenario="paper-random").name
     'ppo+step'
 

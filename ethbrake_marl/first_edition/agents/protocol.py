@@ -76,7 +76,7 @@ class Agent(Script, Protocol):
     The attribute ``knows`` may state the agent's sources of knowledge (``Source``). For an agent without this
     attribute, tables show "not stated". An agent without a memory has one method, ``act(worlds, vehicle)``:
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> class HalfBrake:
     ...     name = "half_brake"
     ...     def act(self, worlds, vehicle):
@@ -258,7 +258,7 @@ class Team:
 
     Raises ``InvalidInput`` for an invalid agent or index.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> team = eb.Team({1: eb.make_agent("full_brake"), 2: eb.make_agent("coast")}, "mixed")
     >>> sorted(team.drivers)
     [1, 2]

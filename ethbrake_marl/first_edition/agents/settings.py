@@ -18,7 +18,7 @@ HORIZON_S = 8.0  # horizon of agents that look ahead, if there is no scenario
 class AgentSettings:
     """Settings for a function that makes an agent, in addition to the argument in the agent's specification.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> eb.AgentSettings("constant:3.5", scenario=eb.load_scenario("paper-random")).needed_scenario().name
     'paper-random'
 

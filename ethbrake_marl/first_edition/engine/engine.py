@@ -171,7 +171,7 @@ class Engine:
         reward_vector: components of a vector reward, which each step returns in addition to the reward
             (``game.reward_vector``); None: no vector reward.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> engine = eb.make_engine("paper-random", 4, seed=7)
     >>> engine.n, engine.learners, engine.worlds.time_s
     (4, (1,), array([0.5, 0.5, 0.5, 0.5]))

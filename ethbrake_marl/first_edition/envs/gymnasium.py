@@ -108,7 +108,7 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
 
     Raises ``InvalidInput`` if the number of learners is not one.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> env = eb.EthBrakeEnv("paper-random")
     >>> observation, info = env.reset(seed=7)
     >>> observation.shape, info["time_s"]

@@ -83,7 +83,7 @@ def make_engine(
         reward_vector: components of a vector reward, which the result of a step then contains as ``vector``, in
             addition to ``reward``. None: there is no vector reward.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> import numpy as np
     >>> engine = eb.make_engine("cooperation-3-pair", 4, seed=7)
     >>> engine.observe_all().shape, engine.step(np.full((4, 2), -1.0)).reward.shape

@@ -155,7 +155,7 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
             that each vehicle bears in the step. A list of components: a reward is an array with these components (see
             docs/environments.md).
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> env = eb.parallel_env(scenario="paper-random")
     >>> observations, infos = env.reset(seed=7)
     >>> while env.agents:
@@ -338,7 +338,7 @@ def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[s
 
     ``scenario`` and ``settings`` have the same meaning as in ``parallel_env``.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> env = eb.raw_env("paper-random")
     >>> env.reset(seed=7)
     >>> env.agent_selection

@@ -74,7 +74,7 @@ def make_sb3_vec_env(
         actions: None: an action is a number in [-1, 1]. A whole number K >= 2: actions are discrete; the indices
             0 to K - 1 stand for K evenly spaced numbers from -1 (full braking capacity) to 1 (full driving capacity).
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> eb.make_sb3_vec_env("paper-random", 4, seed=7).reset().shape
     (4, 27)
 
@@ -110,7 +110,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         render_mode: ``rgb_array`` or None.
         actions: number of discrete actions; None: an action is a number in [-1, 1].
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> import numpy as np
     >>> env = eb.make_sb3_vec_env("paper-random", 4, learners=["vehicle_2", "vehicle_3"])
     >>> env.num_envs

@@ -47,7 +47,7 @@ class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArra
     Raises ``InvalidInput`` if ``env`` is neither an ``EthBrakeEnv`` nor a wrapper around one, or if ``env`` already
     contains a ``CostEnv``.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> env = eb.CostEnv(eb.EthBrakeEnv("paper-random"))
     >>> observation, info = env.reset(seed=7)
     >>> observation, reward, cost, terminated, truncated, info = env.step(env.action_space.sample())
@@ -112,7 +112,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         reward_vector: None: rewards are numbers, [n]. ``vehicles``: rewards are [n, N] and contain minus the harm that
             each vehicle bears in the step. A list of K components: rewards are [n, K] (see docs/environments.md).
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> import numpy as np
     >>> env = eb.EthBrakeVectorEnv(num_envs=4, scenario="paper-random")
     >>> observations, infos = env.reset(seed=7)

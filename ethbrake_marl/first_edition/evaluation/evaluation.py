@@ -44,7 +44,7 @@ class Evaluation:
 
     In ``worlds``, in ``index`` and in every array of the outcomes, entry k belongs to the same world.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> scenario = eb.load_scenario("paper-random")
     >>> agents = {name: eb.make_agent(name) for name in ("full_brake", "coast")}
     >>> evaluation = eb.evaluate(scenario.sample(3, seed=7), agents, scenario=scenario)

@@ -24,7 +24,7 @@ def summarise_by(evaluation: Evaluation, by: str, *, baseline: str = BASELINE) -
 
     Raises ``InvalidInput`` if the worlds have no groups, and ``UnknownName`` if ``by`` is unknown.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> delays = eb.load_scenario("mixture-delays")
     >>> agents = {"full_brake": eb.make_agent("full_brake")}
     >>> tables = eb.summarise_by(eb.evaluate(delays.sample(30, seed=7), agents, scenario=delays), "scenario")

@@ -31,7 +31,7 @@ _COLUMNS = ("at_rest", "predicted_harm", "chosen_policy", "shoved_m", "sampled_h
 class Outcome:
     """Results of one agent in each of n worlds: harm, final state and measures.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> scenario = eb.load_scenario("paper-random")
     >>> agents = {"full_brake": eb.make_agent("full_brake")}
     >>> outcome = eb.evaluate(scenario.sample(3, seed=7), agents, scenario=scenario).outcome("full_brake")

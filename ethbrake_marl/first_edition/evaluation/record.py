@@ -31,7 +31,7 @@ SAMPLE_S = 0.02  # default time between two samples (s)
 class EpisodeRecord:
     """Motion of one world from the alert to the end of its episode, at k times, the first of which is the alert.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> scenario = eb.load_scenario("paper-random")
     >>> world = scenario.sample(1, seed=7).worlds
     >>> record = eb.record_episode(world, eb.make_agent("full_brake"), scenario=scenario)

@@ -59,7 +59,7 @@ class SummaryTable(list[SummaryRow]):
         rows: one row per agent.
         beside: rows from another source, such as the paper, printed below the rows of the agents.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> scenario = eb.load_scenario("paper-random")
     >>> agents = {"full_brake": eb.make_agent("full_brake")}
     >>> rows = eb.summarise(eb.evaluate(scenario.sample(3, seed=7), agents, scenario=scenario))

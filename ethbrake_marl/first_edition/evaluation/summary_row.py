@@ -22,7 +22,7 @@ class SummaryRow:
     ``row[name]`` is the estimate of a measure, by the measure's name in JSON, such as ``row["harm_decrease_total"]``.
     The estimate is None if the measure is not defined in the evaluated worlds.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> scenario = eb.load_scenario("paper-random")
     >>> agents = {name: eb.make_agent(name) for name in ("full_brake", "coast")}
     >>> rows = eb.summarise(eb.evaluate(scenario.sample(3, seed=7), agents, scenario=scenario))

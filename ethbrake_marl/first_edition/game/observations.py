@@ -57,7 +57,7 @@ class ObservationSpec:
     forecast impacts. If ``chosen`` is not empty, it lists exactly the observed features, in order; to make such a
     specification, use ``choose_observation``.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> spec = eb.ObservationSpec(front=2, rear=0)
     >>> spec.size, spec.features[7].name
     (27, 'front_1.known')

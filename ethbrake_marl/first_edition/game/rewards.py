@@ -79,7 +79,7 @@ class RewardParams(FileModel):
         distance_slope_per_m: steepness k_d of the second part of the risk term, 1/m.
         terms: name of a registered measure -> weight; use a negative weight for a measure that should become small.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> env = eb.EthBrakeEnv("paper-random", reward=eb.RewardParams(harm=0.05, terminal=1.0))
 
     """

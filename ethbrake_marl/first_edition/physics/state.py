@@ -185,7 +185,7 @@ _WITHOUT_NEWS = _OF_VEHICLES[:-2]
 class Worlds:
     """State of ``n`` worlds, each at its own time ``time_s``.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> worlds = eb.make_worlds(
     ...     [7.0, 7.0], [20.0, 18.0, 20.0], braking_capacity_mps2=[6.0, 7.0, 6.0], driving_capacity_mps2=3.0,
     ...     latency_s=[0.0, 0.5, 0.8], mass_t=[4.5, 5.5, 5.9], restitution=0.1,
@@ -268,7 +268,7 @@ class Worlds:
     ) -> Worlds:
         """Return these worlds with a new state at a later time, for example a state from another simulator.
 
-        >>> import ethbrake_marl as eb
+        >>> import ethbrake_marl.first_edition as eb
         >>> alert = eb.load_scenario("paper-random").sample(2, seed=7).worlds
         >>> alert.running(0.7, [4.0, 6.0], [18.0, 17.0, 19.0], command_mps2=[-5.0, -2.0, 0.0]).time_s
         array([0.7, 0.7])

@@ -39,7 +39,7 @@ WEIGHTS = "weights.safetensors"
 class Policy:
     """A policy in memory. Calling ``policy(observation)`` returns the deterministic action.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> import numpy as np
     >>> policy = eb.load_shipped("ppo")
     >>> policy.manifest.algorithm, policy.observation.size

@@ -39,7 +39,7 @@ def clusters_of(kinds: Mapping[str, _Texts], index: Ints) -> _Texts | None:
 class Sample:
     """Worlds at the alert (time 0), each with its number in the list of worlds.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> sample = eb.load_scenario("paper-random").sample(2, seed=7)
     >>> sample.index, sample.worlds.gaps_m.round(2)
     (array([0, 1]), array([[6.62, 8.49], [5.33, 7.79]]))

@@ -111,7 +111,7 @@ class Scenario(ScenarioFields):
     one entry per vehicle, or per pair for gaps. ``Scenario(...)``, ``load_scenario`` and ``replace`` raise
     ``InvalidInput`` for an invalid value; the message names key and value, and says what would be valid.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> scenario = eb.load_scenario("paper-random").replace(mass_t=[4.5, 5.5, 40.0])
     >>> scenario.bounds("mass_t")
     ((4.5, 4.5), (5.5, 5.5), (40.0, 40.0))

@@ -51,7 +51,7 @@ from ethbrake_marl.first_edition.shields.rollouts import Proposer, proposed_acti
 class ShieldMode(IntEnum):
     """Mode of a shield. The infos report the mode's number as ``shield_mode``. Modes of extensions have other numbers.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> eb.ShieldMode(1).name
     'STEP'
 

@@ -36,7 +36,7 @@ class ShieldedDriver(ByPolicy):
     Raises ``InvalidInput`` if ``policy`` is not an agent or team, for invalid options, and if a team does not drive
     every learner.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> eb.make_agent("coast+step", scenario=eb.load_scenario("paper-random")).on([1]).name
     'coast+step'
 

@@ -51,7 +51,7 @@ class ShieldOptions:
 
     Raises ``InvalidInput`` for an invalid setting, and ``UnknownName`` for an unknown mode.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> eb.ShieldOptions(allowance=1.0).mode
     'step'
 

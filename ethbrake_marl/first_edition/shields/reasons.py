@@ -11,7 +11,7 @@ class ShieldReason(IntEnum):
     *Plan* means the shield's plan: one action for each decision up to the horizon. *Budget* means the largest harm that
     the shield accepts for the whole episode.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> eb.ShieldReason(3).name, eb.ShieldReason.NO_CERTIFICATE.text
     ('NO_CERTIFICATE', 'no certificate')
 

@@ -33,7 +33,7 @@ class ShieldedVecEnv(SeededInside, VecEnvWrapper):
     Raises ``InvalidInput`` if ``venv`` is another kind of environment, and if several vehicles learn and the mode is
     not ``step``.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> import numpy as np
     >>> env = eb.ShieldedVecEnv(eb.make_sb3_vec_env("paper-random", 4, seed=7))
     >>> observations = env.reset()

@@ -56,7 +56,7 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
 
     Raises ``InvalidInput`` for invalid arguments.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> env = eb.HybridShield(eb.parallel_env(scenario="paper-random"))
     >>> observations, infos = env.reset(seed=7)
     >>> infos = env.step({"vehicle_2": [1.0]})[4]
@@ -141,7 +141,7 @@ class ShieldedEnv(
 
     Raises ``InvalidInput`` if ``env`` is another kind of environment, and for invalid arguments.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> env = eb.ShieldedEnv(eb.EthBrakeEnv("paper-random"))
     >>> observation, info = env.reset(seed=7)
     >>> info = env.step([1.0])[4]
@@ -199,7 +199,7 @@ class ShieldedVectorEnv(_Closing, VectorWrapper):
 
     Raises ``InvalidInput`` if ``env`` is another kind of environment, and for invalid arguments.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> import numpy as np
     >>> env = eb.ShieldedVectorEnv(eb.EthBrakeVectorEnv(num_envs=4, scenario="paper-random"))
     >>> observations, infos = env.reset(seed=7)
@@ -259,7 +259,7 @@ def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, *
     ``ShieldedVectorEnv`` or a ``ShieldedVecEnv``. If ``env`` is an agent or a team, returns the same agent or team with
     a shield. Raises ``InvalidInput`` if ``env`` is of any other type, and for invalid arguments.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> env = eb.shield(eb.parallel_env(scenario="paper-random"))
     >>> observations, infos = env.reset(seed=7)
     >>> env.step({"vehicle_2": [1.0]})[4]["vehicle_2"]["shield_intervened"]

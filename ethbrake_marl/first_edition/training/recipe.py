@@ -108,7 +108,7 @@ class TrainingRecipe(FileModel):
     class, with further keys. The text in ``Field(description=...)`` explains a key in new recipe files, in the JSON
     Schema and in the documentation.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> recipe = eb.load_recipe("ppo").replace(seed=3, total_steps=100_000)
     >>> recipe.algorithm, recipe.seed, recipe.total_steps
     ('ppo', 3, 100000)

@@ -41,7 +41,7 @@ class TrainResult:
     ``trained`` is the best policy: the policy with the least harm on the fixed list of worlds (or the smallest mean of
     the learners' objectives, if they differ from the harm of the line), or the last policy if nothing was measured.
 
-    >>> import ethbrake_marl as eb
+    >>> import ethbrake_marl.first_edition as eb
     >>> short = {"n_envs": 8, "n_steps": 16, "batch_size": 64, "n_epochs": 1}
     >>> recipe = eb.load_recipe("ppo").replace(**short, network={"policy": [8], "value": [8]})
     >>> result = eb.train(recipe, "paper-random", "runs/example", steps=128, measure=None)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from tests.docs.site import load
 from tests.first_edition.learning.tiny import harm_beside_full_braking
 

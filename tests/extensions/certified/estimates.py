@@ -5,7 +5,7 @@ is certified at its first decision. None of the numbers are round: in a world of
 impacts fall on one moment, and the last bit decides which of them is first.
 """
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.agents.driving import drive
 from ethbrake_marl.first_edition.physics.state import Floats
 from ethbrake_marl.first_edition.shields.drivers import ShieldedDriver

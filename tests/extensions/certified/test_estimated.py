@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.agents.driving import drive
 from ethbrake_marl.first_edition.agents.making import make_agent
 from ethbrake_marl.first_edition.physics.state import Floats

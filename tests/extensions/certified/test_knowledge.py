@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.extensions.certified.estimated import Ranges
 from ethbrake_marl.extensions.certified.estimating_agents import Odometer
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import UnknownName
 from ethbrake_marl.extensions.certified.options import checked_uncertainty
 from ethbrake_marl.extensions.certified.robust_step import RobustShield

@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.extensions.cooperation import (
     Equilibrium,

@@ -3,7 +3,7 @@
 import shutil
 from pathlib import Path
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.extensions.cooperation.levels import plan_ablation
 from ethbrake_marl.first_edition.training.recipe import TrainingRecipe
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.extensions.cooperation.comparison import compare
 from ethbrake_marl.extensions.cooperation.joint_optimum import Harms, LevelOptimum, Measured, best_known
 from ethbrake_marl.extensions.cooperation.levels import Level, Plan, common_worlds, plan_ablation

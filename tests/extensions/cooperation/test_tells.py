@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.cooperation.levels import common_worlds, plan_ablation, read_levels
 from ethbrake_marl.first_edition.physics.messages import USUAL_PIECES

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.extensions import datasets
 from ethbrake_marl.extensions.datasets import to_parquet

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.extensions.field.controllers import LAWS, Parameters, Seen, fuzzy
 from ethbrake_marl.first_edition.agents.driving import record_commands

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.fronts.front import Front, amounts_of, least_largest, search_front
 from ethbrake_marl.extensions.fronts.results import FRONT, front_results, front_sheet, full_braking, hypervolumes

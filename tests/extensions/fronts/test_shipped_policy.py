@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.extensions.fronts.front import amounts_of, search_front
 
 SPEC = "vine-preference"

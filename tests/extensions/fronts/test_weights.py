@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.fronts.front import search_front
 from ethbrake_marl.extensions.fronts.weights import corners, weight_grid

@@ -14,7 +14,7 @@ import pytest
 import torch
 from stable_baselines3.common.logger import Logger
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.extensions.learners.branches import visit
 from ethbrake_marl.extensions.learners.gradient_limit import limit_that_cuts, smallest_offset
 from ethbrake_marl.extensions.learners.mixture_plan import ExpertsPlan

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import UnknownName
 from ethbrake_marl.extensions.learners.start_weights import widened
 from ethbrake_marl.first_edition.training.recipe import load_recipe

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.evaluation.rollout import evaluate
 from ethbrake_marl.first_edition.evaluation.summary import summarise
 from ethbrake_marl.first_edition.training import session as train_module

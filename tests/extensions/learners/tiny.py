@@ -1,6 +1,6 @@
 """Trainings of a second, by algorithms of this extension."""
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 
 TINY_VINE = eb.load_recipe("vine").replace(
     start=None,

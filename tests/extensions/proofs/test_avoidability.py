@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.extensions.proofs.avoidability import avoidability
 from tests.fixtures.lines import line, opening, paper_line, random_profiles, wide_worlds
 from tests.reference.avoidability_lp import avoidable_by_lp

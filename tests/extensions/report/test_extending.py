@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.cli.app import app, run_command
 from tests.extending.test_extending import changed
 

@@ -6,7 +6,7 @@ import pytest
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.extensions.report import deceleration as module
 from ethbrake_marl.extensions.report.deceleration import deceleration_curve, deceleration_figure
 from ethbrake_marl.extensions.report.episode_figure import trajectories

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.extensions.report.film import film, film_scenes
 from ethbrake_marl.first_edition.agents.making import make_agent
 from ethbrake_marl.first_edition.evaluation.record import record_episode

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.extensions.report.learners import learners_sheets
 from ethbrake_marl.first_edition.agents.protocol import Team
 from ethbrake_marl.first_edition.training.experiment import run_experiment

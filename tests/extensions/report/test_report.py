@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import plain_text
 from ethbrake_marl.extensions.report import page as page_module
 from ethbrake_marl.extensions.report.page import Part, Section, read_file

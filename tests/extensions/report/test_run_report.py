@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.extensions.report.experiment import telling_world
 from ethbrake_marl.first_edition.evaluation.lineup import make_lineup
 from tests.cli.test_train import ctrl_c_when, status_of

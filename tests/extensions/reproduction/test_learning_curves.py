@@ -4,7 +4,7 @@ import signal
 
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.extensions.reproduction.learning_curves import LearningCurves
 from ethbrake_marl.first_edition.evaluation.identity import scenario_sha256, worlds_sha256
 from ethbrake_marl.progress import Progress

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS, PaperRow
 from ethbrake_marl.extensions.report.seed_curves import SeedCurve
 from ethbrake_marl.extensions.reproduction import delay_curves, folder as folder_module, hybrid, trainings

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.extensions.search.around import Searched
 from ethbrake_marl.first_edition.agents.protocol import policy_sha256
 from ethbrake_marl.first_edition.agents.spec import AgentSpec, parse_spec

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.extensions.search import refine as refine_module
 from ethbrake_marl.extensions.search.around import Searched

@@ -13,7 +13,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.extensions.search import limits, regret
 from ethbrake_marl.extensions.search.limit_measures import LIMITS
 from ethbrake_marl.extensions.search.limits import IncompleteTable, Unproven, known_limits, prove, unproven_because

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.extensions.search.around import Searched
 from ethbrake_marl.extensions.search.refine import refine
 from ethbrake_marl.extensions.search.templates import best_templates

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
 EVIL = """from pathlib import Path
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 Path("ran").touch()
 def make():
     return eb.make_agent("coast")

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.studies.falsification import APART, Scored, far_apart, search
 from ethbrake_marl.extensions.studies.weakness import Measure, MeasureName

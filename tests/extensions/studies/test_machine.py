@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from tests.docs.site import load
 
 benchmark = load("../studies/speed")

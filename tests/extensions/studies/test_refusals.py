@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.extensions.cooperation.levels import Level, common_worlds, with_scheme
 from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
 from tests.refused import refused

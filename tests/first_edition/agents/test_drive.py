@@ -5,7 +5,7 @@ import pickle
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.first_edition.agents.driving import Episodes, drive, episode_engine, script_agents

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.agents.driving import drive
 from ethbrake_marl.first_edition.agents.e_v2x_bm import coupled
 from ethbrake_marl.first_edition.agents.e_v2x_bm.constants import (

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.agents.driving import script_agents
 from ethbrake_marl.first_edition.agents.making import find_entry
 from ethbrake_marl.first_edition.agents.protocol import Knowledge, Source

@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.agents.spec import parse_spec, split_names, split_specs
 from ethbrake_marl.first_edition.policies.shipped import shipped_policies
 

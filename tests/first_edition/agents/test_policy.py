@@ -7,7 +7,7 @@ import onnxruntime
 import pytest
 import stable_baselines3 as stable
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.agents.driving import drive
 from ethbrake_marl.first_edition.agents.learned import LearnedAgent
 from ethbrake_marl.first_edition.agents.protocol import Source, policy_sha256
@@ -158,7 +158,7 @@ def test_clip__means_the_nearest_and_one_float32_step_beyond_is_always_1(beyond,
 
 FILE = """
 import numpy as np
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 
 def make_agent():
     return eb.policy_agent(lambda seen: np.full((len(seen), 1), -0.5), name="half")

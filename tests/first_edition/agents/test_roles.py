@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.first_edition.agents import registry
 from ethbrake_marl.first_edition.agents.driving import Episodes, script_agents

@@ -15,7 +15,7 @@ from pettingzoo.utils.wrappers import AssertOutOfBoundsWrapper, OrderEnforcingWr
 from stable_baselines3.common import vec_env
 from stable_baselines3.common.monitor import Monitor
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.first_edition.agents.driving import drive
 from ethbrake_marl.first_edition.envs.pettingzoo import InTurns

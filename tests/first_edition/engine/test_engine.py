@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.first_edition.engine.engine import Engine
 from ethbrake_marl.first_edition.envs.making import make_engine

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import InvalidInput, Unfamiliar
 from ethbrake_marl.first_edition.evaluation.identity import worlds_sha256
 from ethbrake_marl.first_edition.game.objectives import scored

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.envs.rendering import BODY_M
 from ethbrake_marl.first_edition.envs.trace import Trace
 from tests.contract.interfaces import CRASH

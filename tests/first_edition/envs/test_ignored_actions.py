@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pettingzoo.utils.conversions import aec_to_parallel
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.first_edition.envs.making import IgnoredAction
 

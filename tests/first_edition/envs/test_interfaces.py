@@ -13,7 +13,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 from pettingzoo.utils.conversions import aec_to_parallel
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl import ethbrake_v1
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.first_edition.engine.stream import Stream

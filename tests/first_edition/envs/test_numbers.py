@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.first_edition.scenario.tables import worlds_from_table
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl import parallel_env
 from ethbrake_marl.errors import UnknownName
 from tests.contract.interfaces import CRASH, FIVE, PAPER

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.first_edition.evaluation.chunks import Lineup, evaluate_held, summarise_tally, tally_list
 from ethbrake_marl.first_edition.evaluation.comparison import compare_results

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl import registry
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.first_edition.evaluation.chunks import Lineup, summarise_tally, tally_list

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.evaluation.evaluation import Evaluation
 from ethbrake_marl.first_edition.evaluation.exploits import Exploits
 from ethbrake_marl.first_edition.evaluation.lineup import make_lineup

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import UnknownName
 from ethbrake_marl.first_edition.evaluation.comparison import compare_results
 from ethbrake_marl.first_edition.evaluation.lineup import make_lineup

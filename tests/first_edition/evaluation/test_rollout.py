@@ -12,7 +12,7 @@ from unittest.mock import Mock, call
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl import registry
 from ethbrake_marl.errors import InvalidInput, PhysicsError, Unfamiliar
 from ethbrake_marl.files import python_file

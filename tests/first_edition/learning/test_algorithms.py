@@ -14,7 +14,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.sac.policies import SACPolicy
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.first_edition.policies.actor import Actor
 from ethbrake_marl.first_edition.policies.bundle import load_policy

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, UnknownName
 from ethbrake_marl.files.store import hold_lock
 from ethbrake_marl.first_edition.training.ppo import Ppo

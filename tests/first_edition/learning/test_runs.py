@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput
 from ethbrake_marl.files.store import new_folder, write_file
 from ethbrake_marl.first_edition.evaluation.rollout import evaluate

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.policies.bundle import load_policy
 from ethbrake_marl.first_edition.training.own_team import save_team
 from ethbrake_marl.first_edition.training.team import load_team

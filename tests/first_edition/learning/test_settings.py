@@ -1,6 +1,6 @@
 """Settings KEY=VALUE of recipes and scenarios, and the YAML that they are written in."""
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.files.overrides import Override
 from ethbrake_marl.files.yaml import flow_text, parse_yaml
 from ethbrake_marl.first_edition.evaluation.trial import load_runnable

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.files.yaml import parse_yaml, read_yaml
 from ethbrake_marl.first_edition.policies.bundle import load_policy
 from ethbrake_marl.first_edition.policies.network_spec import NetworkSpec

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.cli.train import quickest
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.first_edition.training.experiment import run_experiment

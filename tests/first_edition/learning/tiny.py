@@ -11,7 +11,7 @@ import pytest
 from jsonschema import Draft202012Validator
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.training import models
 
 TINY_PPO = eb.load_recipe("ppo").replace(

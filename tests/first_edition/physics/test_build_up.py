@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.physics.advance import advance
 from ethbrake_marl.first_edition.physics.motion import stopping_distances
 from ethbrake_marl.first_edition.physics.state import Floats, Ints, Worlds, make_worlds

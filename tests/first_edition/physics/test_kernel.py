@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.agents.driving import drive, script_agents
 from ethbrake_marl.first_edition.agents.protocol import fixed_commands
 from ethbrake_marl.first_edition.engine.profiles import Profiles, profile_problem

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.agents.making import make_agent
 from ethbrake_marl.first_edition.engine.profiles import profile_problem
 from ethbrake_marl.first_edition.evaluation import trial

@@ -18,7 +18,7 @@ import safetensors.numpy
 import torch
 from torch import nn
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.first_edition.evaluation.identity import scenario_sha256
 from ethbrake_marl.first_edition.evaluation.lineup import make_lineup

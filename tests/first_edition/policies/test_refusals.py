@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, UnknownName
 from ethbrake_marl.first_edition.evaluation.lineup import make_lineup
 from ethbrake_marl.first_edition.policies.actor import Actor

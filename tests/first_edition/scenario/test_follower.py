@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.files.yaml import parse_yaml
 from ethbrake_marl.first_edition.scenario.schema import Scenario
 from tests.refused import refused

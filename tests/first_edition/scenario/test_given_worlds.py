@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.scenario.sampling import uniform_numbers
 from ethbrake_marl.first_edition.scenario.tables import read_worlds, table_columns, worlds_from_state, worlds_from_table
 from ethbrake_marl.first_edition.training.training import Training

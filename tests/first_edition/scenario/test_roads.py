@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.agents.driving import drive
 from ethbrake_marl.first_edition.agents.making import make_agent
 from ethbrake_marl.first_edition.agents.protocol import Team

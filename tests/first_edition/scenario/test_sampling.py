@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, strategies as st
 from scipy import stats
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.evaluation.identity import worlds_sha256
 from ethbrake_marl.first_edition.physics.state import Vehicles
 from ethbrake_marl.first_edition.scenario.channel import PRESETS

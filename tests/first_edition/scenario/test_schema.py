@@ -17,7 +17,7 @@ import pytest
 from jsonschema import Draft202012Validator
 from pydantic import ValidationError
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.yaml import flow_text, parse_yaml, read_yaml
 from ethbrake_marl.first_edition.evaluation.identity import scenario_sha256

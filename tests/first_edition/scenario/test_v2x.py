@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.agents.driving import script_agents
 from ethbrake_marl.first_edition.envs.making import make_engine
 from ethbrake_marl.first_edition.game.observations import observe

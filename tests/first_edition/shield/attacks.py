@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.agents.driving import drive, script_agents
 from ethbrake_marl.first_edition.agents.making import make_agent
 from ethbrake_marl.first_edition.physics.advance import advance

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Self
 import gymnasium
 import numpy as np
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.agents.driving import episode_engine
 from ethbrake_marl.first_edition.agents.protocol import Team
 from ethbrake_marl.first_edition.shields.drivers import ShieldedDriver

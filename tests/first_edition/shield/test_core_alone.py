@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import UnknownName
 from ethbrake_marl.first_edition.agents.making import make_agent
 from ethbrake_marl.first_edition.agents.registry import agent_entries

@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
 from ethbrake_marl.first_edition.agents.driving import drive, episode_engine
 from ethbrake_marl.first_edition.agents.making import make_agent

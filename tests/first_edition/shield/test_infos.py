@@ -12,7 +12,7 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 
 PUSH = np.ones(1, np.float32)  # what is proposed in every last step is this or its opposite
 ROWS = 16

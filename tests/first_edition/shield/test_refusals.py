@@ -9,7 +9,7 @@ import pytest
 from pettingzoo.utils import BaseWrapper
 from stable_baselines3.common.vec_env import VecMonitor
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import UncertifiedStep, UnknownName
 from ethbrake_marl.first_edition.agents.driving import drive
 from ethbrake_marl.first_edition.agents.making import make_agent

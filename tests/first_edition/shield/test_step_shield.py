@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.agents.driving import drive
 from ethbrake_marl.first_edition.engine.profiles import profile_problem
 from ethbrake_marl.first_edition.scenario.task import Task

@@ -7,7 +7,7 @@ from pettingzoo import AECEnv
 from pettingzoo.utils import BaseParallelWrapper
 from stable_baselines3.common.vec_env import VecMonitor
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from tests.first_edition.shield.plays import INSIDE, PLAYS, WRAPPERS, disturbed, reported, wrapped
 from tests.first_edition.shield.test_infos import of_row
 from tests.first_edition.shield.test_step_shield import speechless

@@ -1,0 +1,218 @@
+"""E-V2X-BM: brakes with the constant deceleration that does the least harm, chosen at the alert.
+
+``pairwise`` is the paper's closed form. ``coupled`` plays the whole line in the physics of the episode, with the
+changes of speed, later impacts and lasting contact that the closed form leaves out: its harm is the harm that happens.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.agents.drive import MODEL, NOBODY, STATE
+from ethbrake_marl.agents.pairwise import Choice, closed_form, pairwise
+from ethbrake_marl.episode.play import hold
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.step import Rules, begin, failure, step
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.motion.compiling import kernel, large
+from ethbrake_marl.motion.layout import BRAKING, Floats
+from ethbrake_marl.registry import Part
+from ethbrake_marl.worlds.roles import HELD, LEARNER
+
+FIRST_PARTS = 64  # number of parts into which all decelerations are split, and
+PARTS = 8  # into which a cell of them is split
+NARROWEST_MPS2 = 1e-5  # narrower cells are not split
+SMALL = 1e-3  # harm (m2/s2) that is not worth a further split
+TIE = 1e-9  # harms (m2/s2) closer than this count as equal
+
+
+def coupled(alert: State, body: int, count: str = "first", horizon_s: float = 8.0) -> Choice:
+    """Return the constant deceleration of vehicle ``body`` that does the least harm, in every world, and this harm.
+
+    All others hold ``alert.wanted``. ``count``: harm of the ``first`` impact of each pair, or ``total``. If the choice
+    of the closed form does no harm, it is the result. If several do equally little, the least harm of the other count
+    decides, then the middle one. As a function of the deceleration the harm has kinks and jumps: it is not proven that
+    no deceleration between two samples does less.
+    """
+    braking = np.maximum(-alert.wanted, 0.0)
+    braking[:, body] = alert.car[:, BRAKING, body]
+    best = closed_form(alert, braking, body).deceleration_mps2
+    harm = harms(alert, body, best[:, np.newaxis], count, horizon_s)[:, :, 0]
+    rows = np.flatnonzero(harm.any(axis=0))
+    if len(rows):
+        best[rows], harm[0, rows], _ = search(alert.take(rows), body, count, horizon_s).T
+    failed = np.flatnonzero(np.isinf(harm[0]))  # for every deceleration
+    if len(failed):
+        raise failure(alert, failed[0], alert.time_s[failed[0]], horizon_s)
+    return Choice(best, harm[0])
+
+
+def harms(alert: State, body: int, tried: Floats, count: str, horizon_s: float) -> Floats:
+    """Return the harm of both counts, first the one asked for, [2, n, C], for decelerations ``tried`` [n, C]."""
+    return hold(alert, alert.wanted, [body], -tried[:, :, np.newaxis], horizon_s, count)
+
+
+def search(alert: State, body: int, count: str, horizon_s: float) -> Floats:
+    """Return the best decelerations and their harms under both counts, [n, 3].
+
+    All decelerations of a world are split into equal parts, then again and again the parts that may hold a better one.
+    A result is not within rounding of a jump, unless a jump is within rounding of one of these equal parts.
+    """
+    best = np.full((alert.n, 3), np.inf)
+    rows, step = np.arange(alert.n), alert.car[:, BRAKING, body] / FIRST_PARTS
+    at = step[:, np.newaxis] * np.arange(FIRST_PARTS + 1)
+    harm = harms(alert, body, at, count, horizon_s)
+    while len(rows):
+        cells = np.empty((2, at.size), np.int64)
+        row, part = cells[:, : find_cells(rows, at, harm, step, best, cells)]
+        left, right = harm[:, row, part, np.newaxis], harm[:, row, part + 1, np.newaxis]
+        rows, step = rows[row], step / PARTS
+        at = at[row, part, np.newaxis] + step[rows, np.newaxis] * np.arange(PARTS + 1)
+        inside = harms(alert.take(rows), body, at[:, 1:-1], count, horizon_s)
+        harm = np.concatenate([left, inside, right], axis=2)
+    return best
+
+
+@large
+def find_cells(rows, at, harm, step, best, cells):
+    """Update the best decelerations, and return the number of cells in which there may be better ones.
+
+    Row j of ``at`` [m, C] and ``harm`` [2, m, C] are samples of the world ``rows[j]``, ``step[rows[j]]`` m/s2 apart.
+    ``best`` [n, 3] are decelerations and their harms. A cell, the interval between two neighbouring samples, may hold a
+    better one if its lower end is above the best by less than the largest change of the harm in this cell and in the
+    cells beside it. ``cells`` [2, .] receives j and the number of the cell in row j.
+    """
+    count, last = 0, at.shape[1] - 1
+    for j in range(at.shape[0]):
+        known, better = best[rows[j]], False
+        for c in range(last + 1):
+            if compare(harm[:, j, c], known) < 0:
+                known[1], known[2], better = harm[0, j, c], harm[1, j, c], True
+        if better:
+            take_middle(at[j], harm[:, j], known)
+    for j in range(at.shape[0]):
+        if step[rows[j]] <= NARROWEST_MPS2:
+            continue
+        for c in range(last):
+            change = 0.0
+            for beside in range(max(c - 1, 0), min(c + 2, last)):
+                change = max(change, abs(harm[0, j, beside + 1] - harm[0, j, beside]))
+            if min(harm[0, j, c], harm[0, j, c + 1]) - change < best[rows[j], 1] - SMALL:
+                cells[0, count], cells[1, count] = j, c
+                count += 1
+    return count
+
+
+@kernel
+def take_middle(at, harm, known):
+    """Set ``known[0]`` to the middle one of the decelerations ``at`` [C] whose ``harm`` [2, C] is ``known[1:]``."""
+    ties = 0
+    for c in range(len(at)):
+        ties += 1 if compare(harm[:, c], known) == 0 else 0
+    for c in range(len(at)):
+        ties -= 2 if compare(harm[:, c], known) == 0 else 0
+        if ties <= 0:
+            known[0] = at[c]
+            return
+
+
+@kernel
+def compare(harm, known):
+    """Return -1 if ``harm`` [2] is less than ``known[1:]``, 0 if it is the same, 1 if it is more."""
+    for count in range(2):  # the other count decides ties
+        if abs(harm[count] - known[count + 1]) > TIE:
+            return -1 if harm[count] < known[count + 1] else 1
+    return 0
+
+
+class Memory(NamedTuple):
+    """What the agent decided at the alert."""
+
+    command: Floats  # [n] m/s2
+    predicted_harm: Floats  # [n] m2/s2
+
+
+class EV2XBM:
+    """Brakes with the choice of ``coupled``; assumes that the other learners brake fully.
+
+    The harm that it predicts is, to the last bit, the harm of the episode in which they do.
+
+    Args:
+        rules: of the episodes.
+        agents: body -> role of the vehicles that agents drive, whose commands are not known at the alert.
+        count: harm that is minimised, of the ``first`` impact of each pair or ``total``.
+
+    """
+
+    name, knows = "e_v2x_bm", MODEL
+
+    def __init__(self, rules: Rules, agents: Mapping[int, str] = MappingProxyType({}), count: str = "first") -> None:
+        self.rules, self.agents, self.count = rules, agents, count
+
+    def begin(self, alert: State, body: int) -> Memory:
+        """Choose. Raises ``InvalidInput`` if another vehicle is driven by an agent."""
+        for other, role in self.agents.items():
+            if other != body:
+                raise InvalidInput(
+                    f"agent {self.name!r}: vehicle_{other} is driven by {role!r}, whose commands are not known at the"
+                    " alert; use e_v2x_bm:pairwise, which assumes that its neighbours brake fully"
+                )
+        wanted, learners = alert.wanted.copy(), self.rules.learners
+        wanted[:, learners] = -alert.car[:, BRAKING][:, learners]
+        alert = alert._replace(wanted=wanted)
+        command = -coupled(alert, body, self.count, self.rules.horizon_s).deceleration_mps2
+        wanted[:, body] = command
+        return Memory(command, last_if_held(alert, self.rules).harm(self.count))
+
+    def act(self, state: State, memory: Memory, body: int) -> tuple[Floats, Memory]:
+        """Return the command, and the memory as it was."""
+        return memory.command, memory
+
+
+class EV2XBMPairwise:
+    """Brakes with the choice of ``pairwise``, the paper's closed form."""
+
+    name, knows = "e_v2x_bm:pairwise", STATE
+
+    def begin(self, alert: State, body: int) -> Memory:
+        """Choose. Raises ``InvalidInput`` where the closed form does not hold."""
+        deceleration, harm = pairwise(alert, body)
+        return Memory(-deceleration, harm)
+
+    def act(self, state: State, memory: Memory, body: int) -> tuple[Floats, Memory]:
+        """Return the command, and the memory as it was."""
+        return memory.command, memory
+
+
+def last_if_held(alert: State, rules: Rules) -> State:
+    """Return the last state of the episodes in which all vehicles hold ``alert.wanted``, decision by decision."""
+    state = begin(alert, rules.learners, rules.time_step_s, rules.horizon_s)
+    rules, nothing = rules._replace(learners=NOBODY), np.zeros((alert.n, 0))
+    while not state.ended.all():
+        state, _ = step(rules, {}, state, nothing, donate=True)
+    return state
+
+
+def make_e_v2x_bm(argument: str | None, settings: Any) -> EV2XBM | EV2XBMPairwise:
+    """Return the agent ``e_v2x_bm[:pairwise]``. Raises ``InvalidInput`` for another argument."""
+    if argument == "pairwise":
+        return EV2XBMPairwise()
+    if argument is not None:
+        raise InvalidInput(f"agent {settings.spec!r}: must be e_v2x_bm or e_v2x_bm:pairwise")
+    scenario = settings.needed_scenario()
+    roles = dict(enumerate(scenario.roles.values(), 1))
+    agents = {body: role for body, role in roles.items() if role.partition(":")[0] not in (LEARNER, *HELD)}
+    rules = Rules(np.array(scenario.learners, np.int64), scenario.time_step_s, scenario.horizon_s)
+    return EV2XBM(rules, agents, settings.harm_count)
+
+
+E_V2X_BM = Part(
+    make_e_v2x_bm,
+    form="e_v2x_bm[:pairwise]",
+    about="the constant deceleration of least simulated harm; pairwise: the paper's closed form, from the true state",
+    knows=MODEL,
+)

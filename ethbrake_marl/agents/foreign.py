@@ -1,0 +1,231 @@
+"""Models of other libraries: how each kind is asked, and what it brings that is applied or refused.
+
+Nothing here imports torch or Stable-Baselines3; onnxruntime is imported to open a file.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.episode.observe import Observations
+from ethbrake_marl.errors import InvalidInput, MissingExtra, describe_error, naming_extras
+from ethbrake_marl.files.plain import read_plain
+from ethbrake_marl.policies.policy import Policy
+
+MOST_ONNX_BYTES = 1 << 31
+
+Ask = Callable[[Any, Observations], Any]  # (policy, observations [n, F]) -> actions
+
+# library -> its classes around an environment that change neither observations nor actions, or are applied
+HARMLESS = {
+    "gymnasium": (
+        "OrderEnforcing", "PassiveEnvChecker", "TimeLimit", "RecordEpisodeStatistics", "RecordVideo",
+        "TransformReward", "NormalizeReward",
+    ),
+    "stable_baselines3": ("DummyVecEnv", "Monitor", "VecMonitor", "VecCheckNan", "VecVideoRecorder", "VecNormalize"),
+    "pettingzoo": (
+        "OrderEnforcingWrapper", "AssertOutOfBoundsWrapper", "aec_to_parallel_wrapper", "parallel_to_aec_wrapper",
+    ),
+    "supersuit": ("SB3VecEnvWrapper", "ConcatVecEnv", "MarkovVectorEnv"),
+}  # fmt: skip
+INSIDE = ("venv", "envs", "vec_envs", "par_env", "aec_env", "env")  # attributes that hold what is wrapped
+
+
+def ask_of(policy: Any, who: str) -> Ask:
+    """Return how a policy without a memory is asked.
+
+    Raises ``InvalidInput``, which begins with ``who``, for another kind, and for a model that would not act alike in
+    every batch.
+    """
+    if isinstance(policy, bytes) or (hasattr(policy, "run") and hasattr(policy, "get_inputs")):
+        _check_onnx(policy, who)
+        return ask_onnx
+    if hasattr(policy, "predict"):
+        return ask_model
+    torch = sys.modules.get("torch")
+    if torch is not None and isinstance(policy, torch.nn.Module):
+        _refuse_training_mode(policy, who)
+        return ask_torch
+    if not callable(policy) or isinstance(policy, Policy):
+        raise InvalidInput(
+            f"{who}: policy = {policy!r:.80}: must be a function of observations, an object with predict, a torch"
+            " module, an ONNX session or the path of an .onnx file; a policy of this package drives by"
+            " LearnedAgent(policy)"
+        )
+    return ask_function
+
+
+def ask_function(function: Any, seen: Observations) -> Any:
+    """Return what a function answers."""
+    return function(seen)
+
+
+def ask_model(model: Any, seen: Observations) -> Any:
+    """Return the deterministic actions of an object with ``predict``, under its ``VecNormalize``.
+
+    Raises ``InvalidInput`` if it also returns a state.
+    """
+    statistics = statistics_of(model)
+    answer = model.predict(seen if statistics is None else statistics.normalize_obs(seen), deterministic=True)
+    if not isinstance(answer, tuple):
+        return answer
+    actions, *states = answer
+    if any(state is not None for state in states):
+        raise InvalidInput(
+            "predict returned a state, so the model has a memory; write a function (observation, state) -> (action,"
+            " state) around it, whose states are arrays with one row per world, and pass initial_state"
+        )
+    return actions
+
+
+def ask_torch(module: Any, seen: Observations) -> Any:
+    """Return what a torch module answers, without gradients."""
+    torch = sys.modules["torch"]
+    parameter = next(iter(module.parameters()), None)
+    with torch.no_grad():
+        return module(torch.from_numpy(seen).to("cpu" if parameter is None else parameter.device))
+
+
+def ask_onnx(session: Any, seen: Observations) -> Any:
+    """Return the output ``action`` of an ONNX model, or its only one."""
+    session = session_of(session)
+    names = [output.name for output in session.get_outputs()]
+    return session.run(["action" if "action" in names else names[0]], {session.get_inputs()[0].name: seen})[0]
+
+
+def onnx_file(path: str | os.PathLike[str], who: str) -> bytes:
+    """Return the content of an ``.onnx`` file, which is an ONNX model that can be pickled."""
+    file = Path(path).expanduser()
+    if file.suffix != ".onnx":
+        raise InvalidInput(
+            f"{who}: policy = {str(path)!r:.120}: must be the path of an .onnx file; the policy of a run or bundle"
+            " drives by LearnedAgent(load_policy(PATH))"
+        )
+    return read_plain(file, MOST_ONNX_BYTES)
+
+
+def session_of(given: Any) -> Any:
+    """Return the session of the content of an ONNX file, or the one that is given."""
+    return _opened(given) if isinstance(given, bytes) else given
+
+
+@lru_cache(16)
+def _opened(content: bytes) -> Any:
+    with naming_extras():
+        import onnxruntime
+    return onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+
+
+def _check_onnx(given: Any, who: str) -> None:
+    try:
+        session = session_of(given)
+    except MissingExtra:
+        raise
+    except Exception as error:
+        raise InvalidInput(f"{who}: the file is no ONNX model that can be run: {describe_error(error)}") from error
+    inputs, outputs = ([each.name for each in ends] for ends in (session.get_inputs(), session.get_outputs()))
+    if len(inputs) != 1 or ("action" not in outputs and len(outputs) != 1):
+        raise InvalidInput(
+            f"{who}: the ONNX model has the inputs {inputs} and the outputs {outputs}; must have one input, and one"
+            " output or one called 'action'; write a function around a session that needs more"
+        )
+
+
+def _refuse_training_mode(module: Any, who: str) -> None:
+    """Raise ``InvalidInput`` for a layer whose results are random, or depend on the other worlds of a batch."""
+    for layer in module.modules():
+        shares = [getattr(layer, name, None) for name in ("p", "dropout")]
+        random = any(isinstance(share, float | int) and share > 0.0 for share in shares)
+        if layer.training and (random or getattr(layer, "running_mean", None) is not None):
+            raise InvalidInput(
+                f"{who}: the layer {type(layer).__name__} is in training mode, in which results are random or depend on"
+                " the other worlds of a batch; call the eval() of the module first"
+            )
+
+
+def features_of(policy: Any, ask: Ask) -> tuple[str, ...] | None:
+    """Return the names of the features that a model was trained on, where it brings them; None: it does not."""
+    if ask is ask_onnx:
+        listed = session_of(policy).get_modelmeta().custom_metadata_map.get("features")
+        return tuple(listed.split(",")) if listed else None
+    return getattr(getattr(policy, "observation_space", None), "features", None)
+
+
+def count_of_actions(policy: Any, given: int | None, who: str) -> int | None:
+    """Return the number of discrete actions of a policy; None: it returns numbers in [-1, 1].
+
+    Raises ``InvalidInput`` if its action space is neither a box from -1 to 1 nor as ``given``.
+    """
+    space: Any = getattr(policy, "action_space", None)
+    count, least = getattr(space, "n", None), getattr(space, "start", None)
+    if given is None and getattr(space, "evenly_spaced", False):  # of an environment of this package
+        given = int(space.n)
+    low, high = (np.asarray(getattr(space, end, np.nan)).tolist() for end in ("low", "high"))
+    fits = (low, high) == ([-1.0], [1.0]) if given is None else (count, least) == (given, 0)
+    if space is not None and not fits:
+        right = "a number in [-1, 1]" if given is None else f"an index from 0 to {given - 1} (actions={given})"
+        evenly = f"pass actions={count} if they are evenly spaced from -1 to 1, or " if least == 0 else ""
+        raise InvalidInput(
+            f"{who}: the actions of the policy are in {space}; must be {right}; {evenly}write a function around the"
+            " policy that converts its actions"
+        )
+    return given
+
+
+def statistics_of(model: Any) -> Any:
+    """Return the ``VecNormalize`` of a model of Stable-Baselines3; None: it has none."""
+    return getattr(model, "get_vec_normalize_env", lambda: None)()
+
+
+def check_wrappers(policy: Any, who: str) -> None:
+    """Raise ``InvalidInput`` if a model was trained under a wrapper that may change what it sees or does.
+
+    The wrapper of its environment is named. A model without an environment, from a file, may show that it has lost the
+    statistics of its ``VecNormalize``.
+    """
+    env, statistics = getattr(policy, "get_env", lambda: None)(), statistics_of(policy)
+    for layer in [] if env is None else layers_of(env):
+        kind, library = type(layer), type(layer).__module__.partition(".")[0]
+        is_inner = hasattr(kind, "normalize_obs") and layer is not statistics
+        if library != "ethbrake_marl" and (is_inner or kind.__name__ not in HARMLESS.get(library, ())):
+            name = vars(layer).get("modifier_class", kind).__name__  # of SuperSuit
+            raise InvalidInput(
+                f"{who}: the model was trained under {name}{' inside another one' * is_inner}, which may change"
+                " observations or actions and is not applied here; write a function around the model that makes the"
+                " same changes, or pass ignore_wrappers=True if there are none"
+            )
+    if env is None and _was_normalised(policy):
+        raise InvalidInput(
+            f"{who}: the model was trained under VecNormalize, whose statistics are missing; load them with"
+            " model.set_env(VecNormalize.load(PATH, venv)); if VecNormalize changed rewards only, pass"
+            " ignore_wrappers=True"
+        )
+
+
+def layers_of(env: Any) -> Iterator[Any]:
+    """Yield an environment and everything inside it, from the outside in."""
+    yield env
+    for name in INSIDE:
+        inside = getattr(env, "__dict__", {}).get(name, ())  # its own: wrappers forward attributes
+        for each in inside if isinstance(inside, list | tuple) else (inside,):
+            if hasattr(each, "step") or hasattr(each, "step_wait"):
+                yield from layers_of(each)
+
+
+def _was_normalised(model: Any) -> bool:
+    """Return whether the last observation that a model has stored was normalised.
+
+    It is then stored as it was before, too, which off-policy algorithms always do, or it lies outside its space.
+    """
+    if getattr(model, "_last_original_obs", None) is not None and not hasattr(model, "replay_buffer"):
+        return True
+    seen, space = getattr(model, "_last_obs", None), getattr(model, "observation_space", None)
+    low, high = getattr(space, "low", -np.inf), getattr(space, "high", np.inf)
+    return isinstance(seen, np.ndarray) and not np.all((low <= seen) & (seen <= high))

@@ -1,0 +1,164 @@
+"""The paper's E-V2X-BM: the constant deceleration of one vehicle that does the least harm to its two pairs, each alone.
+
+Assumed: the neighbours brake fully, only the first impact of a pair does harm, and impacts change no speed, so the pair
+in front and the pair behind do not influence each other. The harm predicted for a deceleration a is
+
+    H(a) = c_front(a)^2 + c_rear(a)^2    (m2/s2)
+
+with the closing speeds c at the first impacts. Between a few decelerations, the candidates, H is concave, so it is
+least at one of them. docs/internals/proofs/constant-deceleration.md derives every line.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.motion.compiling import kernel, large
+from ethbrake_marl.motion.contact import contact
+from ethbrake_marl.motion.impact import TOUCH_MPS
+from ethbrake_marl.motion.layout import BRAKE_RATE, BRAKING, GAP, LATENCY, RELEASE_RATE, SPEED, Floats
+
+CANDIDATES = 9
+TIE = 1e-12  # harms closer than this, relative to 1 + harm, count as equal
+
+
+class Choice(NamedTuple):
+    """The best constant deceleration of one vehicle in each of n worlds."""
+
+    deceleration_mps2: Floats  # [n] from 0 to the braking capacity
+    harm: Floats  # [n] predicted for it (m2/s2)
+
+
+@kernel
+def braking_now(speed, braking, onset, now):
+    """Return the acceleration (m/s2) of a vehicle that coasts until its onset, then brakes to rest, and how long."""
+    if now < onset:
+        return 0.0, onset - now
+    if speed > 0.0 and braking > 0.0:
+        return -braking, speed / braking
+    return 0.0, math.inf
+
+
+@large
+def meet(gap, front, front_braking, front_onset, rear, rear_braking, rear_onset, until):
+    """Move a pair to its first impact, or to ``until`` (s): return its harm (m2/s2), the gap (m) and both speeds (m/s).
+
+    Each vehicle coasts until its onset (s), then brakes to rest. The first contact is in one of these pieces of
+    constant accelerations: both coast, one brakes, both brake, one stands (the regimes A to C of the proof). A touch is
+    no impact. Vehicles that touch and press against each other stay together: harm 0.
+    """
+    now = 0.0
+    while now < until:
+        front_rate, front_end = braking_now(front, front_braking, front_onset, now)
+        rear_rate, rear_end = braking_now(rear, rear_braking, rear_onset, now)
+        piece, pressing = min(front_end, rear_end, until - now), rear_rate - front_rate
+        time, closing = contact(gap, rear - front, pressing)
+        if time <= piece:
+            if closing > TOUCH_MPS:
+                return closing * closing, 0.0, front, rear
+            if pressing > 0.0:
+                break
+        if piece == math.inf:
+            break
+        gap = max(gap - (rear - front + 0.5 * pressing * piece) * piece, 0.0)
+        front = 0.0 if front_rate < 0.0 and front_end <= piece else front + front_rate * piece
+        rear = 0.0 if rear_rate < 0.0 and rear_end <= piece else rear + rear_rate * piece
+        now += piece
+    return 0.0, gap, front, rear
+
+
+@large
+def predicted_harm(line, braking, wait, body, a):
+    """Return H (m2/s2) in one world if vehicle ``body`` decelerates with ``a`` (m/s2)."""
+    gap, speed, harm = line[GAP], line[SPEED], 0.0
+    if body > 1:
+        i = body - 1
+        harm += meet(gap[i], speed[i], braking[i], wait[i], speed[body], a, wait[body], math.inf)[0]
+    if body < line.shape[1] - 1:
+        i = body + 1
+        harm += meet(gap[body], speed[body], a, wait[body], speed[i], braking[i], wait[i], math.inf)[0]
+    return harm
+
+
+@large
+def find_candidates(line, braking, wait, body, at):
+    """Write the decelerations of vehicle ``body`` at which H may be least to ``at`` [CANDIDATES] (m/s2), in one world.
+
+    They belong to the state at its onset: gap d, own speed v and the neighbour's u, closing speed w, and the time s for
+    which the neighbour still coasts before it brakes with b. Some are not in [0, capacity], or not a number.
+    """
+    gap, speed, onset = line[GAP], line[SPEED], wait[body]
+    at[:] = 0.0
+    at[1] = braking[body]
+    if body > 1:
+        i = body - 1
+        b, s = braking[i], max(wait[i] - onset, 0.0)
+        _, d, u, v = meet(gap[i], speed[i], b, wait[i], speed[body], 0.0, onset, onset)
+        w = v - u
+        at[2] = v * v / (2.0 * (d + u * s + u * u / (2.0 * b)))  # it stops right behind the neighbour
+        at[3] = (w * w + 2.0 * b * (d - w * s)) / (2.0 * d - b * s * s)  # it touches while both brake
+        at[4] = w * w / (2.0 * d)  # it touches while the neighbour coasts,
+        at[5] = (w * w - 4.0 * TOUCH_MPS * TOUCH_MPS) / (2.0 * d)  # or strikes it then as lightly as can be
+        at[6] = 2.0 * (w * s - d) / (s * s)  # it arrives at the moment in which the neighbour begins to brake
+    if body < line.shape[1] - 1:
+        i = body + 1
+        b, s = braking[i], max(wait[i] - onset, 0.0)
+        _, d, v, u = meet(gap[body], speed[body], 0.0, onset, speed[i], b, wait[i], onset)
+        w = u - v
+        at[7] = v * v / (2.0 * (u * s + u * u / (2.0 * b) - d))  # the neighbour stops right behind
+        at[8] = (2.0 * b * (d - w * s) - w * w) / (b * s * s + 2.0 * d)  # the neighbour touches while both brake
+
+
+@large
+def choose(line, braking, wait, body, at, harm, best, least):
+    """Write the best decelerations of vehicle ``body`` to ``best`` [n] and H to ``least`` [n].
+
+    ``braking`` [n, N + 1] is how hard each vehicle brakes, or can (m/s2), ``wait`` [n, N + 1] when it may begin (s from
+    now). Of several best candidates it is the middle between the outer ones, if H is as small there.
+    """
+    for k in range(line.shape[0]):
+        find_candidates(line[k], braking[k], wait[k], body, at)
+        least[k], first, last = math.inf, math.inf, 0.0
+        for c in range(CANDIDATES):
+            at[c] = at[c] if 0.0 <= at[c] <= braking[k, body] else 0.0
+            harm[c] = predicted_harm(line[k], braking[k], wait[k], body, at[c])
+            least[k] = min(least[k], harm[c])
+        tied = least[k] + TIE * (1.0 + least[k])
+        for c in range(CANDIDATES):
+            if harm[c] <= tied:
+                first, last = min(first, at[c]), max(last, at[c])
+        best[k] = 0.5 * (first + last)
+        least[k] = predicted_harm(line[k], braking[k], wait[k], body, best[k])
+        if least[k] > tied:
+            best[k], least[k] = first, predicted_harm(line[k], braking[k], wait[k], body, first)
+
+
+def closed_form(alert: State, braking: Floats, body: int) -> Choice:
+    """Return the choice of vehicle ``body`` where the others brake with ``braking`` [n, N + 1] (m/s2) to rest."""
+    wait = np.maximum(alert.car[:, LATENCY] - alert.time_s[:, np.newaxis], 0.0)
+    choice = Choice(np.empty(alert.n), np.empty(alert.n))
+    choose(alert.line, braking, wait, body, np.empty(CANDIDATES), np.empty(CANDIDATES), *choice)
+    return choice
+
+
+def pairwise(alert: State, body: int) -> Choice:
+    """Return the deceleration of vehicle ``body`` (1: Vehicle 1) that minimises H, and H, in every world.
+
+    Where several do, such as all that avoid both impacts, it is the middle one. It needs gaps, speeds, capacities and
+    latencies of the vehicle and its neighbours; an obstacle is not seen.
+
+    Raises ``InvalidInput`` where the proof does not hold: a vehicle moves backward, or brakes build up gradually.
+    """
+    backward = (alert.speeds_mps < 0.0).any(axis=1)
+    builds = np.isfinite(alert.car[:, [BRAKE_RATE, RELEASE_RATE], 1:]).any(axis=(1, 2))
+    for wrong, what in ((backward, "a vehicle moves backward"), (builds, "brakes build up gradually")):
+        if np.any(wrong):
+            raise InvalidInput(
+                f"e_v2x_bm:pairwise: {what} in row {np.argmax(wrong)}, where the closed form does not hold"
+            )
+    return closed_form(alert, np.ascontiguousarray(alert.car[:, BRAKING]), body)

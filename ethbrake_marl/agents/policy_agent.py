@@ -1,0 +1,257 @@
+"""Agents that drive with policies: of our bundles, and of any other library."""
+
+from __future__ import annotations
+
+import math
+import os
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.agents.drive import MESSAGES, to_command
+from ethbrake_marl.agents.foreign import (
+    Ask,
+    ask_function,
+    ask_of,
+    check_wrappers,
+    count_of_actions,
+    features_of,
+    onnx_file,
+)
+from ethbrake_marl.episode.features import GROUPS
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.observe import View
+from ethbrake_marl.episode.state import NUMBER, State
+from ethbrake_marl.episode.step import LARGEST_ACTION
+from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar, UnknownName, check_whole_number
+from ethbrake_marl.motion.digest import physics_digest
+from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.policies.manifest import PHYSICS
+from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.worlds.catalogue import load_scenario
+from ethbrake_marl.worlds.game import AnyScenario, views_of
+from ethbrake_marl.worlds.scenario import Scenario
+
+
+@dataclass(frozen=True)
+class LearnedAgent:
+    """Drives with the deterministic actions of a policy of ours.
+
+    >>> from ethbrake_marl.policies.bundle import load_shipped
+    >>> LearnedAgent(load_shipped("ppo"), name="mine").name
+    'mine'
+
+    """
+
+    policy: Policy
+    name: str = "learned"
+    knows: str = MESSAGES
+
+    def __post_init__(self) -> None:
+        """Raise ``InvalidInput`` for something else than a policy of one action."""
+        if not isinstance(self.policy, Policy) or self.policy.manifest.network.action_size > 1:
+            raise InvalidInput(
+                f"agent {self.name!r}: policy = {self.policy!r:.80}: must be a policy with one action, such as that of"
+                " load_policy(PATH); for a function or a model of another library use policy_agent"
+            )
+
+    def check(self, game: Game, body: int) -> None:
+        """Warn (``Unfamiliar``) of a policy that was trained on another physics."""
+        then, now = self.policy.manifest.versions.get(PHYSICS), physics_digest()
+        if then not in (None, now):
+            warnings.warn(
+                f"{self.name}: was trained on other physics ({then:.16}) than this installation's ({now}), so it may"
+                " drive worse than reported; train it again",
+                Unfamiliar,
+                stacklevel=2,
+            )
+
+    def begin(self, alert: State, body: int) -> None:
+        """Return no memory."""
+
+    def act(self, state: State, memory: None, body: int) -> tuple[Floats, None]:
+        """Return the commands of vehicle ``body``, [n] m/s2."""
+        policy = self.policy
+        seen = policy.observation.observe(state, np.array([body]), policy.manifest.time_step_s)[:, 0]
+        return to_command(state, body, policy(seen)[:, 0].astype(np.float64)), None
+
+
+@dataclass(frozen=True)
+class PolicyAgent:
+    """Drives with a policy of another library; ``policy_agent`` makes it. It can be pickled where the policy can."""
+
+    policy: Any
+    name: str
+    ask: Ask
+    observation: View
+    is_assumed: bool  # neither the policy nor the user has said what it observes
+    time_step_s: float  # between two decisions in training; only forecasts need it
+    initial_state: Callable[[int], Any] | None
+    clip: bool
+    actions: int | None
+    knows: str = MESSAGES
+
+    def check(self, game: Game, body: int) -> None:
+        """Raise ``InvalidInput`` where the policy may have been trained on other features than it would get."""
+        if self.is_assumed and game.views[body] != self.observation:
+            raise InvalidInput(
+                f"agent {self.name!r}: nothing says which features the policy observes, and vehicle_{body} of scenario"
+                f" {game.name!r} does not observe the usual ones; pass observation=[...] to policy_agent, or scenario="
+                " for the scenario of its training"
+            )
+
+    def begin(self, alert: State, body: int) -> Any:
+        """Return the policy's memory for new episodes."""
+        return None if self.initial_state is None else self._memory(self.initial_state(alert.n), alert.n)
+
+    def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
+        """Return the commands of vehicle ``body``, [n] m/s2, and the policy's new memory.
+
+        Raises ``AgentFailed`` for actions of a wrong shape, or one that is not in its range.
+        """
+        seen = self.observation.observe(state, np.array([body]), self.time_step_s)[:, 0]
+        if self.initial_state is None:
+            answer = self.ask(self.policy, seen)
+        else:
+            answer, memory = self.policy(seen, self._memory(memory, state.n))
+            memory = self._memory(memory, state.n)
+        return to_command(state, body, self._actions(answer, state, body)), memory
+
+    def _memory(self, memory: Any, n: int) -> Any:
+        """Return a memory in arrays of its own."""
+        if isinstance(memory, tuple):
+            return tuple(self._memory(each, n) for each in memory)
+        array = np.array(to_array(memory))
+        if array.ndim < 1 or len(array) != n or array.dtype.hasobject:
+            right = f"must be an array with one row for each of {n} worlds, or a tuple of such arrays"
+            raise AgentFailed(self.name, None, f"its memory has {array.dtype} of the shape {array.shape}; {right}")
+        return array
+
+    def _actions(self, answer: Any, state: State, body: int) -> Floats:
+        """Return the actions [n] in [-1, 1] for what the policy has answered."""
+        given, n, last = to_array(answer), state.n, (self.actions or 0) - 1
+        kinds, low, high, right = "fiu", -1.0, 1.0, "a number in [-1, 1]"
+        if self.actions is not None:
+            kinds, low, high, right = "iu", 0.0, float(last), f"an index from 0 to {last}"
+        if given.shape not in ((n,), (n, 1)) or given.dtype.kind not in kinds:
+            what = f"{len(answer)} values" if isinstance(answer, tuple) else f"{given.dtype} of shape {given.shape}"
+            reason = f"returned {what}; must return {right} for each of {n} worlds, in the shape ({n}, 1)"
+            raise AgentFailed(self.name, None, f"vehicle_{body}: {reason}")
+        values = given.reshape(n).astype(np.float64)
+        if self.clip:
+            values = np.clip(values, low, high)
+        good = (values >= low * LARGEST_ACTION) & (values <= high * LARGEST_ACTION)
+        if not good.all():
+            k = int(np.argmin(good))
+            number = int(state.clock[k, NUMBER])
+            reason = f"vehicle_{body} at {state.time_s[k]:.2f} s: action {values[k]:g}; must be {right}"
+            raise AgentFailed(self.name, k if number < 0 else number, f"{reason}; clip=True clips to the nearest one")
+        return np.clip(values, -1.0, 1.0) if self.actions is None else (2.0 * values - last) / last
+
+
+def to_array(value: Any) -> NDArray[Any]:
+    """Return an array, tensor or sequence as an array; masked entries are NaN."""
+    if np.ma.is_masked(value):
+        return np.asarray(np.ma.filled(value.astype(np.float64), np.nan))
+    try:
+        return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
+    except ValueError:  # lists of different lengths
+        return np.empty(0, object)
+
+
+def policy_agent(
+    policy: Any,
+    *,
+    name: str | None = None,
+    scenario: AnyScenario | None = None,
+    observation: View | Sequence[str] | None = None,
+    initial_state: Callable[[int], Any] | None = None,
+    clip: bool = False,
+    actions: int | None = None,
+    ignore_wrappers: bool = False,
+) -> PolicyAgent:
+    """Return an agent that drives with a policy of any library.
+
+    The policy maps observations, [n, F] float32, to actions, [n, 1] or [n]: numbers in [-1, 1], or indices. A policy
+    with a memory is a function ``(observations, state) -> (actions, state)``.
+
+    Args:
+        policy: a function, an object with ``predict`` (Stable-Baselines3: deterministic, under its ``VecNormalize``), a
+            torch module (without gradients), an ONNX session or the path of an ``.onnx`` file.
+        name: in tables and messages; None: that of the function, class or file.
+        scenario: in which the policy was trained.
+        observation: features that it was trained on; None: those that its observation space or its ONNX metadata name,
+            otherwise those of ``scenario``, otherwise ``[own, front_1, rear_1]``, where the game has no others.
+        initial_state: number of episodes n -> first memory: an array with n rows, or a tuple of such arrays.
+        clip: clip actions to [-1, 1], or indices to the valid ones; otherwise they are errors.
+        actions: number of discrete actions, evenly spaced from -1 to 1, if the policy returns indices.
+        ignore_wrappers: accept a model whose training environment has wrappers that may change observations or actions.
+
+    Raises ``InvalidInput`` for another kind of policy, and for what would not be as in training.
+
+    >>> agent = policy_agent(lambda observation: -observation[:, :1].clip(0, 1), name="mine")
+    >>> agent.observation.names[0]
+    'own.speed'
+
+    """
+    if isinstance(policy, str | os.PathLike):
+        name = Path(policy).stem if name is None else name
+        policy = onnx_file(policy, f"agent {name!r}")
+    elif name is None:
+        name = str(getattr(policy, "__name__", type(policy).__name__))
+    who = f"agent {name!r}"
+    if actions is not None:
+        check_whole_number(f"{who}: actions", actions, 2)
+    ask = ask_of(policy, who)
+    if initial_state is not None and (ask is not ask_function or not callable(initial_state)):
+        raise InvalidInput(
+            f"{who}: initial_state = {initial_state!r:.60}: must be a function, number of episodes -> memory, for a"
+            " function (observation, state) -> (action, state); write one around another kind of model"
+        )
+    if not ignore_wrappers:
+        check_wrappers(policy, who)
+        actions = count_of_actions(policy, actions, who)
+    trained_on, trained_in = features_of(policy, ask), None if scenario is None else load_scenario(scenario)
+    view = _view(observation, trained_on, trained_in, who)
+    if trained_in is None and any(each.partition(".")[0] in GROUPS for each in view.names):
+        raise InvalidInput(
+            f"{who}: observes forecasts, which need the time between two decisions; pass scenario= for the scenario of"
+            " its training"
+        )
+    is_assumed = observation is None and trained_on is None and trained_in is None
+    time_step_s = math.nan if trained_in is None else trained_in.time_step_s
+    return PolicyAgent(policy, name, ask, view, is_assumed, time_step_s, initial_state, clip, actions)
+
+
+def _view(given: Any, trained_on: tuple[str, ...] | None, trained_in: Scenario | None, who: str) -> View:
+    """Return what a policy observes: what is ``given``, what it brings, or what the learners of a scenario observe."""
+    if given is not None:
+        view = given if isinstance(given, View) else View(given)
+        if trained_on not in (None, view.names):
+            raise InvalidInput(
+                f"{who}: observation lists other features than the policy was trained on, which are"
+                f" {list(trained_on or ())!r:.200}; leave out observation="
+            )
+        return view
+    if trained_on is not None:
+        try:
+            return View(trained_on)
+        except UnknownName as error:
+            raise InvalidInput(
+                f"{who}: was trained on what no vehicle observes: {error}; instead of appended='number' observe the"
+                " feature place, or write a function around the model"
+            ) from None
+    if trained_in is None:
+        return View()
+    views = views_of(trained_in)
+    seen = {views[body - 1] for body in trained_in.learners} or set(views)
+    if len(seen) > 1:
+        raise InvalidInput(
+            f"{who}: the learners of scenario {trained_in.name!r} observe different features; pass observation=[...]"
+        )
+    return seen.pop()

@@ -1,0 +1,74 @@
+"""Trained policies as agents, by name: ``universal``, ``ppo``, ``policy@PATH``, ``ppo@PATH``, ``team@RUN``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ethbrake_marl.agents.drive import MESSAGES, Agent, Team
+from ethbrake_marl.agents.policy_agent import LearnedAgent
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.policies.bundle import load_drivers, load_policy, load_shipped, shipped_policies
+from ethbrake_marl.registry import Part
+
+ANY = ("policy", "team")  # names that stand for whatever algorithm has trained the policy
+
+
+def make_trained(argument: str | None, settings: Any) -> Agent | Team:
+    """Return what drives with the policy of a run or bundle, or with a shipped one if the name has no path.
+
+    ``argument`` is the algorithm that should have trained it, if the name does not say. A run whose learners have
+    policies of their own gives a team, or the agent of the only vehicle that it is asked for. Raises ``InvalidInput``
+    for a policy of another algorithm, and the errors of ``load_policy``.
+    """
+    spec, path = settings.spec, settings.policy
+    name = argument or spec.partition("@")[0]
+    if path is None:
+        if name not in shipped_policies():
+            raise InvalidInput(
+                f"agent {spec!r}: needs a policy: write {name}@PATH, where PATH is the folder of a run or bundle, for"
+                f" instance {name}@runs/my-run"
+            )
+        return LearnedAgent(load_shipped(name), spec)
+    if has_policy_each(Path(path)):
+        policies = load_drivers(Path(path) / "policy")
+        driver: Agent | Team = Team.of({vehicle: LearnedAgent(each, spec) for vehicle, each in policies.items()}, spec)
+        policy = next(iter(policies.values()))
+    else:
+        policy = load_policy(path)
+        driver = LearnedAgent(policy, spec)
+    if name not in ANY and name != policy.manifest.algorithm:
+        by = policy.manifest.algorithm
+        raise InvalidInput(f"agent {spec!r}: the policy was trained by {by}; write {by}@{path}")
+    return driver
+
+
+def has_policy_each(run: Path) -> bool:
+    """Return whether a run's learners have policies of their own."""
+    return any((run / "policy").glob("vehicle_[1-9]*"))
+
+
+def _shipped(name: str, what: str) -> Part:
+    return Part(make_trained, form=name, about=f"the shipped policy for {what}", knows=MESSAGES)
+
+
+PPO, SAC = (
+    Part(
+        make_trained,
+        form=f"{name}[@PATH]",
+        about=f"a policy trained by {name.upper()}: the shipped one, or that of a run or bundle",
+        knows=MESSAGES,
+    )
+    for name in ("ppo", "sac")
+)
+POLICY = Part(
+    make_trained, form="policy@PATH", about="the policy of a run or bundle, trained by any algorithm", knows=MESSAGES
+)
+TEAM = Part(make_trained, form="team@RUN", about="the learners of a run, each with its policy", knows=MESSAGES)
+UNIVERSAL = _shipped("universal", "every scenario")
+PPO_OBSTACLE = _shipped("ppo-obstacle", "paper-random-obstacle, first-impact harm")
+ROLLOUT_OBSTACLE = _shipped("rollout-obstacle", "paper-random-obstacle, total harm")
+VINE_PREFERENCE = _shipped("vine-preference", "paper-random-preference")
+VINE_FRONT = _shipped("vine-front", "cooperation-1-front")
+VINE_PAIR = _shipped("vine-pair", "cooperation-3-pair, Vehicles 2 and 3")
+VINE_ALL = _shipped("vine-all", "cooperation-4-all, all vehicles")

@@ -1,0 +1,85 @@
+"""Try a scenario before it is used: what its worlds are like, who knows whom, and what there is to learn."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.agents.drive import drive
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.names import AGENTS, make_agent, open_game, team_of
+from ethbrake_marl.worlds.sampling import Drawn
+from ethbrake_marl.worlds.scenario import Scenario
+
+WORLDS, SEED = 200, 7
+COMPARED = {"full braking": "full_brake", "best constant deceleration": "e_v2x_bm", "best known": "best_harm"}
+
+
+class Trial(NamedTuple):
+    """What happens in the first worlds of the evaluation list, in which learners brake fully."""
+
+    drawn: Drawn
+    early: int  # worlds with an impact before a learner can act
+    moving: int  # worlds in which a vehicle still moves at the horizon
+    late: int  # worlds in which Vehicle 1, whose braking is the alert, has a latency
+    known: dict[str, dict[str, float]]  # learner -> other vehicle -> share of worlds in which it is known in time
+    harm: dict[str, dict[str, float]]  # what drives the learners -> count -> mean harm (m2/s2)
+    refused: dict[str, str]  # agents that cannot drive here -> why
+
+
+def try_scenario(scenario: Scenario, count: str = "first") -> Trial:
+    """Simulate 200 worlds. Raises the errors of scripts, which name vehicle, world and time.
+
+    ``count`` is what ``best constant deceleration`` and ``best known`` minimise.
+    """
+    loaded, game = open_game(scenario)
+    drawn = loaded.draw(WORLDS, SEED)
+    worlds, begun = drawn.worlds, game.begin(drawn.worlds)
+    harm, refused, last = {}, {}, begun
+    for what, spec in COMPARED.items():
+        if loaded.learners and spec in AGENTS:
+            try:
+                team = team_of(make_agent(spec, scenario=loaded, harm_count=count), loaded)
+                then = drive(game, worlds, team)
+            except InvalidInput as error:
+                if spec == "full_brake":  # a script's error
+                    raise
+                refused[spec] = str(error)
+                continue
+            last = then if spec == "full_brake" else last
+            harm[what] = {each: float(then.harm(each).mean()) for each in ("first", "total")}
+    if not loaded.learners:
+        last = _to_the_end(game, begun)
+    return Trial(
+        drawn,
+        early=int(begun.collided.sum()),
+        moving=int((last.speeds_mps != 0.0).any(axis=1).sum()),
+        late=int((worlds.latency_s[:, 0] > 0.0).sum()),
+        known=_known(loaded, begun),
+        harm=harm,
+        refused=refused,
+    )
+
+
+def _to_the_end(game: Game, state: State) -> State:
+    nothing = np.zeros((state.n, 0))
+    while not state.ended.all():
+        state, _ = game.step(state, nothing)
+    return state
+
+
+def _known(scenario: Scenario, state: State) -> dict[str, dict[str, float]]:
+    """Return for each learner how often each other vehicle is known when the learner can first act."""
+    names: Any = scenario.vehicle_names
+    acts_s = np.maximum(state.time_s[:, np.newaxis], state.latency_s)
+    return {
+        names[i - 1]: {
+            names[j - 1]: float((state.know[:, i, j] <= acts_s[:, i - 1]).mean())
+            for j in range(1, len(names) + 1)
+            if j != i
+        }
+        for i in scenario.learners
+    }

@@ -1,0 +1,140 @@
+"""Read policies from folders: a bundle, a shipped policy by its name, the policies of several learners."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from ethbrake_marl.errors import RENAMED, CorruptBundle, InvalidInput, refuse_shipped_path, unknown_name
+from ethbrake_marl.files.model import read_json_model
+from ethbrake_marl.files.plain import read_plain
+from ethbrake_marl.files.store import new_folder
+from ethbrake_marl.policies.manifest import Manifest, content_sha256
+from ethbrake_marl.policies.policy import MANIFEST, WEIGHTS, Policy, checked_tensors
+
+LIMITS_BYTES = {MANIFEST: 1 << 20, WEIGHTS: 256 << 20}
+SHIPPED = Path(__file__).resolve().parents[1] / "_policies"  # NAME/policy is a bundle, NAME/card.md describes it
+
+
+def load_policy(path: str | os.PathLike[str]) -> Policy:
+    """Return the policy of a bundle, or of a training run that has a folder ``policy``.
+
+    Raises ``InvalidInput`` if there is none, and ``CorruptBundle`` with file and reason if it is damaged.
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise InvalidInput(f"policy = {path!r:.60}: must be the path of a training run or of a policy bundle")
+    folder = _bundle_in(Path(path).expanduser())
+    for name in sorted({MANIFEST, WEIGHTS} ^ _names_in(folder)):
+        wrong = f"does not belong in a bundle, which has only the files {MANIFEST} and {WEIGHTS}"
+        missing = name in (MANIFEST, WEIGHTS)
+        raise CorruptBundle(f"{folder / name}: {'is missing from the policy bundle' if missing else wrong}")
+    manifest = _read_manifest(folder / MANIFEST)
+    file = folder / WEIGHTS
+    data = _read(file)
+    sha256 = hashlib.sha256(data).hexdigest()
+    if sha256 != manifest.weights_sha256:
+        raise CorruptBundle(
+            f"{file}: the file has SHA-256 {sha256}, but weights_sha256 in the manifest is {manifest.weights_sha256}"
+        )
+    try:
+        return Policy(manifest, checked_tensors(data, manifest.network))
+    except ValueError as error:
+        raise CorruptBundle(f"{file}: {error}") from None
+
+
+def _read_manifest(file: Path) -> Manifest:
+    try:
+        content, manifest = read_json_model(_read(file), Manifest)
+    except CorruptBundle:
+        raise
+    except ValueError as error:
+        raise CorruptBundle(f"{file}: {error}") from None
+    own = content_sha256(content)
+    if own != manifest.manifest_sha256:
+        raise CorruptBundle(
+            f"{file}: the content has SHA-256 {own}, but manifest_sha256 is {manifest.manifest_sha256}; the file was"
+            " changed after it was saved"
+        )
+    manifest.observation.check(file, manifest.versions.get("ethbrake-marl", "not recorded"))
+    return manifest.model_copy(update={"algorithm": RENAMED.get(manifest.algorithm, manifest.algorithm)})
+
+
+def _read(file: Path) -> bytes:
+    return read_plain(file, LIMITS_BYTES[file.name], refusal=CorruptBundle, follow_links=False)
+
+
+def _bundle_in(path: Path) -> Path:
+    """Return the folder of the bundle: ``path``, or its folder ``policy``."""
+    members: list[Path] = []
+    for folder in (path, path / "policy"):
+        names = _names_in(folder)
+        if names & {MANIFEST, WEIGHTS}:
+            if folder.is_symlink():
+                raise CorruptBundle(f"{folder}: is a symbolic link; give the folder to which the link points")
+            return folder
+        members += [folder / name for name in sorted(names) if name.startswith("vehicle_")]
+    if members:
+        raise InvalidInput(
+            f"{path}: has one policy for each learner; give the path of one of them, for instance {members[0]}"
+        )
+    reason = "contains no policy" if path.is_dir() else "is not a folder"
+    raise InvalidInput(
+        f"{path}: {reason}; give the folder of a policy bundle ({MANIFEST}, {WEIGHTS}) or of a finished run"
+    )
+
+
+def _names_in(folder: Path) -> set[str]:
+    """Return the names in a folder; none if there is no such folder."""
+    try:
+        return set(os.listdir(folder))
+    except (FileNotFoundError, NotADirectoryError):
+        return set()
+    except (OSError, ValueError) as error:
+        raise InvalidInput(f"{str(folder)!r:.120}: cannot be read ({error})") from None
+
+
+def shipped_policies() -> dict[str, Path]:
+    """Return name -> folder of every shipped policy: its card, and the folder ``policy``."""
+    return {folder.parent.name: folder.parent for folder in sorted(SHIPPED.glob("*/policy"))}
+
+
+def load_shipped(name: str) -> Policy:
+    """Return the shipped policy ``name``, such as ``universal``. Raises ``UnknownName``."""
+    folders = shipped_policies()
+    if name not in folders:
+        raise unknown_name("shipped policy", name, folders)
+    return load_policy(folders[name])
+
+
+def load_named_policy(name: str) -> Policy:
+    """Return a shipped policy by its name, or any other by the path of its run or bundle (``./ppo`` for a folder)."""
+    refuse_shipped_path(name)
+    return load_shipped(name) if name in shipped_policies() else load_policy(name)
+
+
+def save_drivers(drivers: Mapping[str, Policy], folder: str | os.PathLike[str], *, replace: bool = False) -> None:
+    """Write the policies of learners, vehicle -> policy: one bundle if they share it, or a folder of one for each.
+
+    Raises ``AlreadyExists``; with ``replace`` an existing folder is deleted once the new one is written.
+    """
+    first = next(iter(drivers.values()))
+    if all(policy is first for policy in drivers.values()) and tuple(drivers) == first.manifest.learners:
+        first.save(folder, replace=replace)
+        return
+    with new_folder(Path(folder), replace=replace) as partial:
+        for name, policy in drivers.items():
+            policy.save(partial / name)
+
+
+def load_drivers(folder: str | os.PathLike[str]) -> dict[str, Policy]:
+    """Return what ``save_drivers`` wrote, vehicle -> policy, front to rear. Raises ``CorruptBundle``."""
+    path = Path(folder)
+    if (path / MANIFEST).exists():
+        policy = load_policy(path)
+        return dict.fromkeys(policy.manifest.learners, policy)
+    names = sorted((each.name for each in path.glob("vehicle_[1-9]*")), key=lambda name: (len(name), name))
+    if not names:
+        raise CorruptBundle(f"{path}: must contain a policy bundle, or one folder vehicle_... per learner")
+    return {name: load_policy(path / name) for name in names}

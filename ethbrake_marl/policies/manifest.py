@@ -1,0 +1,94 @@
+"""The manifest of a policy: network, observation, training, versions and hashes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import platform
+from collections.abc import Mapping
+from importlib.metadata import version
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, JsonValue, model_validator
+
+from ethbrake_marl.episode.features import GROUPS
+from ethbrake_marl.files.model import NAME_PATTERN
+from ethbrake_marl.motion.digest import physics_digest
+from ethbrake_marl.policies.network import NetworkSpec
+from ethbrake_marl.policies.observed import Finite, ObservationSchema, Sha256
+from ethbrake_marl.registry import versions_used
+
+PACKAGES = ("ethbrake-marl", "gymnasium", "numba", "numpy", "safetensors", "stable-baselines3", "torch")
+PHYSICS = "physics"  # key of `versions`: digest of the physics; files of earlier versions lack it
+LONGEST_STEP_S = 1e6
+
+Learner = Annotated[str, Field(pattern=r"^vehicle_[1-9][0-9]?$")]
+
+
+def installed_versions() -> dict[str, str]:
+    """Return name -> version of Python, of the physics, and of every package on which a training may depend."""
+    own = {"python": platform.python_version(), PHYSICS: physics_digest()}
+    return own | {name: version(name) for name in PACKAGES} | versions_used()
+
+
+class Manifest(Finite):
+    """Everything that a file says of a policy, but its tensors."""
+
+    format: Literal["ethbrake-policy"] = "ethbrake-policy"
+    format_version: Literal[2, 3, 4, 5] = 2  # `NetworkSpec.format_version`
+    algorithm: Annotated[str, Field(pattern=NAME_PATTERN)]
+    network: NetworkSpec
+    observation: ObservationSchema
+    action: Literal["fraction_of_own_capacity"] = "fraction_of_own_capacity"  # -1 is full braking
+    learners: Annotated[tuple[Learner, ...], Field(min_length=1)]  # vehicles that it has learned to control
+    scenario: dict[str, JsonValue]  # all values of the scenario of the training
+    reward: dict[str, JsonValue]  # all settings of its reward
+    seeds: dict[str, int]  # purpose -> seed
+    steps: Annotated[int, Field(ge=0)]  # decisions of the learners in training
+    versions: dict[str, str]  # at the time of training
+    weights_sha256: Sha256  # of the file with the tensors
+    manifest_sha256: Sha256  # of all other fields: `content_sha256`
+
+    @property
+    def time_step_s(self) -> float:
+        """Time between two decisions in training (s); NaN where the file does not say it."""
+        step = self.scenario.get("time_step_s")
+        known = isinstance(step, int | float) and not isinstance(step, bool) and 0.0 < step <= LONGEST_STEP_S
+        return float(step) if known else math.nan  # type: ignore[arg-type]  # a number
+
+    @model_validator(mode="after")
+    def _parts_fit(self) -> Manifest:
+        network, features = self.network, self.observation.features
+        if self.format_version != network.format_version:
+            raise ValueError(
+                f"format_version = {self.format_version}: must be {network.format_version} if"
+                f" networks = {network.networks} and output = {network.output!r}"
+            )
+        if len(features) != network.observation_size:
+            raise ValueError(
+                f"observation.features: has {len(features)} features; must have {network.observation_size}, the"
+                " observation_size of the network"
+            )
+        forecasts = [name for name in features if name.partition(".")[0] in GROUPS]
+        if forecasts and math.isnan(self.time_step_s):
+            raise ValueError(
+                f"scenario: time_step_s = {self.scenario.get('time_step_s')!r:.60}: must be a number of seconds above"
+                f" 0, because the policy observes {forecasts[0]}"
+            )
+        vehicles, roles = self.scenario.get("vehicles"), self.scenario.get("roles")
+        for name in self.learners:
+            if isinstance(vehicles, int) and int(name.removeprefix("vehicle_")) > vehicles:
+                raise ValueError(f"learners: {name}: must be one of the {vehicles} vehicles of the scenario")
+            if isinstance(roles, dict) and roles.get(name) != "learner":
+                raise ValueError(f"learners: {name}: must be a learner in the scenario's roles")
+        return self
+
+
+def content_sha256(content: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of a manifest without its key ``manifest_sha256``, as ASCII JSON, sorted and without spaces.
+
+    It shows damage and edits; it is not a signature.
+    """
+    hashed = {key: value for key, value in content.items() if key != "manifest_sha256"}
+    return hashlib.sha256(json.dumps(hashed, sort_keys=True, separators=(",", ":")).encode()).hexdigest()

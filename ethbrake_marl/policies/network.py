@@ -1,0 +1,122 @@
+"""Which networks a policy has: their sizes, and the names and shapes of their tensors."""
+
+from __future__ import annotations
+
+from operator import not_
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from ethbrake_marl.files.model import FileModel
+from ethbrake_marl.policies.layers import Float32s
+
+Activation = Literal["relu", "tanh"]
+Width = Annotated[int, Field(ge=1, le=4096)]
+PerhapsHidden = Annotated[tuple[Width, ...], Field(max_length=8)]
+Shapes = dict[str, tuple[int, ...]]
+
+
+class NetworkSpec(FileModel):
+    """An actor, and perhaps a critic: multilayer perceptrons on the same observation.
+
+    What the actor computes becomes an action in [-1, 1] by its ``output``:
+
+    - ``clip``: clipped. In training (PPO) it is the mean of a Gaussian with one noise parameter per action.
+    - ``tanh``: its tanh. In training (SAC) a second head of the actor gives the noise.
+    - ``choice``: it scores ``choices`` actions, evenly spaced from -1 to 1; the highest score acts, the lowest action
+      among equal ones. It may also score other policies (``among``) on the same observation, whose scores come first;
+      one with the highest score chooses the action. There is neither noise nor critic.
+
+    With ``networks`` above 1 the policy is a mixture of experts: as many actors of one shape, and a gating network
+    (hidden layers ``gate_hidden``) that scores them at every decision. The highest score acts, the first among equal
+    ones. There is neither noise nor critic.
+    """
+
+    observation_size: Annotated[int, Field(ge=1, le=4096)]  # F
+    action_size: Annotated[int, Field(ge=1, le=64)]  # A
+    policy_hidden: Annotated[PerhapsHidden, Field(min_length=1)]  # width of each hidden layer of an actor
+    value_hidden: PerhapsHidden  # of the critic; empty: no critic, which no policy needs to act
+    activation: Activation
+    output: Literal["clip", "tanh", "choice"]
+    choices: Annotated[int | None, Field(ge=2, le=4096, exclude_if=lambda choices: choices is None)] = None
+    networks: Annotated[int, Field(ge=1, le=16, exclude_if=lambda networks: networks == 1)] = 1
+    gate_hidden: Annotated[PerhapsHidden, Field(exclude_if=not_)] = ()
+    among: Annotated[tuple[NetworkSpec, ...], Field(max_length=16, exclude_if=not_)] = ()
+
+    @model_validator(mode="after")
+    def _settings_fit(self) -> NetworkSpec:
+        if (self.networks > 1) != bool(self.gate_hidden):
+            raise ValueError(
+                f"gate_hidden = {list(self.gate_hidden)}: must have a layer if networks is above 1, and must be left"
+                f" out if networks is 1; networks is {self.networks}"
+            )
+        if self.networks > 1 and self.value_hidden:
+            raise ValueError(f"value_hidden = {list(self.value_hidden)}: must be empty if networks is above 1")
+        if (self.output == "choice") != (self.choices is not None):
+            raise ValueError(
+                f"choices = {self.choices}: must be a number if output is 'choice', and must be left out otherwise;"
+                f" output is {self.output!r}"
+            )
+        if self.choices is not None and (self.value_hidden or self.networks > 1 or self.action_size > 1):
+            raise ValueError("output = 'choice': needs networks = 1, action_size = 1 and an empty value_hidden")
+        for m, member in enumerate(self.among):
+            if self.choices is None or member.among:
+                raise ValueError(
+                    "among: needs output = 'choice', and a policy in this list must not have a key among of its own"
+                )
+            if (member.observation_size, member.action_size) != (self.observation_size, self.action_size):
+                raise ValueError(
+                    f"among[{m}]: observation_size and action_size are {member.observation_size} and"
+                    f" {member.action_size}; must be {self.observation_size} and {self.action_size}, as for the network"
+                    " that chooses among these policies"
+                )
+        return self
+
+    @property
+    def actors(self) -> tuple[str, ...]:
+        """Beginnings of the names of the actors' tensors."""
+        return ("policy",) if self.networks == 1 else tuple(f"network_{m + 1}" for m in range(self.networks))
+
+    @property
+    def actions(self) -> Float32s:
+        """The actions that output ``choice`` scores, [choices]."""
+        return np.linspace(-1.0, 1.0, self.choices or 0).astype(np.float32)
+
+    @property
+    def format_version(self) -> Literal[2, 3, 4, 5]:
+        """Version of the file format that has what this network needs."""
+        if self.choices is not None:
+            return 5 if self.among else 4
+        return 2 if self.networks == 1 else 3
+
+    @property
+    def tensors(self) -> Shapes:
+        """Name -> shape of every float32 tensor; weights are [outputs, inputs], as in ``y = W x + b``."""
+        outputs = self.action_size if self.choices is None else len(self.among) + self.choices
+        shapes: Shapes = {}
+        for name in self.actors:
+            shapes |= self._network(name, self.policy_hidden, outputs)
+        if self.networks > 1:
+            shapes |= self._network("gate", self.gate_hidden, self.networks)
+        elif self.choices is not None:
+            for m, member in enumerate(self.among, 1):
+                shapes |= {f"among_{m}.{name}": shape for name, shape in member.tensors.items()}
+        elif self.output == "clip":
+            shapes["policy.log_std"] = (self.action_size,)
+        else:
+            shapes |= _layer("policy.log_std", self.policy_hidden[-1], self.action_size)
+        if self.value_hidden:
+            shapes |= self._network("value", self.value_hidden, 1)
+        return shapes
+
+    def _network(self, name: str, hidden: tuple[int, ...], outputs: int) -> Shapes:
+        sizes = (self.observation_size, *hidden)
+        shapes: Shapes = {}
+        for k, width in enumerate(hidden):
+            shapes |= _layer(f"{name}.{k}", sizes[k], width)
+        return shapes | _layer(f"{name}.output", sizes[-1], outputs)
+
+
+def _layer(name: str, inputs: int, outputs: int) -> Shapes:
+    return {f"{name}.weight": (outputs, inputs), f"{name}.bias": (outputs,)}

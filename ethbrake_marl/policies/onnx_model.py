@@ -1,0 +1,102 @@
+"""A policy as an ONNX model, for other runtimes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.episode.observe import View
+from ethbrake_marl.errors import InvalidInput, naming_extras
+from ethbrake_marl.policies.layers import Float32s
+from ethbrake_marl.policies.manifest import Manifest
+from ethbrake_marl.policies.network import NetworkSpec
+
+CAPACITIES = ("own.braking_capacity", "own.driving_capacity")
+
+
+def onnx_model(manifest: Manifest, observation: View, tensors: Mapping[str, Float32s]) -> bytes:
+    """Return the model of a policy (``Policy.to_onnx``). Its metadata name the ``features`` of an observation.
+
+    Raises ``InvalidInput`` if the policy does not observe both its capacities, ``MissingExtra`` without onnx.
+    """
+    spec, columns = manifest.network, {f.name: (c, f.scale) for c, f in enumerate(observation.features)}
+    missing = [name for name in CAPACITIES if name not in columns]
+    if missing or spec.action_size > 1:
+        raise InvalidInput(
+            f"to_onnx: the policy has action_size = {spec.action_size} and lacks the features"
+            f" {', '.join(missing) or 'none'}; must have one action, and observe {' and '.join(CAPACITIES)}"
+        )
+    with naming_extras():
+        import onnx  # an optional extra, imported only here
+    helper, float32 = onnx.helper, onnx.TensorProto.FLOAT
+    nodes: list[Any] = []
+    constants: list[Any] = []
+
+    def constant(name: str, array: NDArray[Any]) -> str:
+        constants.append(onnx.numpy_helper.from_array(np.ascontiguousarray(array), name))
+        return name
+
+    def node(operator: str, inputs: list[str], *, output: str = "", **attributes: Any) -> str:
+        name = output or f"{operator.lower()}_{len(nodes)}"
+        nodes.append(helper.make_node(operator, inputs, [name], **attributes))
+        return name
+
+    zero = constant("zero", np.zeros(1, np.float32))
+    bounds = [constant(name, np.array(at, np.float32)) for name, at in (("lowest", -1.0), ("highest", 1.0))]
+
+    def network(name: str, hidden: int, activation: str) -> str:
+        x = "observation"
+        for layer in [*(f"{name}.{k}" for k in range(hidden)), f"{name}.output"]:
+            weight, bias = (constant(f"{layer}.{part}", tensors[f"{layer}.{part}"]) for part in ("weight", "bias"))
+            x = node("Gemm", [x, weight, bias], transB=1)
+            if not layer.endswith("output"):
+                x = node("Relu" if activation == "relu" else "Tanh", [x])
+        return x
+
+    def actor(spec: NetworkSpec, prefix: str) -> str:
+        outputs = [network(prefix + name, len(spec.policy_hidden), spec.activation) for name in spec.actors]
+        x = outputs[0]
+        if len(outputs) > 1:  # of the expert with the highest score
+            gate = network(f"{prefix}gate", len(spec.gate_hidden), spec.activation)
+            best = node("ArgMax", [gate], axis=1, keepdims=1)
+            x = node("GatherElements", [node("Concat", outputs, axis=1), best], axis=1)
+        if spec.output == "tanh":
+            return node("Tanh", [x])
+        if spec.output == "clip":
+            return node("Clip", [x, *bounds])
+        members = [actor(each, f"among_{m}.") for m, each in enumerate(spec.among, 1)]
+        nothing = node("Mul", [node("ReduceMax", [x], axes=[1], keepdims=1), zero])  # [n, 1]
+        actions = node("Add", [nothing, constant(f"{prefix}choices", spec.actions[np.newaxis])])
+        best = node("ArgMax", [x], axis=1, keepdims=1)
+        return node("GatherElements", [node("Concat", [*members, actions], axis=1), best], axis=1)
+
+    action = node("Identity", [actor(spec, "")], output="action")
+    capacities = []  # in m/s2, [n, 1] each
+    for name in CAPACITIES:
+        column, scale = columns[name]
+        index = constant(f"{name}.column", np.array([column], np.int64))
+        unit = constant(f"{name}.scale", np.array([scale], np.float32))
+        capacities.append(node("Mul", [node("Gather", ["observation", index], axis=1), unit]))
+    below = node("Mul", [node("Min", [action, zero]), capacities[0]])
+    above = node("Mul", [node("Max", [action, zero]), capacities[1]])
+    node("Add", [below, above], output="acceleration_mps2")
+
+    inputs = [helper.make_tensor_value_info("observation", float32, ["n", spec.observation_size])]
+    outputs = [helper.make_tensor_value_info(name, float32, ["n", 1]) for name in ("action", "acceleration_mps2")]
+    graph = helper.make_graph(nodes, "policy", inputs, outputs, constants)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], producer_name="ethbrake-marl")
+    model.ir_version = 8  # supported by every runtime since 2022
+    helper.set_model_props(
+        model,
+        {
+            "algorithm": manifest.algorithm,
+            "manifest_sha256": manifest.manifest_sha256,
+            "features": ",".join(observation.names),
+        },
+    )
+    onnx.checker.check_model(model)
+    data: bytes = model.SerializeToString()
+    return data

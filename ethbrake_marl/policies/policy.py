@@ -1,0 +1,134 @@
+"""A policy in memory: manifest, tensors and deterministic action."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import safetensors.numpy
+from pydantic import ValidationError
+from safetensors import SafetensorError
+
+from ethbrake_marl.episode.observe import View
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.arrays import ArrayRow, check_arrays, safetensors_headers
+from ethbrake_marl.files.model import first_mistake
+from ethbrake_marl.files.store import new_folder, write_file
+from ethbrake_marl.policies.actor import Actor
+from ethbrake_marl.policies.layers import Float32s
+from ethbrake_marl.policies.manifest import Manifest, content_sha256, installed_versions
+from ethbrake_marl.policies.network import NetworkSpec
+from ethbrake_marl.policies.observed import ObservationSchema
+from ethbrake_marl.policies.onnx_model import onnx_model
+
+MANIFEST, WEIGHTS = "manifest.json", "weights.safetensors"  # the files of a bundle
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A policy in memory. ``policy(observations)`` gives its deterministic actions.
+
+    >>> from ethbrake_marl.policies.bundle import load_shipped
+    >>> import numpy as np
+    >>> policy = load_shipped("ppo")
+    >>> policy.manifest.algorithm, len(policy.observation.features)
+    ('ppo', 27)
+    >>> policy(np.zeros((2, 27), np.float32)).shape
+    (2, 1)
+
+    """
+
+    manifest: Manifest
+    tensors: Mapping[str, Float32s]  # weights and biases by name: `NetworkSpec.tensors`
+
+    def __repr__(self) -> str:
+        manifest, scenario = self.manifest, self.manifest.scenario.get("name")
+        return (
+            f"Policy({manifest.algorithm!r}, {len(manifest.observation.features)} observations, {manifest.steps:,}"
+            f" steps on {scenario!r:.66}, sha256 {manifest.manifest_sha256[:12]})"
+        )
+
+    @cached_property
+    def actor(self) -> Actor:
+        """What computes the actions."""
+        return Actor(self.manifest.network, self.tensors)
+
+    @cached_property
+    def observation(self) -> View:
+        """What the policy observes."""
+        return View(self.manifest.observation.features)
+
+    def __call__(self, observations: Float32s) -> Float32s:
+        """Return the actions [n, A] in [-1, 1] for observations [n, F] float32, each by itself."""
+        return self.actor(observations)
+
+    @classmethod
+    def make(cls, tensors: Mapping[str, Float32s], *, network: NetworkSpec, observation: View, **manifest: Any) -> Self:
+        """Return a policy of these tensors. ``manifest``: the other fields of ``Manifest``, but hashes and versions.
+
+        Raises ``InvalidInput`` with the bad tensor or field.
+        """
+        data = serialised(tensors)
+        try:
+            draft = Manifest(
+                **{"versions": installed_versions(), **manifest}, network=network,
+                format_version=network.format_version, observation=ObservationSchema.of(observation),
+                weights_sha256=hashlib.sha256(data).hexdigest(), manifest_sha256="0" * 64,
+            )  # fmt: skip
+            return cls(draft.model_copy(update={"manifest_sha256": _own_sha256(draft)}), checked_tensors(data, network))
+        except ValidationError as error:
+            raise InvalidInput(f"policy: {first_mistake(error)}") from None
+        except ValueError as error:
+            raise InvalidInput(f"policy: {error}") from None
+
+    def save(self, folder: str | os.PathLike[str], *, replace: bool = False) -> None:
+        """Write the bundle as a new folder, completely or not at all. Raises ``AlreadyExists``.
+
+        With ``replace`` an existing folder is deleted once the new one is written.
+        """
+        manifest = self.manifest.model_copy(update={"manifest_sha256": _own_sha256(self.manifest)})
+        with new_folder(Path(folder), replace=replace) as partial:
+            write_file(partial / WEIGHTS, serialised(self.tensors))
+            write_file(partial / MANIFEST, manifest.model_dump_json(indent=2).encode() + b"\n")
+
+    def to_onnx(self) -> bytes:
+        """Return the ONNX model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
+
+        The acceleration is the action times the capacity to brake or to drive, as the policy observes them. The model
+        adds products in another order than this package. Raises ``MissingExtra`` without the package onnx.
+        """
+        return onnx_model(self.manifest, self.observation, self.tensors)
+
+
+def _own_sha256(manifest: Manifest) -> str:
+    return content_sha256(manifest.model_dump(mode="json"))  # keys of earlier versions are not written
+
+
+def serialised(tensors: Mapping[str, Float32s]) -> bytes:
+    """Return the file of these tensors."""
+    return safetensors.numpy.save({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()})
+
+
+def checked_tensors(data: bytes, network: NetworkSpec) -> dict[str, Float32s]:
+    """Return the tensors of a file, read-only, by name.
+
+    Raises ``ValueError`` for a tensor whose name or shape is not the network's, or an entry that is not finite.
+    """
+    check_arrays(
+        safetensors_headers(data), [ArrayRow(name, "F32", shape) for name, shape in network.tensors.items()], "tensor"
+    )
+    try:
+        tensors = safetensors.numpy.load(data)
+    except SafetensorError as error:
+        raise ValueError(f"not a safetensors file ({error})") from None
+    for name, tensor in tensors.items():
+        if not np.isfinite(tensor).all():
+            raise ValueError(f"tensor {name!r}: contains a number that is not finite")
+        tensor.setflags(write=False)
+    return tensors
