@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ethbrake_marl.agents.drive import MESSAGES, MODEL, SENSORS, STATE as TRUE_STATE, Team, play
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import STEPS, TIME, State
-from ethbrake_marl.errors import InvalidInput, count_of, naming_extras, unknown_name
+from ethbrake_marl.errors import AgentFailed, InvalidInput, count_of, naming_extras, unknown_name
 from ethbrake_marl.evaluation.identity import policies_of, versions, worlds_sha256
 from ethbrake_marl.evaluation.measures import DEFAULT, Measure, Values, measured, measures_called
 from ethbrake_marl.motion.digest import physics_digest
@@ -40,11 +40,11 @@ class Result:
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.agents.drive import Team
-    >>> from ethbrake_marl.agents.scripts import COAST, FULL_BRAKE
+    >>> from ethbrake_marl.agents.scripts import Held
     >>> from ethbrake_marl.evaluation.evaluate import evaluate
     >>> from ethbrake_marl.worlds.game import game_of
     >>> scenario, game = game_of("paper-random")
-    >>> teams = {agent.name: Team(agent.name, {2: agent}) for agent in (FULL_BRAKE, COAST)}
+    >>> teams = {name: Team(name, {2: Held(name)}) for name in ("full_brake", "coast")}
     >>> result = evaluate(scenario.draw(3, seed=7), teams, game)
     >>> result["full_brake"]["total_harm"].round(2), result["coast"]["collided"]
     (array([33.79, 77.19,  0.  ]), array([ True,  True,  True]))
@@ -84,7 +84,10 @@ class Result:
     def take(self, rows: Any) -> Result:
         """Return the result in some of its worlds: row numbers, or a mask [n]."""
         columns = {team: {name: each[rows] for name, each in own.items()} for team, own in self.columns.items()}
-        return replace(self, columns=columns, worlds={name: each[rows] for name, each in self.worlds.items()})
+        worlds = {name: each[rows] for name, each in self.worlds.items()}
+        about = {key: value for key, value in self.about.items() if key != "worlds_sha256"}
+        about |= {"count": len(worlds["world"]), "rejected_draws": 0}
+        return replace(self, columns=columns, worlds=worlds, about=about)
 
     def arrays(self) -> Columns:
         """Return a table with one row per team and world: name of a column -> values. A missing number is NaN."""
@@ -109,7 +112,7 @@ def evaluate(
     worlds: Drawn | State,
     agents: Mapping[str, Team],
     game: Game,
-    measures: Iterable[str] = (),
+    measures: str | Iterable[str] = (),
     jobs: int | None = 1,
     *,
     ray: str | None = None,
@@ -122,7 +125,7 @@ def evaluate(
         worlds: worlds at the alert: ``scenario.draw(n, seed)``, or a ``State``, whose recordings are not known.
         agents: name in tables -> team, which drives all learners of the game.
         game: game of the worlds' scenario.
-        measures: names of measures beside the usual ones (``evaluation.measures``).
+        measures: names of measures beside the usual ones (``evaluation.measures``), a list or separated by commas.
         jobs: number of processes.
         ray: ``local``, or address of a Ray cluster; None: processes of joblib.
         about: what else tables and files should say (``identity.about_scenario``).
@@ -135,7 +138,7 @@ def evaluate(
     """
     drawn = worlds if isinstance(worlds, Drawn) else Drawn.given(worlds)
     _check(drawn.worlds, agents, game)
-    chosen = measures_called((*DEFAULT, *measures))
+    chosen = (*measures_called(DEFAULT), *measures_called(measures))
     alert, n = drawn.worlds, drawn.worlds.n
     calls: Any = (
         (drive_chunk, alert.take(slice(first, first + CHUNK)), dict(agents), game, chosen)
@@ -184,13 +187,11 @@ def _driven(alert: State, name: str, team: Team, game: Game, measures: Sequence[
     watches = {each.name: each.watch(whole, alert) for each in measures if each.watch is not None}
     seen = [watch for watch in watches.values() if watch is not None]
     before = alert
-    try:
+    with AgentFailed.naming(name, [script.name for script in game.scripts.values() if hasattr(script, "name")]):
         for step, state in play(game, alert, team, donate=not seen):
             for watch in seen:
                 watch.see(before, step, state)
             before = state
-    except InvalidInput as error:
-        raise InvalidInput(f"agent {name!r}: {error}") from error
     columns: Columns = {}
     for measure in measures:
         columns |= measured(measure, watches.get(measure.name), whole, alert, before)

@@ -46,8 +46,9 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.episode.terms import TERMS, TermFunction
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, describe_error, unknown_name
+from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.motion.layout import COUNT, FIRST, FORCE, SPEED
-from ethbrake_marl.registry import Registry
+from ethbrake_marl.registry import Part, Registry
 
 Values = NDArray[Any]
 Given = Values | Mapping[str, Values] | None
@@ -268,10 +269,13 @@ MEASURES: Registry[Measure] = Registry(
 _REWARDED = ("collision", "risk", "jerk")  # built-in terms of a step, with the constants of a usual reward
 
 
-def measures_called(names: Iterable[str]) -> tuple[Measure, ...]:
-    """Return the measures, summed terms and objectives of these names, each once. Raises ``UnknownName``."""
+def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:
+    """Return the measures, summed terms and objectives of these names, each once; ``FILE.py:NAME`` runs the file.
+
+    Raises ``UnknownName``, and ``InvalidInput`` for a file without such a measure.
+    """
     found: dict[str, Measure] = {}
-    for name in names:
+    for name in names.split(",") if isinstance(names, str) else names:
         found |= {measure.name: measure for measure in _called(name)}
     return tuple(found.values())
 
@@ -283,11 +287,34 @@ def _called(name: str) -> list[Measure]:
         return [_summed(name, partial(_rewarded, name), "1")]
     if name in TERMS:
         return [_summed(name, TERMS[name].value, TERMS[name].unit)]
+    file, _, own = str(name).rpartition(":")
+    if file.endswith(".py"):
+        register_measure(own, *_part(file, own).given, **_part(file, own).settings)
+        measure, called = MEASURES[own], FromFile(file, own)
+        return [measure._replace(of=called) if measure.watch is None else measure._replace(watch=called)]
     kind = str(name).partition(":")[0]
     if kind in OBJECTIVES:
         meaning = f"What the vehicle would minimise: {OBJECTIVES[kind].about}."
         return [Measure(name, partial(_objective, name), meaning, "m2/s2")]
     raise unknown_name("measure", name, (*MEASURES, *_REWARDED, *TERMS, *OBJECTIVES), may_be_own=True)
+
+
+class FromFile(NamedTuple):
+    """A function of a user's Python file, which every process runs for itself."""
+
+    file: str
+    name: str
+
+    def __call__(self, *given: Any) -> Any:
+        """Call the function."""
+        part = _part(self.file, self.name)
+        function = part.given[0] if part.given else part.settings.get("of") or part.settings["watch"]
+        return function(*given)
+
+
+def _part(file: str, name: str) -> Part:
+    part = load_from_file(file, name)
+    return part if isinstance(part, Part) else Part(part)
 
 
 def _summed(name: str, term: TermFunction, unit: str) -> Measure:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.drive import SENSORS, Team
-from ethbrake_marl.agents.scripts import FULL_BRAKE, constant
+from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.evaluation.evaluate import Result, evaluate
 from ethbrake_marl.evaluation.identity import about_scenario
@@ -23,7 +23,7 @@ PAIR: dict[str, Any] = {
     "roles": {"vehicle_2": "learner"},
 }  # fmt: skip
 
-GENTLE = constant(4.0)
+FULL_BRAKE, COAST, GENTLE = Held("full_brake"), Held("coast"), Held("constant:4.0")
 
 
 class Foretold(NamedTuple):

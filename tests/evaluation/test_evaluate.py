@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from ethbrake_marl.agents.drive import Team
-from ethbrake_marl.agents.scripts import COAST, FULL_BRAKE
+from ethbrake_marl.agents.e_v2x_bm import EV2XBM
+from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.terms import TERMS, register_term
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, PhysicsError, UnknownName
@@ -19,8 +21,11 @@ from ethbrake_marl.evaluation.measures import DEFAULT, MEASURES, Statistic, meas
 from ethbrake_marl.evaluation.statistics import mean, rate
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.motion.layout import GAP
+from ethbrake_marl.policies.bundle import load_shipped
+from ethbrake_marl.shields.algorithm_1 import EpisodeShield
+from ethbrake_marl.shields.step import StepShield
 from ethbrake_marl.worlds.game import game_of
-from tests.evaluation.lines import GENTLE, PAIR, Careless, Foreteller, evaluated, recorded, teams
+from tests.evaluation.lines import COAST, FULL_BRAKE, GENTLE, PAIR, Careless, Foreteller, evaluated, recorded, teams
 from tests.refused import refused
 
 # ---- measures
@@ -146,7 +151,73 @@ def test_names_of_measures() -> None:
         evaluated(PAIR, 2, measures=["social:99"])
 
 
+FILE = """
+from ethbrake_marl import Part
+
+
+def gap(game, alert, last):
+    '''Last gap ahead of Vehicle 2, m.'''
+    return last.gaps_m[:, 0]
+
+
+class Pushes:
+    def __init__(self, game, alert):
+        self.steps = 0 * alert.steps
+
+    def see(self, before, step, after):
+        if step is not None:
+            self.steps += (after.gaps_m[:, 0] == 0.0) & ~before.ended
+
+    def result(self, last):
+        return self.steps
+
+
+def pushes(game, alert):
+    '''Steps that end in contact.'''
+    return Pushes(game, alert)
+
+
+steps = Part(watch=pushes, unit="steps")
+number = 3
+"""
+
+
+def test_measures_of_a_python_file__run_in_every_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(MEASURES, "loaded", dict(MEASURES.loaded))
+    monkeypatch.setattr(evaluating, "CHUNK", 5)
+    file = tmp_path / "mine.py"
+    file.write_text(FILE)
+    one, two = (evaluated("paper-random", 10, measures=f"{file}:gap,{file}:steps", jobs=jobs) for jobs in (1, 2))
+    for name in ("gap", "steps"):
+        assert one["full_brake"][name].tolist() == two["full_brake"][name].tolist()
+    assert {each.name: each.unit for each in one.measures[-2:]} == {"gap": "1", "steps": "steps"}
+    assert "mine.py" in one.about["versions"]
+    with refused("does not define 'gap_m'"):
+        measures_called(f"{file}:gap_m")
+    with refused("measure 'number': give one function"):
+        measures_called([f"{file}:number"])
+
+
 # ---- evaluations
+
+
+def test_our_agents__are_sent_to_processes_and_report_what_they_predict(monkeypatch: pytest.MonkeyPatch) -> None:
+    scenario, game = game_of("paper-random")
+    ppo = {2: LearnedAgent(load_shipped("ppo"), "ppo")}
+    agents = {
+        "e_v2x_bm": Team("e", {2: EV2XBM(game.rules)}), "ppo": Team("p", ppo),
+        "ppo+step": Team("s", ppo, StepShield(ppo)), "ppo+episode": Team("a", ppo, EpisodeShield(ppo)),
+    }  # fmt: skip
+    monkeypatch.setattr(evaluating, "CHUNK", 40)
+    one, two = (evaluate(scenario.draw(80, 7), agents, game, jobs=jobs) for jobs in (1, 2))
+    for name, columns in one.columns.items():
+        assert all((two[name][key] == column).all() for key, column in columns.items())
+    assert one["e_v2x_bm"]["predicted_harm"].tolist() == one["e_v2x_bm"]["first_impact_harm"].tolist()
+    assert one["ppo+step"]["replaced_none"].tolist() == (one["ppo+step"]["replaced_actions"] == 0).tolist()
+    least = np.minimum(one["ppo"]["first_impact_harm"], one["e_v2x_bm"]["first_impact_harm"])
+    assert one["ppo+episode"]["first_impact_harm"].tolist() == least.tolist()
+    assert summarise(one)[3]["policy_share"] == rate(one["ppo+episode"]["replaced_none"])
+    assert one.knows["ppo+step"] == "messages + true model" and one.policies["ppo+step"] == one.policies["ppo"] != {}
 
 
 def test_golden_rows() -> None:
@@ -237,7 +308,7 @@ def refusals() -> dict[str, Any]:
         "worlds: 0 worlds": lambda: evaluate(drawn.worlds.take(slice(0)), mine, game),
         "2 worlds of 5 vehicles; must be": lambda: evaluate(pair, mine, game),
         "team 'x': drives vehicle_1; must drive exactly vehicle_2": lambda: evaluate(drawn, {"a": wrong}, game),
-        "agent 'wild': script of vehicle_2: its commands are": lambda: evaluate(drawn, teams(Wild()), game),
+        "agent 'wild', world 0, vehicle_2 at 0.50 s: command nan m/s2": lambda: evaluate(drawn, teams(Wild()), game),
         "'careless' cannot be sent to another process": lambda: evaluate(drawn, teams(local), game, jobs=2),
     }  # fmt: skip
 

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.drive import Team, drive
-from ethbrake_marl.agents.scripts import COAST, FULL_BRAKE
 from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
 from ethbrake_marl.worlds.game import game_of
 from ethbrake_marl.worlds.scenario import Scenario
-from tests.evaluation.lines import GENTLE, PAIR, Careless
+from tests.evaluation.lines import COAST, FULL_BRAKE, GENTLE, PAIR, Careless
 from tests.refused import refused
 
 

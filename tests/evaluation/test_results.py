@@ -12,14 +12,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ethbrake_marl.agents.scripts import COAST, FULL_BRAKE
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation.compare import compare_results
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.results import _digest, read_result, write_results, write_rows
 from ethbrake_marl.evaluation.statistics import difference
 from ethbrake_marl.evaluation.summary import summarise
-from tests.evaluation.lines import GENTLE, PAIR, Foreteller, evaluated, recorded
+from tests.evaluation.lines import COAST, FULL_BRAKE, GENTLE, PAIR, Foreteller, evaluated, recorded
 from tests.refused import refused
 
 ROWS = ["csv", "parquet", "json"]

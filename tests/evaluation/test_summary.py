@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.scripts import COAST, FULL_BRAKE
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.evaluation import statistics
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise, summarise_by, summarise_lists
 from ethbrake_marl.files.sheet import terminal_text
-from tests.evaluation.lines import GENTLE, PAIR, Careless, Foreteller, evaluated, recorded
+from tests.evaluation.lines import COAST, FULL_BRAKE, GENTLE, PAIR, Careless, Foreteller, evaluated, recorded
 from tests.refused import refused
 
 EXPENSIVE = ["sampled_harm", "vehicle_1_shoved_m"]
@@ -219,6 +218,7 @@ def test_groups__have_the_estimates_of_their_worlds() -> None:
     mine = result.worlds["scenario"] == "paper-delay-low"
     harm = result["constant:4.0"]["total_harm"][mine]
     assert tables["paper-delay-low"][1]["total_harm"] == statistics.mean(harm)
+    assert "paper-delay" not in str(tables) and "mixture-delays: 8 worlds" in str(tables["paper-delay-low"])
     with refused("unknown group 'scenarios'; did you mean 'scenario'?", UnknownName):
         summarise_by(result, "scenarios")
     with refused("by = 'scenario': these worlds have no groups", InvalidInput):

@@ -9,7 +9,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.drive import Team
-from ethbrake_marl.agents.scripts import COAST, FULL_BRAKE, constant
+from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.evaluation import statistics as new
 from ethbrake_marl.evaluation.evaluate import evaluate
 from ethbrake_marl.evaluation.identity import about_scenario
@@ -20,7 +20,7 @@ from ethbrake_marl.first_edition.evaluation.own_measures import LOADED, REPORTED
 from ethbrake_marl.worlds.game import game_of
 
 SCENARIOS = ["paper-random", "paper-random-obstacle", "paper-random-buildup", "mixture-delays", "cooperation-2-five"]
-AGENTS = {"full_brake": FULL_BRAKE, "coast": COAST, "constant:2.5": constant(2.5)}
+AGENTS = {name: Held(name) for name in ("full_brake", "coast", "constant:2.5")}
 
 
 @pytest.fixture
@@ -104,7 +104,7 @@ def test_record__is_that_of_the_first_edition(name: str) -> None:
         expected = eb.record_episode(
             earlier.sample(k + 1, seed=7).worlds.take([k]), eb.make_agent("constant:4"), scenario=earlier
         )
-        found = record_episode(scenario.sample(1, 7, first=k), Team("x", {2: constant(4.0)}), game)
+        found = record_episode(scenario.sample(1, 7, first=k), Team("x", {2: Held("constant:4")}), game)
         for field in ("time_s", "gaps_m", "speeds_mps", "positions_m", "command_mps2"):
             np.testing.assert_allclose(getattr(found, field), getattr(expected, field), rtol=1e-9, atol=1e-9)
         impacts, rows = found.impacts, expected.impacts
