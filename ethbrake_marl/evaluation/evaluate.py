@@ -19,7 +19,7 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import STEPS, TIME, State
 from ethbrake_marl.errors import AgentFailed, InvalidInput, count_of, naming_extras, unknown_name
 from ethbrake_marl.evaluation.identity import policies_of, versions, worlds_sha256
-from ethbrake_marl.evaluation.measures import DEFAULT, Measure, Values, measured, measures_called
+from ethbrake_marl.evaluation.measures import DEFAULT, Measure, Values, measured
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import LATENCY, OWN_LATENCY, Bools
 from ethbrake_marl.parallel import run_each
@@ -112,7 +112,7 @@ def evaluate(
     worlds: Drawn | State,
     agents: Mapping[str, Team],
     game: Game,
-    measures: str | Iterable[str] = (),
+    measures: Iterable[Measure] = (),
     jobs: int | None = 1,
     *,
     ray: str | None = None,
@@ -125,20 +125,20 @@ def evaluate(
         worlds: worlds at the alert: ``scenario.draw(n, seed)``, or a ``State``, whose recordings are not known.
         agents: name in tables -> team, which drives all learners of the game.
         game: game of the worlds' scenario.
-        measures: names of measures beside the usual ones (``evaluation.measures``), a list or separated by commas.
+        measures: measures beside the usual ones, for instance ``measures_called("sampled_harm,injury")``.
         jobs: number of processes.
         ray: ``local``, or address of a Ray cluster; None: processes of joblib.
         about: what else tables and files should say (``identity.about_scenario``).
         on_done: called with the number of worlds that all teams have driven so far.
 
     Raises ``InvalidInput`` for worlds that are not at the alert or have another number of vehicles, for a team that
-    does not fit, and for bad commands of an agent; ``UnknownName`` for a measure; ``PhysicsError`` if a check of the
+    does not fit, and for bad commands of an agent; ``PhysicsError`` if a check of the
     physics fails.
 
     """
     drawn = worlds if isinstance(worlds, Drawn) else Drawn.given(worlds)
     _check(drawn.worlds, agents, game)
-    chosen = (*measures_called(DEFAULT), *measures_called(measures))
+    chosen = (*DEFAULT, *measures)
     alert, n = drawn.worlds, drawn.worlds.n
     calls: Any = (
         (drive_chunk, alert.take(slice(first, first + CHUNK)), dict(agents), game, chosen)

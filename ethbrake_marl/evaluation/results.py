@@ -15,7 +15,8 @@ import numpy as np
 
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, naming_extras
 from ethbrake_marl.evaluation.evaluate import Columns, Result
-from ethbrake_marl.evaluation.measures import MEASURES, Measure, Values
+from ethbrake_marl.evaluation.measures import Measure, Values
+from ethbrake_marl.evaluation.named_measures import MEASURES
 from ethbrake_marl.evaluation.summary import IDENTITY, SummaryTable
 from ethbrake_marl.files.plain import parse_strict_json, read_plain
 from ethbrake_marl.files.sheet import Estimate, parquet_file

@@ -79,7 +79,7 @@ class SummaryTable(list[SummaryRow]):
         columns = []
         for place, column in enumerate(self.columns()):
             measure = self.shown[column.name][0]
-            gives_way = 1 if column.name == "collision_rate" else 2 + place + 100 * (measure.name in DEFAULT)
+            gives_way = 1 if column.name == "collision_rate" else 2 + place + 100 * (measure in DEFAULT)
             below = column.name in FIRST_COLUMNS
             never = below and column.name != "collision_rate"
             columns.append(
@@ -91,9 +91,7 @@ class SummaryTable(list[SummaryRow]):
     def measures(self) -> Sheet | None:
         """Return the table of what was asked for and has no column of its own; None without any."""
         asked = {
-            key: measure
-            for key, (measure, each) in self.shown.items()
-            if not each.heading and measure.name not in DEFAULT
+            key: measure for key, (measure, each) in self.shown.items() if not each.heading and measure not in DEFAULT
         }
         rows = [
             (row.agent, _in_words(key, measure), row.estimates[key]) for row in self for key, measure in asked.items()

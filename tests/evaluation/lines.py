@@ -11,6 +11,7 @@ from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.evaluation.evaluate import Result, evaluate
 from ethbrake_marl.evaluation.identity import about_scenario
+from ethbrake_marl.evaluation.named_measures import measures_called
 from ethbrake_marl.worlds.game import game_of
 from ethbrake_marl.worlds.scenario import Scenario
 
@@ -66,7 +67,9 @@ def evaluated(
     loaded, game = game_of(Scenario(**scenario) if isinstance(scenario, dict) else scenario)
     (body,) = game.rules.learners.tolist()
     drawn = loaded.draw(n, 7)
-    return evaluate(drawn, teams(*agents, body=body), game, measures, about=about_scenario(loaded, 7), **more)
+    return evaluate(
+        drawn, teams(*agents, body=body), game, measures_called(measures), about=about_scenario(loaded, 7), **more
+    )
 
 
 def recorded(recordings: int, rows_of_each: int = 20) -> Scenario:

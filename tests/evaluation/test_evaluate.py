@@ -17,7 +17,8 @@ from ethbrake_marl.episode.terms import TERMS, register_term
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, PhysicsError, UnknownName
 from ethbrake_marl.evaluation import evaluate as evaluating
 from ethbrake_marl.evaluation.evaluate import evaluate
-from ethbrake_marl.evaluation.measures import DEFAULT, MEASURES, Statistic, measures_called, register_measure
+from ethbrake_marl.evaluation.measures import DEFAULT, Statistic
+from ethbrake_marl.evaluation.named_measures import MEASURES, measures_called, register_measure
 from ethbrake_marl.evaluation.statistics import mean, rate
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.motion.layout import GAP
@@ -54,7 +55,7 @@ def test_measures__of_one_impact_by_hand() -> None:
 def test_measures__that_cost_are_not_computed_unless_they_are_named() -> None:
     columns = evaluated(PAIR, 2)["full_brake"]
     assert not [name for name in columns if name.startswith(("sampled", "vehicle_1_shoved", "injury"))]
-    assert {name for name in DEFAULT if name not in columns} == {"predicted_harm", "replaced"}
+    assert {each.name for each in DEFAULT if each.name not in columns} == {"predicted_harm", "replaced"}
 
 
 def test_measures__that_are_not_defined_have_no_column() -> None:

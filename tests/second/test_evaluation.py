@@ -13,6 +13,7 @@ from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.evaluation import statistics as new
 from ethbrake_marl.evaluation.evaluate import evaluate
 from ethbrake_marl.evaluation.identity import about_scenario
+from ethbrake_marl.evaluation.named_measures import measures_called
 from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.first_edition.evaluation import statistics as old
@@ -43,7 +44,7 @@ def test_columns__are_those_of_the_first_edition(name: str) -> None:
     (body,) = game.rules.learners.tolist()
     teams = {key: Team(key, {body: agent}) for key, agent in AGENTS.items()}
     measures = ["sampled_harm", "vehicle_1_shoved_m", "injury"]
-    found = evaluate(scenario.draw(300, 7), teams, game, measures, about=about_scenario(scenario, 7))
+    found = evaluate(scenario.draw(300, 7), teams, game, measures_called(measures), about=about_scenario(scenario, 7))
     exact = "buildup" not in name
     for key in AGENTS:
         columns = expected.outcome(key).columns()
