@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ethbrake_marl.errors import count_of
+from ethbrake_marl.evaluation.summary_row import EXPLOITS, SEES_THROUGH, SummaryRow
 from ethbrake_marl.worlds.rules import RULES
-
-if TYPE_CHECKING:
-    from ethbrake_marl.evaluation.summary import SummaryRow
 
 SYMBOLS = {
     "gaps_m": ("d", "m"), "speeds_mps": ("v", "m/s"), "braking_capacity_mps2": ("braking capacity", "m/s²"),
@@ -21,7 +19,6 @@ SYMBOLS = {
     "harm_weight": ("weight of harm", ""),
 }  # fmt: skip
 STAY = "\u00a0"  # a space at which no line ends
-SEES_THROUGH, EXPLOITS = "†", "‡"  # marks of agents
 
 
 def ranges_of(worlds: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,11 +10,12 @@ from typing import Any, Literal
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.captions import EXPLOITS
+from ethbrake_marl.evaluation.captions import by_recording
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.results import HARMS, Saved
 from ethbrake_marl.evaluation.statistics import difference, unpaired
 from ethbrake_marl.evaluation.summary import summarise
+from ethbrake_marl.evaluation.summary_row import EXPLOITS
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet
 
 SAME = {  # what two results must have in common -> what differs otherwise
@@ -73,7 +74,7 @@ class Comparison:
         how = "paired by world"
         if self.unpaired_because:
             how = f"NOT paired by world, so wider than paired intervals: {self.unpaired_because}"
-        by = f"; 95 % intervals by {self.recordings:,} recordings" if self.recordings else ""
+        by = by_recording(self.recordings)
         notes = [f"Second minus first, mean per world in m²/s²; in brackets: 95 % intervals, {how}{by}."]
         damage = [
             f"{each.agent} ({' and '.join(exploits)}, {which} result)"
@@ -87,7 +88,7 @@ class Comparison:
             if agents:
                 notes.append(f"Only in the {which} result: {', '.join(agents)}.")
         for name, (one, other) in self.changed.items():
-            if "SHA-256" in f"{one}{other}" or name.endswith("sha256"):
+            if "SHA-256" in f"{one}{other}" or name == "physics_digest":
                 notes.append(f"Note: {name} differs.")
             else:
                 notes.append(f"Note: {name}: {one} in the first result, {other} in the second.")
@@ -169,4 +170,4 @@ def _recorded(saved: Saved, key: str) -> Any:
 
 def _noted(saved: Saved) -> dict[str, Any]:
     parts = [each for key in NOTED if isinstance(each := saved.about.get(key), dict)]
-    return {"physics_sha256": saved.about.get("physics_sha256"), **{k: v for part in parts for k, v in part.items()}}
+    return {"physics_digest": saved.about.get("physics_digest"), **{k: v for part in parts for k, v in part.items()}}

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from ethbrake_marl.agents.drive import MESSAGES, MODEL, SENSORS, STATE as TRUE_STATE, Team, play
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import STEPS, TIME, State
-from ethbrake_marl.errors import InvalidInput, count_of, naming_extras, unknown_name
+from ethbrake_marl.errors import AgentFailed, InvalidInput, count_of, naming_extras, unknown_name
 from ethbrake_marl.evaluation.identity import policies_of, versions, worlds_sha256
-from ethbrake_marl.evaluation.measures import DEFAULT, Measure, Values, measured, measures_called
-from ethbrake_marl.motion.compiling import physics_sha256
+from ethbrake_marl.evaluation.measures import DEFAULT, Measure, Values, measured
+from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import LATENCY, OWN_LATENCY, Bools
 from ethbrake_marl.parallel import run_each
 from ethbrake_marl.worlds.describe import clusters_of, columns_of
@@ -40,11 +40,11 @@ class Result:
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.agents.drive import Team
-    >>> from ethbrake_marl.agents.scripts import COAST, FULL_BRAKE
+    >>> from ethbrake_marl.agents.scripts import Held
     >>> from ethbrake_marl.evaluation.evaluate import evaluate
     >>> from ethbrake_marl.worlds.game import game_of
     >>> scenario, game = game_of("paper-random")
-    >>> teams = {agent.name: Team(agent.name, {2: agent}) for agent in (FULL_BRAKE, COAST)}
+    >>> teams = {name: Team(name, {2: Held(name)}) for name in ("full_brake", "coast")}
     >>> result = evaluate(scenario.draw(3, seed=7), teams, game)
     >>> result["full_brake"]["total_harm"].round(2), result["coast"]["collided"]
     (array([33.79, 77.19,  0.  ]), array([ True,  True,  True]))
@@ -84,7 +84,10 @@ class Result:
     def take(self, rows: Any) -> Result:
         """Return the result in some of its worlds: row numbers, or a mask [n]."""
         columns = {team: {name: each[rows] for name, each in own.items()} for team, own in self.columns.items()}
-        return replace(self, columns=columns, worlds={name: each[rows] for name, each in self.worlds.items()})
+        worlds = {name: each[rows] for name, each in self.worlds.items()}
+        about = {key: value for key, value in self.about.items() if key != "worlds_sha256"}
+        about |= {"count": len(worlds["world"]), "rejected_draws": 0}
+        return replace(self, columns=columns, worlds=worlds, about=about)
 
     def arrays(self) -> Columns:
         """Return a table with one row per team and world: name of a column -> values. A missing number is NaN."""
@@ -109,7 +112,7 @@ def evaluate(
     worlds: Drawn | State,
     agents: Mapping[str, Team],
     game: Game,
-    measures: Iterable[str] = (),
+    measures: Iterable[Measure] = (),
     jobs: int | None = 1,
     *,
     ray: str | None = None,
@@ -122,38 +125,32 @@ def evaluate(
         worlds: worlds at the alert: ``scenario.draw(n, seed)``, or a ``State``, whose recordings are not known.
         agents: name in tables -> team, which drives all learners of the game.
         game: game of the worlds' scenario.
-        measures: names of measures beside the usual ones (``evaluation.measures``).
+        measures: measures beside the usual ones, for instance ``measures_called("sampled_harm,injury")``.
         jobs: number of processes.
         ray: ``local``, or address of a Ray cluster; None: processes of joblib.
         about: what else tables and files should say (``identity.about_scenario``).
         on_done: called with the number of worlds that all teams have driven so far.
 
     Raises ``InvalidInput`` for worlds that are not at the alert or have another number of vehicles, for a team that
-    does not fit, and for bad commands of an agent; ``UnknownName`` for a measure; ``PhysicsError`` if a check of the
+    does not fit, and for bad commands of an agent; ``PhysicsError`` if a check of the
     physics fails.
 
     """
     drawn = worlds if isinstance(worlds, Drawn) else Drawn.given(worlds)
     _check(drawn.worlds, agents, game)
-    chosen = measures_called((*DEFAULT, *measures))
+    chosen = (*DEFAULT, *measures)
     alert, n = drawn.worlds, drawn.worlds.n
     calls: Any = (
         (drive_chunk, alert.take(slice(first, first + CHUNK)), dict(agents), game, chosen)
         for first in range(0, n, CHUNK)
     )
+    if jobs not in (None, 1) or ray is not None:
+        _check_can_be_sent(agents, chosen)
     parts: list[dict[str, Columns]] = []
-    try:
-        for part in run_each(calls, jobs, ray):
-            parts.append(part)
-            if on_done is not None:
-                on_done(min(len(parts) * CHUNK, n))
-    except (pickle.PicklingError, AttributeError, TypeError) as error:
-        if jobs in (None, 1) and ray is None:
-            raise
-        raise InvalidInput(
-            f"evaluate: jobs = {jobs}: an agent or a measure cannot be sent to another process ({error}); define its"
-            " class or function in a module, or use jobs=1"
-        ) from error
+    for part in run_each(calls, jobs, ray):
+        parts.append(part)
+        if on_done is not None:
+            on_done(min(len(parts) * CHUNK, n))
     learners = game.rules.learners.tolist()
     columns = columns_of(drawn)
     return Result(
@@ -172,7 +169,7 @@ def evaluate(
             "rejected_draws": drawn.rejected,
             **(about or {}),
             "worlds_sha256": worlds_sha256(alert),
-            "physics_sha256": physics_sha256(),
+            "physics_digest": physics_digest(),
             "versions": versions(),
         },
     )
@@ -190,13 +187,11 @@ def _driven(alert: State, name: str, team: Team, game: Game, measures: Sequence[
     watches = {each.name: each.watch(whole, alert) for each in measures if each.watch is not None}
     seen = [watch for watch in watches.values() if watch is not None]
     before = alert
-    try:
+    with AgentFailed.naming(name, [script.name for script in game.scripts.values() if hasattr(script, "name")]):
         for step, state in play(game, alert, team, donate=not seen):
             for watch in seen:
                 watch.see(before, step, state)
             before = state
-    except InvalidInput as error:
-        raise InvalidInput(f"agent {name!r}: {error}") from error
     columns: Columns = {}
     for measure in measures:
         columns |= measured(measure, watches.get(measure.name), whole, alert, before)
@@ -225,8 +220,20 @@ def hidden_from(alert: State, learners: Sequence[int]) -> Bools:
 
 def known_by(team: Team) -> str:
     """Return what a team has to know, as one text: ``messages + true model``."""
-    each = {getattr(one, "knows", UNSTATED) for one in (*team.drivers.values(), *filter(None, (team.shield,)))}
+    each = {getattr(agent, "knows", UNSTATED) for agent in team.drivers.values()}
+    each |= {getattr(team.shield, "knows", MODEL)} if team.shield is not None else set()
     return " + ".join(sorted(each, key=lambda word: (*KNOWLEDGE, word).index(word)))
+
+
+def _check_can_be_sent(agents: Mapping[str, Team], measures: Sequence[Measure]) -> None:
+    for name, part in (*agents.items(), *((measure.name, measure) for measure in measures)):
+        try:
+            pickle.dumps(part)
+        except Exception as error:
+            raise InvalidInput(
+                f"evaluate: {name!r:.60} cannot be sent to another process ({error}); define its classes and functions"
+                " in a module, or use jobs=1"
+            ) from error
 
 
 def _check(alert: State, agents: Mapping[str, Team], game: Game) -> None:

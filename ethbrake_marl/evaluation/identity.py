@@ -48,6 +48,6 @@ def versions() -> dict[str, str]:
 
 
 def policies_of(drivers: Mapping[int, object]) -> dict[str, str]:
-    """Return the SHA-256 of the policy of each vehicle whose agent states it: ``policy_sha256``."""
-    each = {f"vehicle_{body}": getattr(agent, "policy_sha256", None) for body, agent in drivers.items()}
-    return {name: str(sha256) for name, sha256 in each.items() if sha256}
+    """Return the SHA-256 of the manifest of each vehicle's policy; vehicles without a policy of ours are left out."""
+    manifests = {body: getattr(getattr(agent, "policy", None), "manifest", None) for body, agent in drivers.items()}
+    return {f"vehicle_{body}": each.manifest_sha256 for body, each in manifests.items() if each is not None}

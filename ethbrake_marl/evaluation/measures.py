@@ -18,17 +18,18 @@ of a state                               what it is (``episode.state.State``)
 ``braking_capacity_mps2``, ``driving_``  [n, N] m/s2 on this road
 ``time_s``, ``steps``, ``ended``         [n] s since the alert; steps taken; whether the episode has ended
 ``memories``                             body -> memory of its agent; ``"shield"`` -> memory of the shield
+``car``, ``line``                        [n, rows, N + 1] all parameters, all that changes (``motion.layout``)
 =======================================  ===============================================================================
 
-Every evaluation has DEFAULT. All other measures cost something and are computed if they are named: registered ones, the
-sum over all steps of any term of a reward (``episode.terms``), and the value of an objective (``social:45``), in both
-counts, for each vehicle.
+A ``Watch`` also sees what each step did (``episode.step.Step``): ``first_impact_harm`` and ``total_harm`` of the line,
+[n] m2/s2; ``reward`` [n, N] and its ``terms``; ``terminated``, ``truncated`` and ``safe_end``, [n].
+
+Every evaluation has DEFAULT. Other measures, which cost something, are named: ``evaluation.named_measures``.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -36,14 +37,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, objectives_of
-from ethbrake_marl.episode.reward import Rewarding
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
-from ethbrake_marl.episode.terms import TERMS, TermFunction
-from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, describe_error, unknown_name
+from ethbrake_marl.errors import EthBrakeError, InvalidInput, describe_error
 from ethbrake_marl.motion.layout import COUNT, FIRST, FORCE, SPEED
-from ethbrake_marl.registry import Registry
 
 Values = NDArray[Any]
 Given = Values | Mapping[str, Values] | None
@@ -107,25 +104,6 @@ def flat(measure: Measure, given: Given, last: State) -> dict[str, Values]:
     return columns
 
 
-class SummedTerm:
-    """Adds up a term of a reward over all steps."""
-
-    def __init__(self, term: TermFunction, game: Game, alert: State) -> None:
-        self.term, self.sum = term, np.zeros(alert.n)
-
-    def see(self, before: State, step: Step | None, after: State) -> None:
-        """Add the step's term, 0 in episodes that had ended."""
-        if step is not None:
-            value = self.term(before, step, after)
-            self.sum = (self.sum if self.sum.shape == value.shape else np.zeros(value.shape)) + np.where(
-                before.ended if value.ndim == 1 else before.ended[:, np.newaxis], 0.0, value
-            )
-
-    def result(self, last: State) -> Given:
-        """Return the sum."""
-        return self.sum
-
-
 # ---- built-in measures
 
 
@@ -169,16 +147,20 @@ def predicted_harm(game: Game, alert: State, last: State) -> Given:
 
 
 def replaced(game: Game, alert: State, last: State) -> Given:
-    """Number of actions that the shield replaced, and whether it replaced none."""
-    number = getattr(last.memories.get("shield"), "replaced", None)
-    return None if number is None else {"actions": number, "none": number == 0}
+    """Number of actions that the shield replaced; whether it replaced none, or let the policy drive (Algorithm 1)."""
+    memory: Any = last.memories.get("shield")
+    if hasattr(memory, "chosen"):
+        return {"none": memory.chosen}
+    if hasattr(memory, "replaced"):
+        return {"actions": memory.replaced, "none": memory.replaced == 0}
+    return None
 
 
 def _built_in(of: Callable[[Game, State, State], Given], unit: str, *shown: Statistic) -> Measure:
     return Measure(of.__name__, of, of.__doc__ or "", unit, shown)
 
 
-_BUILT_IN = (
+DEFAULT = (
     _built_in(collided, "", Statistic("collision_rate", "rate", "Collisions")),
     Measure(
         "first_impact_harm", partial(harm, "first"),
@@ -207,96 +189,6 @@ _BUILT_IN = (
     _built_in(predicted_harm, "m2/s2", Statistic("predicted_harm", "mean", "Predicted harm", "Pre-\ndicted")),
     _built_in(replaced, "1", Statistic("policy_share", "rate", ending="none")),
 )  # fmt: skip
-
-DEFAULT = tuple(measure.name for measure in _BUILT_IN)
-
-
-def register_measure(
-    name: str,
-    of: Callable[[Game, State, State], Given] | None = None,
-    *,
-    unit: str = "1",
-    shown: Iterable[Statistic] = (),
-    watch: Callable[[Game, State], Watch | None] | None = None,
-) -> None:
-    """Register a measure, for ``evaluate(measures=[name])``. Entry points: ``ethbrake_marl.episode_measures``.
-
-    Raises ``AlreadyExists`` for a name in use, and ``InvalidInput`` for a bad name or a function without a docstring,
-    which says what the measure means.
-
-    Args:
-        name: 1 to 64 characters ``a-z``, ``0-9``, ``_``, beginning with a letter, not ending in ``_`` and a number, nor
-            in ``_interval``, ``_low``, ``_high``, ``_error``, ``_freedom``.
-        of: ``of(game, alert, last)`` returns [n] or [n, N].
-        unit: unit of the value.
-        shown: how tables show it; by default the mean, or the share of worlds in which it is true.
-        watch: in place of ``of``: ``watch(game, alert)`` returns a ``Watch``, which sees every step.
-
-    >>> import ethbrake_marl as eb
-    >>> from ethbrake_marl.evaluation.measures import register_measure
-    >>> def hardest(game, alert, last):
-    ...     '''Speed at which the rear vehicle ends, m/s.'''
-    ...     return last.speeds_mps[:, -1]
-    >>> register_measure("rear_speed_mps", hardest, unit="m/s")
-
-    """
-    right = r"(?!.*_([0-9]+|interval|low|high|error|freedom)\Z)[a-z][a-z0-9_]{0,63}"
-    if not isinstance(name, str) or re.fullmatch(right, name) is None:
-        raise InvalidInput(
-            f"measure {name!r:.80}: the name must be 1 to 64 characters a-z, 0-9 and _, beginning with a letter and not"
-            " ending in _ and a number, nor in _interval, _low, _high, _error or _freedom"
-        )
-    function = watch if of is None else of
-    if (of is None) == (watch is None) or not callable(function) or not (function.__doc__ or "").strip():
-        raise InvalidInput(f"measure {name!r}: give one function, of= or watch=, with a docstring that describes it")
-    measure = Measure(name, of, " ".join(str(function.__doc__).split()), str(unit), tuple(shown), watch)
-    if name in DEFAULT or name in TERMS:
-        raise AlreadyExists(f"measure {name!r}: this name is already in use; give another name")
-    MEASURES.add(name, measure, lambda other: other == measure)
-
-
-MEASURES: Registry[Measure] = Registry(
-    "measure", "episode_measures", register_measure, {measure.name: measure for measure in _BUILT_IN}
-)
-
-_REWARDED = ("collision", "risk", "jerk")  # built-in terms of a step, with the constants of a usual reward
-
-
-def measures_called(names: Iterable[str]) -> tuple[Measure, ...]:
-    """Return the measures, summed terms and objectives of these names, each once. Raises ``UnknownName``."""
-    found: dict[str, Measure] = {}
-    for name in names:
-        found |= {measure.name: measure for measure in _called(name)}
-    return tuple(found.values())
-
-
-def _called(name: str) -> list[Measure]:
-    if name in MEASURES:
-        return [MEASURES[each] for each in MEASURES.load(name)]
-    if name in _REWARDED:
-        return [_summed(name, partial(_rewarded, name), "1")]
-    if name in TERMS:
-        return [_summed(name, TERMS[name].value, TERMS[name].unit)]
-    kind = str(name).partition(":")[0]
-    if kind in OBJECTIVES:
-        meaning = f"What the vehicle would minimise: {OBJECTIVES[kind].about}."
-        return [Measure(name, partial(_objective, name), meaning, "m2/s2")]
-    raise unknown_name("measure", name, (*MEASURES, *_REWARDED, *TERMS, *OBJECTIVES), may_be_own=True)
-
-
-def _summed(name: str, term: TermFunction, unit: str) -> Measure:
-    return Measure(name, None, f"Sum of the term {name} over all steps.", unit, watch=partial(SummedTerm, term))
-
-
-def _rewarded(name: str, before: State, step: Step, after: State) -> Values:
-    learners, times = np.zeros(0, np.int64), (step.time_step_s, 0.0)
-    rewarding, _ = Rewarding.of({"harm": 0.0, name: 1.0}, "total", after.vehicles, learners, times, None)
-    return rewarding.terms[0][2](before, step, after)
-
-
-def _objective(name: str, game: Game, alert: State, last: State) -> Given:
-    objectives = objectives_of(name, last.vehicles)
-    return {count: amounts(objectives, None, last, count) for count in ("first", "total")}
 
 
 def measured(measure: Measure, watch: Watch | None, game: Game, alert: State, last: State) -> dict[str, Values]:

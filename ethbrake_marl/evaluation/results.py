@@ -15,7 +15,8 @@ import numpy as np
 
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, naming_extras
 from ethbrake_marl.evaluation.evaluate import Columns, Result
-from ethbrake_marl.evaluation.measures import MEASURES, Measure, Values
+from ethbrake_marl.evaluation.measures import Measure, Values
+from ethbrake_marl.evaluation.named_measures import MEASURES
 from ethbrake_marl.evaluation.summary import IDENTITY, SummaryTable
 from ethbrake_marl.files.plain import parse_strict_json, read_plain
 from ethbrake_marl.files.sheet import Estimate, parquet_file
@@ -188,10 +189,9 @@ def _beside(file: Path, agents: Mapping[str, Mapping[str, Any]]) -> tuple[Result
             for name, part in parts.items()
         }
         described = {name: _typed(table[name], parts[own["agent"]], kind) for name, kind in worlds.items()}
-        every = [*(each for own in columns.values() for each in own.values()), *described.values()]
-        sizes = {len(each) for each in every if each is not None}
-        if sizes != {own["episodes"]}:
-            raise ValueError(f"has {sizes} rows per agent, but {file} {own['episodes']} episodes")
+        sizes = {name: int(part.sum()) for name, part in parts.items()}
+        if set(sizes.values()) != {own["episodes"]} or sum(sizes.values()) != len(table["agent"]):
+            raise ValueError(f"{rows.name} has rows of other agents, or not {own['episodes']} of each")
         measures = tuple(
             MEASURES.loaded.get(name, Measure(name, unit=str(unit))) for name, unit in beside["measures"].items()
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.errors import InvalidInput, naming_extras, unknown_name
 from ethbrake_marl.evaluation import statistics
-from ethbrake_marl.evaluation.captions import EXPLOITS, SEES_THROUGH, caption, notes_of, ranges_of
+from ethbrake_marl.evaluation.captions import caption, notes_of, ranges_of
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.measures import DEFAULT, HORIZON, Measure, Statistic, Values
+from ethbrake_marl.evaluation.summary_row import SEES_THROUGH, SummaryRow
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, terminal_text
 
 BASELINE = "full_brake"
-FAR_M, MOVING = 5.0, 0.05  # mean way of shoving, and share of worlds moving at the horizon, that are exploits
-OMNISCIENT = ("true state", "true model")
 FIRST_COLUMNS = ("collision_rate", "first_impact_harm", "total_harm")  # their intervals stand below the values
 
 HEAD = {
@@ -31,59 +30,6 @@ HEAD = {
     " they read values that the V2X channel hides in these worlds.",
     "Decrease": "1 − (mean harm) / (mean harm of the baseline in the same worlds). Interval: delta method.",
 }
-
-
-@dataclass(frozen=True)
-class SummaryRow:
-    """Results of one team. ``row["total_harm"]`` is an estimate by its key in JSON, None where it is not defined."""
-
-    agent: str
-    knows: str  # what the team has to know
-    estimates: Mapping[str, Estimate | None]
-    collisions: int  # number of worlds with an impact
-    horizon_ends: int  # number of worlds in which a vehicle still moves at the horizon
-    episodes: int  # number of worlds
-    hidden_share: float  # share of worlds in which the V2X channel hides something from a controlled vehicle
-    policies: Mapping[str, str]  # vehicle -> SHA-256 of its policy
-
-    def __getitem__(self, key: str) -> Estimate | None:
-        if key not in self.estimates:
-            raise unknown_name("estimate", key, self.estimates)
-        return self.estimates[key]
-
-    @property
-    def sees_through(self) -> bool:
-        """Whether the team reads values that the V2X channel hides in these worlds."""
-        return self.hidden_share > 0.0 and any(word in self.knows for word in OMNISCIENT)
-
-    @property
-    def exploits(self) -> dict[str, str]:
-        """Damage that harm does not count -> its size in words: ``shoves`` Vehicle 1, ``moving`` at the horizon."""
-        shoved, moving = self.estimates.get("vehicle_1_shoved_m"), self.horizon_ends / self.episodes
-        words = {}
-        if shoved is not None and shoved.value > FAR_M:
-            words["shoves"] = f"shoves Vehicle 1 by {shoved.value:.1f} m on average"
-        if moving > MOVING:
-            words["moving"] = f"runs past the horizon in {100 * moving:.1f} % of worlds"
-        return words
-
-    @property
-    def marked(self) -> str:
-        """Name of the team, followed by ‡ if it has exploits."""
-        return f"{self.agent} {EXPLOITS}" if self.exploits else self.agent
-
-    def to_json(self) -> dict[str, Any]:
-        """Return plain data: each estimate with interval, standard error and degrees of freedom, null if unknown."""
-        plain: dict[str, Any] = {
-            "agent": self.agent, "knows": self.knows, "sees_through_channel": self.sees_through,
-            "hidden_share": self.hidden_share, "episodes": self.episodes, "collisions": self.collisions,
-            "horizon_ends": self.horizon_ends, "exploits": list(self.exploits),
-        }  # fmt: skip
-        for key, each in self.estimates.items():
-            plain |= Estimate.side_by_side({key: each})
-            plain[f"{key}_error"] = None if each is None else each.error
-            plain[f"{key}_freedom"] = None if each is None else each.freedom
-        return plain | {"policy_sha256": dict(self.policies)}
 
 
 class SummaryTable(list[SummaryRow]):
@@ -133,7 +79,7 @@ class SummaryTable(list[SummaryRow]):
         columns = []
         for place, column in enumerate(self.columns()):
             measure = self.shown[column.name][0]
-            gives_way = 1 if column.name == "collision_rate" else 2 + place + 100 * (measure.name in DEFAULT)
+            gives_way = 1 if column.name == "collision_rate" else 2 + place + 100 * (measure in DEFAULT)
             below = column.name in FIRST_COLUMNS
             never = below and column.name != "collision_rate"
             columns.append(
@@ -145,9 +91,7 @@ class SummaryTable(list[SummaryRow]):
     def measures(self) -> Sheet | None:
         """Return the table of what was asked for and has no column of its own; None without any."""
         asked = {
-            key: measure
-            for key, (measure, each) in self.shown.items()
-            if not each.heading and measure.name not in DEFAULT
+            key: measure for key, (measure, each) in self.shown.items() if not each.heading and measure not in DEFAULT
         }
         rows = [
             (row.agent, _in_words(key, measure), row.estimates[key]) for row in self for key, measure in asked.items()
@@ -206,7 +150,7 @@ class SummaryTable(list[SummaryRow]):
         return "\n\n".join([worlds, *self.notes()])
 
 
-IDENTITY = ("worlds_sha256", "scenario_sha256", "physics_sha256", "versions")
+IDENTITY = ("worlds_sha256", "scenario_sha256", "physics_digest", "versions")
 _PERCENT: dict[str, Any] = {"digits": 1, "scale": 100.0, "unit": " %"}
 _FORMATS = {"rate": _PERCENT, "decrease": _PERCENT}
 

@@ -9,7 +9,6 @@ machine code is therefore named by the digest of all sources of kernels.
 
 from __future__ import annotations
 
-import ast
 import atexit
 import hashlib
 import os
@@ -74,19 +73,6 @@ def folder_of(file: str) -> Path:
         pass
     _warn_once()
     return temporary
-
-
-@cache
-def physics_sha256() -> str:
-    """Return a digest of the sources of all motion, without comments and docstrings: which physics gave a result."""
-    digest = hashlib.sha256()
-    for path in sorted((PACKAGE / SOURCES[0]).glob("*.py")):
-        tree = ast.parse(path.read_bytes())
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
-                node.body = node.body[1:] or [ast.Pass()]
-        digest.update(ast.unparse(tree).encode())
-    return digest.hexdigest()
 
 
 @cache
