@@ -118,7 +118,7 @@ def test_train__needs_no_stream_for_its_progress(broken: str, tmp_path: Path) ->
     lines = {
         "closed": "sys.stderr.close()",
         "missing": "sys.stderr = None",
-        "no isatty": "sys.stderr = type('Stream', (), {'write': lambda self, text: len(text), 'flush': lambda self: None})()",
+        "no isatty": "import types; sys.stderr = types.SimpleNamespace(write=len, flush=lambda: None)",
         "full": "sys.stderr = open('/dev/full', 'w')",
     }
     code = (
