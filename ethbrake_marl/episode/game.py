@@ -33,7 +33,10 @@ class Shield(Protocol):
         """Return the memory for new episodes, whose first decision is ``state``."""
 
     def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Any]:
-        """Return the actions to apply, [n, L], and the new memory. ``proposed`` None: its own agents propose."""
+        """Return the actions to apply, [n, L], and the new memory.
+
+        ``proposed`` [n, L] are in [-1, 1]; NaN: nothing is proposed. None: its own agents propose.
+        """
 
     def infos(self, game: Game, state: State) -> dict[str, Any]:
         """Return what users may want to know of it: name -> [n]."""
@@ -80,10 +83,13 @@ class Game(NamedTuple):
     def step(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
         """Return the state after one step of all worlds, and what the step did.
 
-        ``actions`` [n, L] of the learners, in [-1, 1]; None: the shield's own agents propose them. ``donate``: the
-        memory of ``state`` may be reused. What raises leaves ``state`` as it was.
+        ``actions`` [n, L] of the learners, in [-1, 1]; behind a shield they are proposals, NaN where there is none, and
+        None lets the shield's own agents propose. ``donate``: the memory of ``state`` may be reused. What raises leaves
+        ``state`` as it was. Raises ``InvalidInput`` for bad actions.
         """
         if self.shield is not None:
+            if actions is not None:
+                actions = one_step.proposals(self.rules, actions, state.n)
             actions, memory = self.shield.decide(self, state, actions, donate=donate)
             state = state._replace(memories={**state.memories, "shield": memory})
         if self.rewarding.is_compiled:

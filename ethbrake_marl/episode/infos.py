@@ -89,17 +89,24 @@ def of_step(game: Game, state: State, step: Step | None, seed: int) -> dict[str,
 
 def dictionaries(game: Game, state: State, step: Step | None, seed: int, bodies: Ints) -> list[dict[str, Any]]:
     """Return one dictionary for each world and body, world by world."""
-    found = of_step(game, state, step, seed) | game.own_infos(state)
-    shared = {name: value.tolist() for name, value in found.items() if value.ndim == 1}
-    own = {name: value[:, bodies - 1].tolist() for name, value in found.items() if value.ndim == 2}
-    infos: list[dict[str, Any]] = []
-    for k, world in enumerate(numbers(state, bodies).tolist()):
-        common = {name: column[k] for name, column in shared.items()}
-        for o, values in enumerate(world):
-            info = dict(zip(NUMBERS, values, strict=True))
-            info["collided"] = values[COLLIDED] == 1.0
-            infos.append(info | common | {name: column[k][o] for name, column in own.items()})
+    infos = []
+    shared = per_body(of_step(game, state, step, seed) | game.own_infos(state), state.n, bodies)
+    for values, common in zip(numbers(state, bodies).reshape(-1, len(NUMBERS)).tolist(), shared, strict=True):
+        info = dict(zip(NUMBERS, values, strict=True))
+        info["collided"] = values[COLLIDED] == 1.0
+        infos.append(info | common)
     return infos
+
+
+def per_body(columns: dict[str, Any], n: int, bodies: Ints) -> list[dict[str, Any]]:
+    """Return columns, [n] or [n, N], as one dictionary for each world and body, world by world."""
+    shared = {name: value.tolist() for name, value in columns.items() if value.ndim == 1}
+    own = {name: value[:, bodies - 1].tolist() for name, value in columns.items() if value.ndim == 2}
+    rows = []
+    for k in range(n):
+        common = {name: column[k] for name, column in shared.items()}
+        rows += [common | {name: column[k][o] for name, column in own.items()} for o in range(len(bodies))]
+    return rows
 
 
 def arrays(game: Game, state: State, step: Step | None, seed: int, body: int) -> dict[str, Any]:

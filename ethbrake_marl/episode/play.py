@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ethbrake_marl.episode.state import CLOCK_COLUMNS, ENDED, STEPS, State, harm_so_far
+from ethbrake_marl.episode.state import ENDED, STEPS, State, harm_so_far
 from ethbrake_marl.episode.step import advance, command
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.drive import FAILED, drive
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from ethbrake_marl.episode.game import Game
 
 
-def working_memory(bodies: int) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return working memory: of the physics, and for one world's line, commands and clock."""
-    return scratch_for(bodies), np.zeros((LINE_ROWS, bodies)), np.zeros(bodies), np.zeros(CLOCK_COLUMNS)
+def working_memory(bodies: int) -> tuple[Floats, Floats, Floats]:
+    """Return working memory: of the physics, and for one world's line and commands."""
+    return scratch_for(bodies), np.zeros((LINE_ROWS, bodies)), np.zeros(bodies)
 
 
 @large
@@ -36,26 +36,21 @@ def copy(source, target):
 
 
 @large
-def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, horizon_s, total, memory, out):
-    """Write the harm of every plan [T, L] to ``out`` [n]; a plan's last decision repeats; stop above ``most`` [n]."""
-    scratch, here, commands, now = memory
+def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, horizon_s, total, scratch, out):
+    """Follow every plan [T, L], in place; write the harm to ``out`` [n]; stop above ``most`` [n]."""
     for k in range(len(out)):
-        for row in range(here.shape[0]):
-            copy(line[k, row], here[row])
-        copy(wanted[k], commands)
-        copy(clock[k], now)
-        harm = harm_so_far(here, total)
-        while now[ENDED] == 0.0 and harm <= most[k]:
-            command(car[k], commands, learners, plans[k, min(int(now[STEPS]), plans.shape[1] - 1)])
-            met, _ = advance(here, car[k], now, commands, scratch, time_step_s, horizon_s)
-            harm = math.inf if met == FAILED else harm_so_far(here, total)
+        harm = harm_so_far(line[k], total)
+        while clock[k, ENDED] == 0.0 and harm <= most[k]:
+            command(car[k], wanted[k], learners, plans[k, min(int(clock[k, STEPS]), plans.shape[1] - 1)])
+            met, _ = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s, horizon_s)
+            harm = math.inf if met == FAILED else harm_so_far(line[k], total)
         out[k] = harm
 
 
 @large
 def hold_worlds(line, car, wanted, bodies, tried, time, until, total, memory, out):
     """Write both counts of harm to ``out`` [2, n, C], if ``bodies`` hold the commands ``tried`` [n, C, B]."""
-    scratch, here, commands, _ = memory
+    scratch, here, commands = memory
     for k in range(tried.shape[0]):
         copy(wanted[k], commands)
         for j in range(tried.shape[1]):
@@ -68,25 +63,36 @@ def hold_worlds(line, car, wanted, bodies, tried, time, until, total, memory, ou
             out[1, k, j] = math.inf if failed else harm_so_far(here, not total)
 
 
-def price(game: Game, state: State, plans: Floats, count: str, most: Any = math.inf) -> Floats:
-    """Return the harm of every episode, [n] m2/s2, if its learners follow their plan from now on.
+def played(
+    game: Game, state: State, plans: Floats, count: str, most: Any = math.inf, *, donate: bool = False
+) -> tuple[State, Floats]:
+    """Return the last states of episodes whose learners follow their plans from now on, and their harm, [n] m2/s2.
 
-    ``plans`` [n, T, L] are the learners' actions at every decision; the last one repeats. A play may stop once its harm
-    is above ``most``. Scripts that look at the state are asked as in the episode.
+    ``plans`` [n, T, L] are the learners' actions at every decision; the last one repeats. An episode stops where its
+    harm is above ``most`` [n]. The harm is infinite where a check of the physics fails. Scripts that look at the state
+    are asked as in the episode. ``donate``: the memory of ``state`` may be reused.
     """
+    most = np.full(len(plans), most)
     if game.scripts:
         rows = np.arange(len(plans))
-        while not state.ended.all():
+        while (~state.ended & (state.harm(count) <= most)).any():
             now = np.minimum(state.steps, plans.shape[1] - 1)
             state, _ = game.follow(state, plans[rows, now])
-        return state.harm(count)
+        return state, state.harm(count)
+    line, car, clock, know, wanted, memories = state
+    if not donate:
+        line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
     out, rules = np.empty(len(plans)), game.rules
-    most = np.broadcast_to(np.float64(most), out.shape).copy()
     play_worlds(
-        *state[:3], state.wanted, plans, most, rules.learners, rules.time_step_s, rules.horizon_s, count == "total",
-        working_memory(state.wanted.shape[1]), out,
+        line, car, clock, wanted, plans, most, rules.learners, rules.time_step_s, rules.horizon_s, count == "total",
+        scratch_for(wanted.shape[1]), out,
     )  # fmt: skip
-    return out
+    return State(line, car, clock, know, wanted, memories), out
+
+
+def price(game: Game, state: State, plans: Floats, count: str, most: Any = math.inf) -> Floats:
+    """Return the harm of every episode, [n] m2/s2, if its learners follow their plan from now on; see ``played``."""
+    return played(game, state, plans, count, most)[1]
 
 
 def hold(state: State, wanted: Floats, bodies: Sequence[int], tried: Floats, until_s: float, count: str) -> Floats:

@@ -197,10 +197,7 @@ def step(
     decision. Raises ``InvalidInput`` for a bad action. ``state`` does not change, unless its memory is donated.
     """
     line, car, clock, know, wanted, memories = state
-    shape = len(clock), len(rules.learners)
-    if not isinstance(actions, np.ndarray) or actions.shape != shape or actions.dtype.kind not in "fiu":
-        raise InvalidInput(f"actions = {actions!r:.60}: must be an array of numbers with the shape {shape}")
-    actions = actions.astype(np.float64, copy=False)
+    actions = numbers_of(rules, actions, len(clock))
     commands = {}
     if scripts:
         memories = dict(memories)
@@ -216,6 +213,24 @@ def step(
         _check_actions(rules, actions[failed])
         raise failure(state, failed, state.time_s[failed], clock[failed, TIME])
     return State(line, car, clock, know, wanted, memories), Step(reward, out, rules.time_step_s)
+
+
+def numbers_of(rules: Rules, actions: Floats | None, n: int) -> Floats:
+    """Return the learners' actions as float64. Raises ``InvalidInput`` unless they are numbers of the shape [n, L]."""
+    shape = n, len(rules.learners)
+    if not isinstance(actions, np.ndarray) or actions.shape != shape or actions.dtype.kind not in "fiu":
+        raise InvalidInput(f"actions = {actions!r:.60}: must be an array of numbers with the shape {shape}")
+    return actions.astype(np.float64, copy=False)
+
+
+def proposals(rules: Rules, actions: Floats, n: int) -> Floats:
+    """Return proposed actions, [n, L] in [-1, 1] or NaN. Raises ``InvalidInput`` for anything else."""
+    actions = numbers_of(rules, actions, n)
+    beyond = np.abs(actions) > LARGEST_ACTION
+    if beyond.any():
+        row = actions[beyond.any(axis=1)][0]
+        _check_actions(rules, np.where(np.isnan(row), 0.0, row))
+    return np.clip(actions, -1.0, 1.0)
 
 
 def begun(script: Any, alert: State, body: int) -> Any:

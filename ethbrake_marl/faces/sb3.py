@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from ethbrake_marl.episode.features import Feature
 from ethbrake_marl.episode.full_state import full_state, state_features
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.infos import NUMBERS, dictionaries, numbers
+from ethbrake_marl.episode.infos import NUMBERS, dictionaries, numbers, per_body
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
@@ -106,6 +106,7 @@ class EthBrakeVecEnv(VecEnv):
         self._given: Any = None
         rows = n * len(self.learners)
         self._return, self._steps, self._begun = np.zeros(rows), np.zeros(rows, np.int64), np.zeros(0)
+        self._begun_own: list[dict[str, Any]] = []
         self._of_state = scenario.horizon_s, scenario.has_obstacle
         super().__init__(rows, FeatureBox(self._features()), action_space(actions))
         self.renderer = make_renderer(self, render_mode)
@@ -142,7 +143,7 @@ class EthBrakeVecEnv(VecEnv):
             self.stream.seed, self.stream.next, self._next_seed = self._next_seed, 0, None
         self.episode = self.stream.draw(self.n) if worlds is None else self.game.begin(worlds)
         self._return[:], self._steps[:] = 0.0, 0
-        self._begun = numbers(self.episode, self.learners)
+        self._begun, self._begun_own = numbers(self.episode, self.learners), self._own_infos()
         if self.renderer is not None:
             self.renderer.began(self.episode)
         return self._observe(self.episode)
@@ -167,14 +168,16 @@ class EthBrakeVecEnv(VecEnv):
         reward = step.reward.take(self.learners - 1, axis=1).reshape(-1)
         self._return += reward
         self._steps += 1
-        infos = self._infos(self.episode, step) if self.step_infos else self._shield_infos()
+        infos = self._infos(self.episode, step) if self.step_infos else self._step_infos()
         over = self.episode.ended
         ended = np.flatnonzero(over)
         if len(ended):
             self._close(ended, step, infos)
             new = self.stream.draw(len(ended))
             self.episode = self.episode.put(ended, new, donate=True)
-            self._begun[ended] = numbers(new, self.learners)
+            self._begun[ended], own = numbers(new, self.learners), self._own_infos()
+            for row in (ended[:, np.newaxis] * L + np.arange(L)).reshape(-1).tolist():
+                self._begun_own[row] = own[row]
         if self.renderer is not None:
             self.renderer.stepped(self.episode)
         return self._observe(self.episode), reward.astype(np.float32), over.repeat(L), infos
@@ -198,13 +201,11 @@ class EthBrakeVecEnv(VecEnv):
     def _infos(self, state: State, step: Step | None) -> list[dict[str, Any]]:
         return dictionaries(self.game, state, step, self.stream.seed or 0, self.learners)
 
-    def _shield_infos(self) -> list[dict[str, Any]]:
-        if self.game.shield is None:
-            return [{} for _ in range(self.num_envs)]
-        told = self.game.shield.infos(self.game, self.episode)
-        columns = {f"shield_{name}": value.tolist() for name, value in told.items()}
-        rows = [{name: column[k] for name, column in columns.items()} for k in range(self.n)]
-        return [dict(row) for row in rows for _ in self.learners]
+    def _step_infos(self) -> list[dict[str, Any]]:
+        return [{} for _ in range(self.num_envs)] if self.game.shield is None else self._own_infos()
+
+    def _own_infos(self) -> list[dict[str, Any]]:
+        return per_body(self.game.own_infos(self.episode), self.n, self.learners)
 
     @property
     def reset_infos(self) -> list[dict[str, Any]]:
@@ -213,7 +214,10 @@ class EthBrakeVecEnv(VecEnv):
             return [{} for _ in range(self.num_envs)]
         infos = self._infos(self.episode, None)
         begun = self._begun.reshape(-1, len(NUMBERS)).tolist()
-        return [info | dict(zip(NUMBERS, row, strict=True)) for info, row in zip(infos, begun, strict=True)]
+        return [
+            info | dict(zip(NUMBERS, row, strict=True)) | own
+            for info, row, own in zip(infos, begun, self._begun_own, strict=True)
+        ]
 
     @reset_infos.setter
     def reset_infos(self, infos: list[dict[str, Any]]) -> None:
@@ -252,6 +256,7 @@ class EthBrakeVecEnv(VecEnv):
             "state": [each.copy() for each in self.episode[:5]],
             "memories": {str(name): copy.deepcopy(memory) for name, memory in self.episode.memories.items()},
             "rows": [self._return.copy(), self._steps.copy(), self._begun.copy()],
+            "own_infos": [dict(own) for own in self._begun_own],
             "stream": [self.stream.seed, self.stream.next],
         }
 
@@ -262,6 +267,7 @@ class EthBrakeVecEnv(VecEnv):
         line, car, clock, know, wanted = saved["state"]
         self.episode = State(line, car, clock, know, wanted, memories)
         self._return, self._steps, self._begun = saved["rows"]
+        self._begun_own = saved["own_infos"]
         self.stream.seed, self.stream.next = saved["stream"]
 
     def render(self, mode: str | None = None) -> Any:

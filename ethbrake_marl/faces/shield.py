@@ -1,0 +1,110 @@
+"""One function puts a shield around an environment of any interface, or around a team."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from inspect import signature
+from typing import Any
+
+from ethbrake_marl.agents.drive import Team
+from ethbrake_marl.agents.policy_agent import LearnedAgent
+from ethbrake_marl.episode.game import Game, Shield
+from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.faces.rendering import make_renderer
+from ethbrake_marl.faces.stream import Stream
+from ethbrake_marl.names import team_of, teams_of
+from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.registry import Registry
+from ethbrake_marl.shields.algorithm_1 import EpisodeShield
+from ethbrake_marl.shields.step import StepShield
+from ethbrake_marl.worlds.catalogue import load_scenario
+from ethbrake_marl.worlds.game import AnyScenario
+
+MakeShield = Callable[..., Shield]  # (drivers, **options): body -> agent, perhaps empty; the options of the mode
+
+
+def register_shield_mode(name: str, make: MakeShield) -> None:
+    """Register a mode of the shield. Entry points: ``ethbrake_marl.shield_modes``."""
+    MODES.add(name, make, lambda other: other is make)
+
+
+MODES: Registry[MakeShield] = Registry(
+    "shield mode", "shield_modes", register_shield_mode, {"step": StepShield, "episode": EpisodeShield}
+)
+
+
+def shield(
+    env: Any, policy: Any = None, mode: str = "step", *, scenario: AnyScenario | None = None, **options: Any
+) -> Any:
+    """Return a shielded copy of an environment, of the same class, or a shielded team.
+
+    The copy starts with ``reset``; ``env`` stays as it is. The shield decides inside: what wrappers of ``env`` do to an
+    action, they do to the proposal. Infos: ``shield_...`` (docs/shield.md).
+
+    Args:
+        env: an environment of this package, parallel, in turns, Gymnasium, vector or ``VecEnv``, perhaps in wrappers of
+            its library; or a ``Team``, or an agent, who propose.
+        policy: proposes the actions that the caller leaves out (NaN, or no entry in a dictionary); the shield also
+            plans with it. A name, an agent for all learners, a ``Team``, or vehicle -> agent. None: without a proposal
+            the shield's own plan is followed.
+        mode: ``step``, ``episode`` (the paper's Algorithm 1), or the mode of an extension.
+        scenario: in which an agent drives; not for environments and teams.
+        options: of the mode: ``harm_count`` (``first`` or ``total``) of both, ``allowance`` (m2/s2) and ``cap`` (None
+            or ``baseline``) of ``step``, ``bound`` (``coupled`` or ``pairwise``) of ``episode``.
+
+    >>> import ethbrake_marl as eb
+    >>> env = eb.shield(eb.parallel_env(scenario="paper-random"))
+    >>> observations, infos = env.reset(seed=7)
+    >>> env.step({"vehicle_2": [1.0]})[4]["vehicle_2"]["shield_intervened"]
+    True
+
+    """
+    if mode not in MODES:
+        raise unknown_name("shield mode", mode, MODES)
+    make = MODES[mode]
+    known = [name for name in signature(make).parameters if name != "drivers"]
+    for name in options:
+        if name not in known:
+            raise unknown_name(f"option of a shield in mode {mode}", name, known)
+    if isinstance(env, Team) or hasattr(env, "act"):
+        if policy is not None:
+            raise InvalidInput(f"shield: {env.name!r} proposes by itself; leave out policy")
+        if not isinstance(env, Team):
+            if scenario is None:
+                raise InvalidInput(f"shield: agent {env.name!r}: pass scenario=..., in which it drives")
+            env = team_of(env, load_scenario(scenario))
+        if env.shield is not None:
+            raise InvalidInput(f"shield: team {env.name!r} already has a shield")
+        return env._replace(name=f"{env.name}+{mode}", shield=make(env.drivers, **options))
+    base: Any = getattr(env, "unwrapped", None)
+    game, stream = getattr(base, "game", None), getattr(base, "stream", None)
+    if isinstance(env, type) or not isinstance(game, Game) or not isinstance(stream, Stream):
+        raise InvalidInput(
+            f"shield: {env!r:.80}: must be a team, an agent, or an environment made by eb.parallel_env, eb.env,"
+            " eb.EthBrakeEnv, eb.EthBrakeVectorEnv or eb.make_sb3_vec_env, perhaps in wrappers"
+        )
+    if game.shield is not None:
+        raise InvalidInput("shield: this environment already has a shield")
+    if not len(game.rules.learners):
+        raise InvalidInput(f"shield: scenario {game.name!r} has no learner to shield; pass learners=['vehicle_2']")
+    if policy is None:
+        return guarded(env, base, game._replace(shield=make(None, **options)))
+    policy = LearnedAgent(policy) if isinstance(policy, Policy) else policy
+    team = teams_of({"policy": policy}, base.scenario, harm_count=options.get("harm_count", "first"))["policy"]
+    return guarded(env, base, team._replace(shield=make(team.drivers, **options)).game(game))
+
+
+def guarded(env: Any, base: Any, game: Game) -> Any:
+    """Return a copy of an environment, with its wrappers, that plays ``game`` and has no running episode."""
+    shared = {id(base.game): game, id(base.scenario): base.scenario, id(base.renderer): None}
+    if hasattr(base, "episode"):
+        shared[id(base.episode)] = None
+    other = copy.deepcopy(env, shared)
+    base = other.unwrapped
+    vars(base).pop("episode", None)
+    for name, none in (("agents", []), ("_running", False)):
+        if hasattr(base, name):
+            setattr(base, name, none)
+    base.renderer = make_renderer(base, base.render_mode)
+    return other

@@ -1,0 +1,122 @@
+"""The paper's hybrid (Algorithm 1): at the alert, a policy or E-V2X-BM gets the whole episode, whoever does less harm.
+
+The policy is played from the alert on; its harm is compared with H*, the harm of E-V2X-BM's constant deceleration. With
+the coupled H*, which is the price of this deceleration, the harm of the episode is the smaller of both numbers, to the
+last bit, if the policy drives again as it was played (a policy with random actions does not). With the paper's own
+pairwise H* nothing is bounded: it is about half of the harm that this deceleration does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.agents.drive import MODEL, Agent, Team, propose, to_action
+from ethbrake_marl.agents.e_v2x_bm import coupled
+from ethbrake_marl.agents.pairwise import pairwise
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.play import price
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.step import begun
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.motion.layout import Bools, Floats
+from ethbrake_marl.registry import Part
+from ethbrake_marl.shields.decision import check_harm_count, check_learners, checked_drivers, spread
+from ethbrake_marl.shields.fallbacks import held, rollout
+
+ROUNDING = 1e-6  # of an action in 32 bits; a proposal within it counts as the applied action
+
+
+class Memory(NamedTuple):
+    """What the shield remembers of n episodes with one learner."""
+
+    chosen: Bools  # [n] whether the policy drives
+    policy_harm: Floats  # [n] harm of the policy's play (m2/s2)
+    bound_harm: Floats  # [n] H* (m2/s2)
+    backup: Floats  # [n, 1] action of E-V2X-BM
+    agent: Any  # memory of the policy
+    proposed: Floats  # [n, 1] last proposal
+    applied: Floats  # [n, 1] last action
+    intervened: Bools  # [n, N] whether they differ
+
+
+class EpisodeShield:
+    """Algorithm 1 for one learner; what is proposed from outside has no effect.
+
+    Args:
+        drivers: body of the learner -> its policy.
+        harm_count: harm that is compared: ``first`` (first impact of each pair) or ``total`` (every impact).
+        bound: H*: ``coupled`` (the episode's own physics) or ``pairwise`` (the paper's closed form).
+
+    """
+
+    def __init__(
+        self, drivers: Mapping[int, Agent] | None, *, harm_count: str = "first", bound: str = "coupled"
+    ) -> None:
+        check_harm_count(harm_count)
+        if bound not in ("coupled", "pairwise"):
+            raise InvalidInput(f"shield: bound = {bound!r}: must be 'coupled' or 'pairwise'")
+        self.drivers, self.count, self.coupled = checked_drivers(drivers), harm_count, bound == "coupled"
+        if len(self.drivers) != 1:
+            raise InvalidInput(
+                f"shield: mode 'episode' needs the policy of exactly one learner, not of {len(self.drivers)}; mode"
+                " 'step' guards several, and needs none"
+            )
+
+    def begin(self, game: Game, alert: State, state: State) -> Memory:
+        """Return the memory at the first decision ``state``, with the driver of each episode."""
+        check_learners(game, self.drivers)
+        ((body, agent),) = self.drivers.items()
+        remembered = begun(agent, alert, body)
+        known = alert._replace(wanted=state.wanted)
+        choice = coupled(known, body, self.count, game.rules.horizon_s) if self.coupled else pairwise(known, body)
+        backup = to_action(alert, body, -choice.deceleration_mps2)[:, np.newaxis]
+        held_back = held(game, backup)
+        own = state._replace(memories={**state.memories, body: remembered})
+        policy_harm = price(game, state, rollout(game, self.drivers, own, held_back, self.count), self.count)
+        bound_harm = price(game, state, held_back, self.count) if self.coupled else choice.harm
+        nothing = np.zeros((state.n, 1))
+        return Memory(
+            policy_harm <= bound_harm, policy_harm, bound_harm, backup, remembered, nothing, nothing,
+            np.zeros((state.n, state.vehicles), np.bool_),
+        )  # fmt: skip
+
+    def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
+        """Return the action of the driver that was chosen at the alert, [n, 1], and the new memory."""
+        memory: Memory = state.memories["shield"]
+        (body,) = self.drivers
+        own, after = propose(self.drivers, state, {body: memory.agent})
+        proposed = own if proposed is None else np.where(np.isnan(proposed), own, proposed)
+        applied = np.where(memory.chosen[:, np.newaxis], own, memory.backup)
+        differ = (np.abs(applied - proposed) > ROUNDING) & ~state.ended[:, np.newaxis]
+        return applied, memory._replace(
+            agent=after[body], proposed=proposed, applied=applied, intervened=spread(game, state, differ, False)
+        )
+
+    def infos(self, game: Game, state: State) -> dict[str, Any]:
+        """Return what users may want to know: name -> [n] or [n, N]."""
+        memory: Memory = state.memories["shield"]
+        return {
+            "chosen_policy": memory.chosen,
+            "policy_harm": memory.policy_harm,
+            "bound_harm": memory.bound_harm,
+            "proposed_action": spread(game, state, memory.proposed),
+            "applied_action": spread(game, state, memory.applied),
+            "intervened": memory.intervened,
+        }
+
+
+def make_episode(team: Team, argument: str | None, settings: Any) -> Team:
+    """Return the team ``TEAM+episode[:pairwise]``."""
+    bound = "coupled" if argument is None else argument
+    return team._replace(shield=EpisodeShield(team.drivers, harm_count=settings.harm_count, bound=bound))
+
+
+EPISODE = Part(
+    make_episode,
+    form="episode[:pairwise]",
+    about="the paper's hybrid: the policy or E-V2X-BM drives the whole episode",
+    knows=MODEL,
+)

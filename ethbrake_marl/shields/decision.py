@@ -1,0 +1,75 @@
+"""What every shield reports of its last decision, and the term of a reward that counts replaced actions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.agents.drive import Agent, check_agent
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.step import Step
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.motion.layout import Floats
+
+
+class ShieldReason(IntEnum):
+    """Why the step shield accepted or replaced an action.
+
+    >>> import ethbrake_marl as eb
+    >>> eb.ShieldReason(3).name
+    'NO_CERTIFICATE'
+
+    """
+
+    NO_DECISION = -1  # before the first step, and always for a vehicle that follows a script
+    SAME_AS_PLAN = 0  # accepted: it is the plan's action
+    PLAN_REMAINS = 1  # accepted: the bound holds if the rest of the plan follows
+    CONSTANT = 2  # accepted: the bound holds if constant actions follow
+    NO_CERTIFICATE = 3  # replaced: the bound holds for no plan that was tried
+    NOT_A_NUMBER = 4  # replaced: nothing was proposed
+    ENDED = 5  # the episode is over
+    POLICY_ROLLOUT = 7  # accepted: the bound holds if the shield's own agents drive on
+
+    @property
+    def text(self) -> str:
+        """Reason in words, such as "no certificate"."""
+        return self.name.lower().replace("_", " ")
+
+
+def checked_drivers(drivers: Mapping[int, Agent] | None) -> dict[int, Agent]:
+    """Return body -> agent from front to rear. Raises ``InvalidInput`` for what is no agent."""
+    for body, agent in (drivers or {}).items():
+        check_agent(agent, f"shield: policy of vehicle_{body} = {agent!r:.60}")
+    return dict(sorted((drivers or {}).items()))
+
+
+def check_learners(game: Game, drivers: Mapping[int, Agent]) -> None:
+    """Raise ``InvalidInput`` unless the agents drive exactly the learners of a game."""
+    if list(drivers) != game.rules.learners.tolist():
+        theirs, right = (", ".join(f"vehicle_{i}" for i in each) for each in (drivers, game.rules.learners))
+        raise InvalidInput(f"shield: has agents for {theirs}; must have one for each learner, {right or 'none'}")
+
+
+def check_harm_count(count: str) -> None:
+    """Raise ``InvalidInput`` for an unknown count of harm."""
+    if count not in ("first", "total"):
+        raise InvalidInput(f"shield: harm_count = {count!r}: must be 'first' or 'total'")
+
+
+def spread(game: Game, state: State, columns: Any, other: Any = 0) -> Any:
+    """Return values of learners [n, L] as values of vehicles, [n, N]; ``other`` for those that follow scripts."""
+    wide = np.full((state.n, state.vehicles), other, columns.dtype)
+    wide[:, game.rules.learners - 1] = columns
+    return wide
+
+
+def intervention(before: State, step: Step, after: State) -> Floats:
+    """Return minus 1 for each vehicle whose proposed action a shield has replaced, otherwise 0."""
+    memory = before.memories.get("shield")
+    if memory is None:
+        raise InvalidInput("this game has no shield; give the environment one, eb.shield(env), or the weight 0")
+    return np.where(memory.intervened, -1.0, 0.0)

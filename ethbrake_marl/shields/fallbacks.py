@@ -1,0 +1,81 @@
+"""Plans for a shield: what may follow an action, and what the learners do if nobody proposes anything.
+
+A plan [n, T, L] has the learners' actions at every decision. Nothing here is trusted: the shield asks for the price of
+each plan.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.agents.drive import Agent, propose, to_action
+from ethbrake_marl.agents.e_v2x_bm import coupled
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.play import descend, hold
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.motion.layout import BRAKING, Floats
+
+SHARES = np.linspace(0.0, 1.0, 21)  # of its brakes that each of several learners tries at the alert
+ROUNDS = 2  # in which they try them
+CHANGES = np.array([0.05, -0.05, 0.1, -0.1, 0.2, -0.2])  # of the plan's next actions, tried as constants
+
+
+def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floats]:
+    """Return the plans at the alert, constant actions: [n, T, L] each.
+
+    One learner: E-V2X-BM. Several: full braking, E-V2X-BM of one while the others brake fully, and for each the best
+    share of its brakes, one after the other.
+    """
+    learners, n, horizon_s = game.rules.learners, state.n, game.rules.horizon_s
+    full = alert._replace(wanted=state.wanted.copy())
+    full.wanted[:, learners] = -alert.car[:, BRAKING, learners]
+    actions = []
+    for column, body in enumerate(learners.tolist()):
+        action = np.full((n, len(learners)), -1.0)
+        action[:, column] = to_action(alert, body, -coupled(full, body, count, horizon_s).deceleration_mps2)
+        actions.append(action)
+    if len(learners) > 1:
+        wanted, _ = descend(state, learners.tolist(), SHARES, ROUNDS, horizon_s, count)
+        descended = [to_action(alert, body, wanted[:, body]) for body in learners.tolist()]
+        actions += [np.stack(descended, axis=1), np.full((n, len(learners)), -1.0)]
+    return [held(game, action) for action in actions]
+
+
+def held(game: Game, actions: Floats) -> Floats:
+    """Return the plans that repeat actions [n, L] up to the horizon."""
+    decisions = int(np.ceil(game.rules.horizon_s / game.rules.time_step_s)) + 1
+    return np.repeat(actions[:, np.newaxis], decisions, axis=1)
+
+
+def best_constant(game: Game, state: State, plans: Floats, count: str) -> tuple[Floats, Floats]:
+    """Return plans that hold the best of some constant actions, and their harm in one piece, [n] m2/s2.
+
+    Tried are the plan's next actions, all of them a little harder or softer: deviations from a good plan are mended by
+    small changes far more often than by a fixed set of constants that spans all brakes.
+    """
+    learners, rows = game.rules.learners, np.arange(state.n)
+    planned = plans[rows, np.minimum(state.steps, plans.shape[1] - 1)]
+    actions = np.clip(planned[:, np.newaxis] + CHANGES[:, np.newaxis], -1.0, 0.0)
+    commands = actions * state.car[:, np.newaxis, BRAKING, learners]
+    harm = hold(state, state.wanted, learners.tolist(), commands, game.rules.horizon_s, count)[0]
+    best = harm.argmin(axis=1)
+    return np.repeat(actions[rows, best, np.newaxis], plans.shape[1], axis=1), harm[rows, best]
+
+
+def rollout(
+    game: Game, drivers: Mapping[int, Agent], state: State, plans: Floats, count: str, most: Any = np.inf
+) -> Floats:
+    """Return the plans with the actions of agents that drive from now on, as long as the harm is at most ``most`` [n].
+
+    ``state`` has the agents' memories.
+    """
+    plans, rows = plans.copy(), np.arange(state.n)
+    while (~state.ended & (state.harm(count) <= most)).any():
+        actions, memories = propose(drivers, state, state.memories)
+        now = np.minimum(state.steps, plans.shape[1] - 1)
+        plans[rows, now] = actions
+        state, _ = game.follow(state._replace(memories=memories), actions)
+    return plans
