@@ -13,9 +13,9 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, objectives_of
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.motion.layout import Bools, Floats
+from ethbrake_marl.names import open_game
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.training.training import Training
-from ethbrake_marl.worlds.game import game_of
 
 Policies = Mapping[str, Policy]  # learner -> policy, front to rear; learners may share one
 Evaluate = Callable[[Policies], Mapping[str, float]]  # returns metrics of policies, by name
@@ -33,7 +33,7 @@ def measure_on_list(training: Training) -> Evaluate:
     vehicle still moves at the horizon) and, where a learner's objective is not the harm of the line, the ``objective``
     of each learner (``objective_vehicle_2``) and the mean of these.
     """
-    plan, (scenario, game) = training.recipe.evaluation, game_of(training.scenario)
+    plan, (scenario, game) = training.recipe.evaluation, open_game(training.scenario)
     worlds = scenario.sample(plan.worlds, plan.seed)
     parts = [worlds.take(slice(first, first + AT_ONCE)) for first in range(0, plan.worlds, AT_ONCE)]
 

@@ -17,6 +17,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.faces.sb3 import EthBrakeVecEnv
 from ethbrake_marl.files.plain import read_object
+from ethbrake_marl.names import open_game
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.progress import Progress, Told
@@ -29,7 +30,7 @@ from ethbrake_marl.training.recipe import Scheme, TrainingRecipe
 from ethbrake_marl.training.run import RunFolder
 from ethbrake_marl.training.training import Training
 from ethbrake_marl.training.updates import BetweenUpdates, Stopped
-from ethbrake_marl.worlds.game import AnyScenario, game_of
+from ethbrake_marl.worlds.game import AnyScenario
 
 APPENDED: dict[Scheme, Any] = {"independent": "number", "centralised": "state"}
 _ONE_TRAINING = threading.Lock()
@@ -205,7 +206,7 @@ def _prepared(
 def make_environment(training: Training) -> EthBrakeVecEnv:
     """Return the environment of a training, with one row for each learner in each world."""
     recipe = training.recipe
-    scenario, game = game_of(training.scenario, reward=recipe.reward, observation=list(training.row.names))
+    scenario, game = open_game(training.scenario, reward=recipe.reward, observation=list(training.row.names))
     appended = APPENDED.get(training.scheme)
     return EthBrakeVecEnv(scenario, game, recipe.n_envs, recipe.seed, recipe.horizon_is_end, appended)
 

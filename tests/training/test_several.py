@@ -21,7 +21,7 @@ from ethbrake_marl.training.training import Training
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.game import game_of
 from tests.refused import refused
-from tests.training.tiny import PAIR, TINY, UPDATE
+from tests.training.tiny import PAIR, TINY, UPDATE, dying_after, go_on, kept, killed
 
 NAMES = ("vehicle_2", "vehicle_3")
 SHORT = TINY.replace(total_steps=4 * 2 * UPDATE)
@@ -56,6 +56,18 @@ def test_train__leaves_policies_that_drive_as_they_were_measured(scheme: Any, tm
             _ = result.policy
     else:
         assert result.policy is result.policies["vehicle_3"]
+
+
+def test_train__other_vehicles_are_driven_by_the_agents_that_roles_name(tmp_path: Path) -> None:
+    roles = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "e_v2x_bm"}
+    scenario = load_scenario("paper-random").replace(roles=roles, early_impacts="keep")
+    braking = scenario.replace(roles={**roles, "vehicle_3": "full_brake"})
+    whole = train(TINY, scenario, tmp_path / "whole", on_progress=None)
+    other = train(TINY, braking, tmp_path / "other", on_progress=None)
+    assert whole.evaluations[0]["first_impact_harm"] != other.evaluations[0]["first_impact_harm"]
+    killed(train, TINY, scenario, tmp_path / "run", on_progress=dying_after(5))
+    go_on(tmp_path / "run")
+    assert kept(tmp_path / "run") == kept(tmp_path / "whole")
 
 
 def history(recipe: TrainingRecipe, folder: Path) -> list[dict[str, str]]:
