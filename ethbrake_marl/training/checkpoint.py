@@ -1,7 +1,7 @@
 """Checkpoints: everything on which the rest of a training depends, between two updates. Reading one runs no code.
 
-A checkpoint is a file of ``torch.save`` with plain data and tensors only, read with ``weights_only=True``. The CRC-32 of
-its parts, which torch writes and does not check, shows damage.
+A checkpoint is a file of ``torch.save`` with plain data and tensors only, read with ``weights_only=True``. The CRC-32
+of its parts, which torch writes and does not check, shows damage.
 """
 
 from __future__ import annotations
@@ -200,7 +200,7 @@ def newest(folder: Path) -> tuple[dict[str, Any] | None, list[str]]:
             path.unlink()
     if others := sorted(folder.glob("step_*")):
         raise InvalidInput(
-            f"{others[-1]}: another version of this package wrote this checkpoint; install that version, or delete it to"
-            " train from the beginning"
+            f"{others[-1]}: another version of this package wrote this checkpoint; install that version, or delete"
+            " it to train from the beginning"
         )
     return None, reasons

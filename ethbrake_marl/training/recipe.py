@@ -287,8 +287,8 @@ def load_recipe(recipe: str | Path | Mapping[str, Any] | TrainingRecipe) -> Trai
     """Load a recipe by name, by the path of its file, or from the content of such a file.
 
     What ends in ``.yaml`` or has a path separator is a path; ``~`` is the user's home. A ``TrainingRecipe`` is returned
-    as it is. Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` with file, line, key, value and what would
-    be right for bad content.
+    as it is. Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` with file, line, key, value and what
+    would be right for bad content.
     """
     if isinstance(recipe, TrainingRecipe):
         return recipe

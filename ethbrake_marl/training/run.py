@@ -62,7 +62,7 @@ class RunFolder:
             new.write_status("running")
 
     def held(self) -> Any:
-        """Return the context in which no other process can train in this folder; raises ``InvalidInput`` if one does."""
+        """Return the context in which no other process can train here. It raises ``InvalidInput`` if one does."""
         return hold_lock(self.lock, "another process is training in this folder")
 
     def write_team(self, training: Training) -> None:

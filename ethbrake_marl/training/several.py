@@ -1,8 +1,8 @@
 """Several learners with PPO: a policy for each of them (independent), or one with a critic that sees the whole line.
 
 Independent learners drive in the same worlds. Decisions are collected for all of them together; then each learns from
-its own rows, with Stable-Baselines3's ``PPO.train``. The last entry of an observation is the number of the learner, from
-0 (``appended="number"``).
+its own rows, with Stable-Baselines3's ``PPO.train``. The last entry of an observation is the number of the learner,
+from 0 (``appended="number"``).
 """
 
 from __future__ import annotations

@@ -98,20 +98,22 @@ def train(
     """Train the learners of a scenario, and write the folder of the run.
 
     Ctrl-C stops after the current update (status ``interrupted``), a second one at once. After Ctrl-C or an error
-    ``policy/`` has the best policy so far and ``policy-last/`` the latest; ``resume`` goes on. The same recipe, scenario
-    and seed lead to the same policy on the same machine, to the bit.
+    ``policy/`` has the best policy so far and ``policy-last/`` the latest; ``resume`` goes on. The same recipe,
+    scenario and seed lead to the same policy on the same machine, to the bit.
 
     Args:
         recipe: a recipe, its name, the path of its file, or the content of one.
         scenario: likewise. Its roles say which vehicles learn.
         directory: new folder of the run.
-        scheme, turns, seed, steps: other values of the recipe's keys ``scheme``, ``turns``, ``seed``, ``total_steps``.
-            A training ends with a whole update, so it may make a few more steps.
+        scheme: how several learners train together; None: as the recipe says. Likewise:
+        turns: how often each independent learner has its turn to learn.
+        seed: of worlds, networks and exploration.
+        steps: decisions of all learners together. A training ends with a whole update, so there may be a few more.
         force: replace an earlier run in ``directory``.
         settings: by which recipe and scenario differ from their files, ``KEY=VALUE``; ``config.json`` records them.
-        measure: takes a ``Training``, and returns a function that takes policies, learner -> policy, and returns metrics.
-            By default these are measured on the recipe's fixed list of worlds; None: nothing is measured. Measured is
-            before the first update, every few updates and at the end.
+        measure: takes a ``Training``, and returns a function of policies, learner -> policy, that returns metrics. It
+            is called before the first update, every few updates and at the end. By default policies are measured on
+            the recipe's fixed list of worlds; None: not at all.
         on_progress: is called with each ``Progress``; ``show``: print it on stderr; None: no reports.
 
     Raises ``AlreadyExists`` for a directory that exists, ``InvalidInput`` if recipe and scenario do not fit each other
@@ -141,7 +143,8 @@ def resume(
 
     Args:
         directory: folder of the run.
-        measure, on_progress: as in ``train``.
+        measure: as in ``train``.
+        on_progress: as in ``train``.
         other_versions: accept a checkpoint that other versions of packages, or another physics, have written.
 
     Raises ``InvalidInput`` if the folder has no training or a finished one, if another process is training in it, if

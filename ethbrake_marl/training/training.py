@@ -38,7 +38,7 @@ class Training(NamedTuple):
         learners = tuple(scenario.vehicle_names[body - 1] for body in scenario.learners)
         every = views_of(scenario) if recipe.observation is None else (View(recipe.observation),) * scenario.vehicles
         views = tuple(every[body - 1] for body in scenario.learners)
-        scheme = recipe.scheme or ("single" if len(learners) == 1 else "shared")
+        scheme: Scheme = recipe.scheme or ("single" if len(learners) == 1 else "shared")
         _check(recipe, scenario, scheme, learners)
         if scheme != "independent" and len(set(views)) > 1:
             raise InvalidInput(
@@ -80,7 +80,7 @@ class Training(NamedTuple):
         return hashlib.sha256(json.dumps(self.content(), sort_keys=True).encode()).hexdigest()
 
     def config(self, settings: Sequence[str] = ()) -> dict[str, Any]:
-        """Return the content of ``config.json``: recipe, scenario, seeds, versions, and the ``settings`` of a command."""
+        """Return the content of ``config.json``; ``settings`` are those of a command."""
         return {
             "recipe": self.recipe.model_dump(mode="json"),
             "scenario": self.scenario.declared(),

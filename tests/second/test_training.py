@@ -47,6 +47,11 @@ def test_train__learns_the_weights_of_the_first_edition(case: str, tmp_path: Pat
         assert found.keys() == expected.keys()
         different = [key for key in found if found[key].tobytes() != expected[key].tobytes()]
         assert not different, {key: float(np.abs(found[key] - expected[key]).max()) for key in different}
+    first_policy, policy = next(iter(theirs.last.drivers.values())), next(iter(mine.last_policies.values()))
+    kept, written = (each.manifest.model_dump(mode="json") for each in (first_policy, policy))
+    for manifest in (kept, written):
+        del manifest["versions"], manifest["manifest_sha256"]
+    assert written == kept
     assert (mine.steps, mine.updates) == (theirs.steps, theirs.updates)
     for one, other in zip(mine.evaluations, theirs.evaluations, strict=True):
         measured = {key: value for key, value in one.items() if key != "cpu_s"}

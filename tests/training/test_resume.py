@@ -69,9 +69,7 @@ def test_resume__after_a_kill_while_a_checkpoint_is_written(
     untouched = {"write": Path.write_bytes, "replace": os.replace}[when]
 
     def fatal(*arguments: Any) -> Any:
-        if any("step_000000000512" in str(each) for each in (*arguments, *run.glob("*/step_000000000256.pt"))) or (
-            when == "write" and list(run.glob("checkpoints/step_000000000256.pt"))
-        ):
+        if list(run.glob("checkpoints/step_000000000256.pt")):
             die()
         return untouched(*arguments)
 
@@ -168,16 +166,15 @@ DAMAGE = {
     "other data": lambda path: torch.save({"training": 1}, path),
     "a list": lambda path: torch.save([1], path),
     "a link": lambda path: (path.unlink(), path.symlink_to("/dev/zero")),
-    "a folder": lambda path: (path.unlink(), path.mkdir()),
 }
 
 
-@pytest.mark.parametrize("damage", [each for each in DAMAGE if each != "a folder"])
+@pytest.mark.parametrize("damage", DAMAGE)
 def test_resume__goes_back_behind_a_damaged_checkpoint(
     damage: str, run: Path, whole: Whole, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(run.parent)
-    newest, before = checkpoint.files_in(run / "checkpoints")
+    newest = checkpoint.files_in(run / "checkpoints")[0]
     DAMAGE[damage](newest)
     notes: list[str] = []
     go_on(run, on_progress=lambda progress: notes.append(progress.note) if progress.note else None)
