@@ -20,7 +20,7 @@ from ethbrake_marl.motion.layout import BRAKING, Floats
 
 SHARES = np.linspace(0.0, 1.0, 21)  # of its brakes that each of several learners tries at the alert
 ROUNDS = 2  # in which they try them
-CHANGES = np.array([0.05, -0.05, 0.1, -0.1, 0.2, -0.2])  # of the plan's next actions, tried as constants
+CHANGES = np.array([0.05, -0.05, 0.1, -0.1, 0.2, -0.2, 0.4, -0.4])  # of the plan's next actions, tried as constants
 
 
 def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floats]:
