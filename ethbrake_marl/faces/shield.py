@@ -43,8 +43,8 @@ def shield(
     action, they do to the proposal. Infos: ``shield_...`` (docs/shield.md).
 
     Args:
-        env: an environment of this package, parallel, in turns, Gymnasium or vector, perhaps in wrappers of its library;
-            a ``VecEnv``; or a ``Team``, or an agent, who propose.
+        env: an environment of this package, parallel, in turns, Gymnasium or vector, perhaps in wrappers of its
+            library; a ``VecEnv``; or a ``Team``, or an agent, who propose.
         policy: proposes the actions that the caller leaves out (NaN, or no entry in a dictionary); the shield also
             plans with it. A name, an agent for all learners, a ``Team``, or vehicle -> agent. None: without a proposal
             the shield's own plan is followed.

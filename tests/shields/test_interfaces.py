@@ -119,7 +119,7 @@ def test_it_is_the_same_kind_of_environment_and_starts_with_reset(make: Callable
 @pytest.mark.filterwarnings("ignore::ethbrake_marl.faces.stream.UnknownResetOption")
 def test_the_libraries_accept_it() -> None:
     check_env(shield(EthBrakeEnv("paper-random")), skip_render_check=True)
-    parallel_api_test(shield(EthBrakeParallelEnv("paper-random"), "coast"), num_cycles=100)
+    parallel_api_test(shield(EthBrakeParallelEnv("paper-random", agents="learners"), "coast"), num_cycles=100)
     api_test(shield(raw_env("cooperation-3-pair", agents="learners")), num_cycles=100)
 
 
