@@ -417,6 +417,14 @@ def test_agents_for_other_vehicles() -> None:
         game.begin(scenario.sample(2, 7))
 
 
+def test_the_callers_array_stays_the_callers() -> None:
+    game, state = opened("paper", 2)
+    proposed = np.array([[0.5], [-0.5]])
+    state, _ = game.step(state, proposed)
+    proposed[:] = 0.0
+    assert state.memories["shield"].proposed.tolist() == [[0.5], [-0.5]]
+
+
 def test_whole_numbers_are_proposals() -> None:
     game, state = opened("paper", 2)
     assert game.step(state, np.array([[1], [-1]]))[0].memories["shield"].proposed.tolist() == [[1.0], [-1.0]]
