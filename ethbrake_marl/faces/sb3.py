@@ -143,7 +143,7 @@ class EthBrakeVecEnv(VecEnv):
             self.stream.seed, self.stream.next, self._next_seed = self._next_seed, 0, None
         self.episode = self.stream.draw(self.n) if worlds is None else self.game.begin(worlds)
         self._return[:], self._steps[:] = 0.0, 0
-        self._begun, self._begun_own = numbers(self.episode, self.learners), self._own_infos()
+        self._begun, self._begun_own = numbers(self.episode, self.learners), self._own_infos(self.episode)
         if self.renderer is not None:
             self.renderer.began(self.episode)
         return self._observe(self.episode)
@@ -175,9 +175,11 @@ class EthBrakeVecEnv(VecEnv):
             self._close(ended, step, infos)
             new = self.stream.draw(len(ended))
             self.episode = self.episode.put(ended, new, donate=True)
-            self._begun[ended], own = numbers(new, self.learners), self._own_infos()
-            for row in (ended[:, np.newaxis] * L + np.arange(L)).reshape(-1).tolist():
-                self._begun_own[row] = own[row]
+            self._begun[ended] = numbers(new, self.learners)
+            if self._begun_own:
+                rows = (ended[:, np.newaxis] * L + np.arange(L)).reshape(-1).tolist()
+                for row, own in zip(rows, self._own_infos(new), strict=True):
+                    self._begun_own[row] = own
         if self.renderer is not None:
             self.renderer.stepped(self.episode)
         return self._observe(self.episode), reward.astype(np.float32), over.repeat(L), infos
@@ -202,10 +204,12 @@ class EthBrakeVecEnv(VecEnv):
         return dictionaries(self.game, state, step, self.stream.seed or 0, self.learners)
 
     def _step_infos(self) -> list[dict[str, Any]]:
-        return [{} for _ in range(self.num_envs)] if self.game.shield is None else self._own_infos()
+        return [{} for _ in range(self.num_envs)] if self.game.shield is None else self._own_infos(self.episode)
 
-    def _own_infos(self) -> list[dict[str, Any]]:
-        return per_body(self.game.own_infos(self.episode), self.n, self.learners)
+    def _own_infos(self, state: State) -> list[dict[str, Any]]:
+        """Return the infos that only this game has; an empty list if it has none."""
+        columns = self.game.own_infos(state)
+        return per_body(columns, state.n, self.learners) if columns else []
 
     @property
     def reset_infos(self) -> list[dict[str, Any]]:
@@ -214,10 +218,8 @@ class EthBrakeVecEnv(VecEnv):
             return [{} for _ in range(self.num_envs)]
         infos = self._infos(self.episode, None)
         begun = self._begun.reshape(-1, len(NUMBERS)).tolist()
-        return [
-            info | dict(zip(NUMBERS, row, strict=True)) | own
-            for info, row, own in zip(infos, begun, self._begun_own, strict=True)
-        ]
+        infos = [info | dict(zip(NUMBERS, row, strict=True)) for info, row in zip(infos, begun, strict=True)]
+        return [info | own for info, own in zip(infos, self._begun_own, strict=True)] if self._begun_own else infos
 
     @reset_infos.setter
     def reset_infos(self, infos: list[dict[str, Any]]) -> None:

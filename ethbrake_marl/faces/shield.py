@@ -43,8 +43,8 @@ def shield(
     action, they do to the proposal. Infos: ``shield_...`` (docs/shield.md).
 
     Args:
-        env: an environment of this package, parallel, in turns, Gymnasium, vector or ``VecEnv``, perhaps in wrappers of
-            its library; or a ``Team``, or an agent, who propose.
+        env: an environment of this package, parallel, in turns, Gymnasium or vector, perhaps in wrappers of its
+            library; a ``VecEnv``; or a ``Team``, or an agent, who propose.
         policy: proposes the actions that the caller leaves out (NaN, or no entry in a dictionary); the shield also
             plans with it. A name, an agent for all learners, a ``Team``, or vehicle -> agent. None: without a proposal
             the shield's own plan is followed.
@@ -84,6 +84,9 @@ def shield(
             f"shield: {env!r:.80}: must be a team, an agent, or an environment made by eb.parallel_env, eb.env,"
             " eb.EthBrakeEnv, eb.EthBrakeVectorEnv or eb.make_sb3_vec_env, perhaps in wrappers"
         )
+    if hasattr(env, "venv"):  # copies of Stable-Baselines3's wrappers lose what they wrap
+        name = type(env).__name__
+        raise InvalidInput(f"shield: put the shield inside: {name}(eb.shield(env), ...) instead of shield({name}(env))")
     if game.shield is not None:
         raise InvalidInput("shield: this environment already has a shield")
     if not len(game.rules.learners):

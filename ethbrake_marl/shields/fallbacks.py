@@ -20,7 +20,7 @@ from ethbrake_marl.motion.layout import BRAKING, Floats
 
 SHARES = np.linspace(0.0, 1.0, 21)  # of its brakes that each of several learners tries at the alert
 ROUNDS = 2  # in which they try them
-CHANGES = np.array([0.05, -0.05, 0.1, -0.1, 0.2, -0.2])  # of the plan's next actions, tried as constants
+CHANGES = np.array([0.05, -0.05, 0.1, -0.1, 0.2, -0.2, 0.4, -0.4])  # of the plan's next actions, tried as constants
 
 
 def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floats]:
@@ -51,18 +51,18 @@ def held(game: Game, actions: Floats) -> Floats:
 
 
 def best_constant(game: Game, state: State, plans: Floats, count: str) -> tuple[Floats, Floats]:
-    """Return plans that hold the best of some constant actions, and their harm in one piece, [n] m2/s2.
+    """Return the best of some constant actions, [n, 1, L], and their harm in one piece, [n] m2/s2.
 
     Tried are the plan's next actions, all of them a little harder or softer: deviations from a good plan are mended by
     small changes far more often than by a fixed set of constants that spans all brakes.
     """
     learners, rows = game.rules.learners, np.arange(state.n)
     planned = plans[rows, np.minimum(state.steps, plans.shape[1] - 1)]
-    actions = np.clip(planned[:, np.newaxis] + CHANGES[:, np.newaxis], -1.0, 0.0)
+    actions = np.minimum(np.maximum(planned[:, np.newaxis] + CHANGES[:, np.newaxis], -1.0), 0.0)
     commands = actions * state.car[:, np.newaxis, BRAKING, learners]
     harm = hold(state, state.wanted, learners.tolist(), commands, game.rules.horizon_s, count)[0]
     best = harm.argmin(axis=1)
-    return np.repeat(actions[rows, best, np.newaxis], plans.shape[1], axis=1), harm[rows, best]
+    return actions[rows, best, np.newaxis], harm[rows, best]
 
 
 def rollout(

@@ -73,8 +73,9 @@ class Memory(NamedTuple):
     replaced: Ints  # [n] number of actions that have been replaced
 
 
-# What may follow an action: its reason, and (shield, game, states after the action, plans, most) -> plans and their
-# harm, [n], or less where it is not known yet. Only a plan with an estimate up to `most` is priced.
+# What may follow an action: its reason, and (shield, game, states after the action, plans, most) -> actions of every
+# decision, [n, T or 1, L], and their harm, [n], or less where it is not known yet. What seems to cost more than `most`
+# is not priced.
 Fallback = tuple[int, Callable[["StepShield", Game, State, Floats, Floats], tuple[Floats, Floats]]]
 
 
@@ -163,20 +164,22 @@ class StepShield:
         deviates = (tried != planned) & running
         reason = np.where(deviates, NO_CERTIFICATE, np.where(silent, NOT_A_NUMBER, SAME_AS_PLAN))
         margin = np.repeat((bound - memory.price)[:, np.newaxis], proposed.shape[1], axis=1)
-        rejected = np.flatnonzero(deviates.any(axis=1))
+        rejected = deviates.any(axis=1).nonzero()[0]
         for columns in trials(proposed.shape[1]):
-            mine, wanted = deviates[rejected] & columns, tried[rejected]
+            if not len(rejected):
+                break
+            mine, wanted, together = deviates[rejected] & columns, tried[rejected], columns.all()
             actions = np.where(mine, wanted, memory.plan[rejected, now[rejected]])
-            new = mine.any(axis=1) & (columns.all() | (actions != wanted).any(axis=1))  # else it is the first trial
+            new = mine.any(axis=1)
+            if not together:
+                new &= (actions != wanted).any(axis=1)  # what was rejected together is not tried again
             rows, mine = rejected[new], mine[new]
             if len(rows):
-                rests = (
-                    self.rests if columns.all() else self.rests[:1]
-                )  # what the agents propose, they propose together
+                rests = self.rests if together else self.rests[:1]  # what the agents propose, they propose together
                 why, least = self.accept(game, state, memory, rows, actions[new], now[rows], rests)
                 reason[rows] = np.where(mine, why[:, np.newaxis], reason[rows])
                 margin[rows] = np.where(mine, (bound[rows] - least)[:, np.newaxis], margin[rows])
-                if columns.all():
+                if together:
                     rejected = rows[why == NO_CERTIFICATE]
         applied = memory.plan[each, now]
         differ = (applied != proposed) & running
@@ -215,24 +218,27 @@ class StepShield:
         least = self.price(game, before, plans, most, take(memory.caps, rows))
         reason = np.where(least <= most, PLAN_REMAINS, NO_CERTIFICATE)
         for code, rest in rests:
-            left = np.flatnonzero(reason == NO_CERTIFICATE)
+            left = (reason == NO_CERTIFICATE).nonzero()[0]
             if not len(left):
                 break
             here = self.part(before, left)
             after, _ = game.follow(here, actions[left].repeat(self.M, axis=0))
             after = after if self.M == 1 else after.take(slice(None, None, self.M))
-            tried, value = rest(self, game, after, plans[left], most[left])
-            hopeful = np.flatnonzero(value <= most[left] + NEARLY)
+            later, value = rest(self, game, after, plans[left], most[left])
+            hopeful = (value <= most[left] + NEARLY).nonzero()[0]
             if len(hopeful):
-                at, tried = left[hopeful], tried[hopeful]
+                at = left[hopeful]
+                tried = np.empty((len(at), *plans.shape[1:]))
+                tried[:] = later[hopeful]
                 tried[np.arange(len(at)), now[at]] = actions[at]
                 states, caps = self.part(here, hopeful), take(memory.caps, rows[at])
                 value[hopeful] = self.price(game, states, tried, most[at], caps)
-                good = np.flatnonzero(value[hopeful] <= most[at])
+                good = value[hopeful] <= most[at]
                 plans[at[good]], reason[at[good]] = tried[good], code
             least[left] = np.minimum(least[left], value)
-        good = np.flatnonzero(reason != NO_CERTIFICATE)
-        memory.plan[rows[good]], memory.price[rows[good]] = plans[good], least[good]
+        good = (reason != NO_CERTIFICATE).nonzero()[0]
+        if len(good):
+            memory.plan[rows[good]], memory.price[rows[good]] = plans[good], least[good]
         return reason, least
 
     def part(self, states: State, rows: Ints) -> State:

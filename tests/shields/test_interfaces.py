@@ -1,0 +1,266 @@
+"""One wrapper for all interfaces: the bound holds in each, the caller's environment stays, infos are flat, refusals."""
+
+import copy
+import pickle
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from pettingzoo.test import api_test, parallel_api_test
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+
+from ethbrake_marl.agents.drive import Team
+from ethbrake_marl.agents.policy_agent import LearnedAgent
+from ethbrake_marl.agents.scripts import Held
+from ethbrake_marl.errors import InvalidInput, UnknownName
+from ethbrake_marl.faces.gymnasium import EthBrakeEnv
+from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv, raw_env
+from ethbrake_marl.faces.sb3 import make_sb3_vec_env
+from ethbrake_marl.faces.shield import shield
+from ethbrake_marl.faces.vector import EthBrakeVectorEnv
+from ethbrake_marl.names import make_teams
+from ethbrake_marl.policies.bundle import load_shipped
+from ethbrake_marl.shields.decision import ShieldReason
+from ethbrake_marl.worlds.catalogue import load_scenario
+from tests.shields.attack import LINES, ONLY_ONE, PLAYS, TEAMS, WAYS, attack
+
+INFOS = {
+    "bound_harm": float,
+    "settles": bool,
+    "proposed_action": float,
+    "applied_action": float,
+    "intervened": bool,
+    "reason": int,
+    "margin": float,
+}
+COAST = Held("coast")
+CELLS = [(play, name) for play in PLAYS for name in LINES if not (play in ONLY_ONE and name in TEAMS)]
+
+
+@pytest.mark.parametrize(("play", "name"), CELLS)
+def test_harm_is_the_certified_harm(play: str, name: str) -> None:
+    k = CELLS.index((play, name))
+    count, way = ("first", "total")[k % 2], list(WAYS)[k % len(WAYS)]
+    assert attack(play, name, count, way, 2 if play in ("parallel", "AEC", "Gymnasium") else 12).held
+
+
+def shield_infos(info: dict[str, Any]) -> dict[str, Any]:
+    return {name.removeprefix("shield_"): value for name, value in info.items() if name.startswith("shield_")}
+
+
+def test_infos_are_flat_numbers_from_the_reset_on() -> None:
+    env = shield(EthBrakeParallelEnv("cooperation-3-pair"))
+    for infos in (env.reset(seed=7)[1], env.step({"vehicle_2": [1.0], "vehicle_3": [-1.0]})[4]):
+        for info in infos.values():
+            assert {name: type(value) for name, value in shield_infos(info).items()} == INFOS
+    assert shield_infos(infos["vehicle_1"])["reason"] == ShieldReason.NO_DECISION
+    assert shield_infos(infos["vehicle_2"])["proposed_action"] == 1.0
+    assert shield_infos(infos["vehicle_3"])["proposed_action"] == -1.0
+
+
+MAKERS: dict[str, Callable[[], Any]] = {
+    "parallel": lambda: EthBrakeParallelEnv("paper-random", agents="learners"),
+    "AEC": lambda: raw_env("paper-random", agents="learners"),
+    "Gymnasium": lambda: EthBrakeEnv("paper-random"),
+    "in wrappers": lambda: gymnasium.wrappers.OrderEnforcing(
+        gymnasium.wrappers.ClipAction(EthBrakeEnv("paper-random"))
+    ),
+    "vector": lambda: EthBrakeVectorEnv(2, "paper-random"),
+    "vector in a wrapper": lambda: gymnasium.wrappers.vector.RecordEpisodeStatistics(EthBrakeVectorEnv(2)),
+    "VecEnv": lambda: make_sb3_vec_env("paper-random", 2, 5),
+}
+
+
+def begin(env: Any) -> None:
+    env.reset(**({} if isinstance(env, VecEnv) else {"seed": 7}))
+
+
+def push(env: Any, u: float = 1.0) -> Any:
+    """Propose u for all learners, and return what the step returns."""
+    if hasattr(env, "num_envs"):
+        return env.step(np.full((env.num_envs, 1), u, np.float32))
+    return env.step({"vehicle_2": [u]} if isinstance(env, EthBrakeParallelEnv) else np.array([u], np.float32))
+
+
+@pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
+def test_the_callers_environment_stays_as_it_is(make: Callable[[], Any]) -> None:
+    env, other = make(), make()
+    begin(env)
+    begin(other)
+    game, episode = env.unwrapped.game, copy.deepcopy(env.unwrapped.episode)
+    guarded = shield(env)
+    begin(guarded)
+    for _ in range(3):
+        push(guarded)
+    assert env.unwrapped.game is game and game.shield is None
+    np.testing.assert_array_equal(env.unwrapped.episode.line, episode.line)
+    push(env)
+    push(other)
+    np.testing.assert_array_equal(env.unwrapped.episode.line, other.unwrapped.episode.line)
+    assert (guarded.unwrapped.episode.line != env.unwrapped.episode.line).any()
+
+
+@pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
+def test_it_is_the_same_kind_of_environment_and_starts_with_reset(make: Callable[[], Any]) -> None:
+    env = make()
+    begin(env)
+    guarded = shield(env)
+    assert type(guarded) is type(env) and type(guarded.unwrapped) is type(env.unwrapped)
+    with pytest.raises(InvalidInput, match="no episode is running; call reset first"):
+        push(guarded)
+    begin(guarded)
+    push(guarded)
+    assert guarded.unwrapped.episode.memories["shield"].intervened.any()
+
+
+@pytest.mark.filterwarnings("ignore::ethbrake_marl.faces.stream.UnknownResetOption")
+def test_the_libraries_accept_it() -> None:
+    check_env(shield(EthBrakeEnv("paper-random")), skip_render_check=True)
+    parallel_api_test(shield(EthBrakeParallelEnv("paper-random", agents="learners"), "coast"), num_cycles=100)
+    api_test(shield(raw_env("cooperation-3-pair", agents="learners")), num_cycles=100)
+
+
+def test_policies_propose_what_the_caller_leaves_out() -> None:
+    for policy in (COAST, "coast", {"vehicle_2": COAST}, Team("coasting", {2: COAST})):
+        env = shield(EthBrakeParallelEnv("paper-random"), policy)
+        env.reset(seed=7)
+        info = env.step({})[4]["vehicle_2"]
+        assert info["shield_proposed_action"] == 0.0 and info["shield_reason"] != ShieldReason.NOT_A_NUMBER
+    env = shield(EthBrakeParallelEnv("cooperation-3-pair"), "coast")
+    env.reset(seed=7)
+    infos = env.step({"vehicle_3": [0.5]})[4]
+    assert [infos[f"vehicle_{i}"]["shield_proposed_action"] for i in (1, 2, 3)] == [0.0, 0.0, 0.5]
+    gym = shield(EthBrakeEnv("paper-random"), load_shipped("ppo"))
+    first = gym.reset(seed=7)[1]["shield_bound_harm"]
+    over = False
+    while not over:
+        *_, ended, cut, info = gym.step([np.nan])
+        over = ended or cut
+        assert not info["shield_intervened"]
+    assert info["world_first_impact_harm"] == first
+
+
+def test_without_a_policy_the_plan_is_followed() -> None:
+    env = shield(EthBrakeParallelEnv("paper-random"))
+    first = env.reset(seed=7)[1]["vehicle_2"]["shield_bound_harm"]
+    while env.agents:
+        info = env.step({})[4]["vehicle_2"]
+    assert info["world_first_impact_harm"] == first and first > 0.0
+
+
+def test_every_new_episode_of_a_vec_env_reports_its_own_bound() -> None:
+    env = shield(make_sb3_vec_env("paper-random", 8, 3))
+    env.reset()
+    first = [info["shield_bound_harm"] for info in env.reset_infos]
+    numbers = [info["world"] for info in env.reset_infos]
+    for _ in range(60):
+        _, _, over, _ = env.step(np.ones((8, 1)))
+        again = env.reset_infos
+        for row in range(8):
+            if over[row]:
+                first[row], numbers[row] = again[row]["shield_bound_harm"], again[row]["world"]
+            assert again[row]["shield_bound_harm"] == first[row]
+            assert again[row]["shield_reason"] == ShieldReason.NO_DECISION
+    assert numbers != list(range(8))
+
+
+def test_mode_episode() -> None:
+    env = shield(EthBrakeEnv("paper-random"), "full_brake", "episode", bound="pairwise")
+    env.reset(seed=7)
+    info = env.step([0.0])[4]
+    names = {"chosen_policy", "policy_harm", "bound_harm", "proposed_action", "applied_action", "intervened"}
+    assert shield_infos(info).keys() == names
+
+
+def test_teams_and_names() -> None:
+    team = Team("coasting", {2: COAST})
+    guarded = shield(team, harm_count="total", allowance=1.0)
+    assert guarded.name == "coasting+step" and guarded.shield.drivers == {2: COAST}
+    assert (guarded.shield.count, guarded.shield.allowance) == ("total", 1.0)
+    alone = shield(COAST, scenario="paper-random", mode="episode")
+    assert alone.drivers == {2: COAST} and alone.name == "coast+episode"
+    scenario = load_scenario("paper-random")
+    teams = make_teams("ppo+step,coast+episode:pairwise", scenario, harm_count="total")
+    assert [type(each.shield).__name__ for each in teams.values()] == ["StepShield", "EpisodeShield"]
+    assert [each.shield.count for each in teams.values()] == ["total", "total"]
+
+
+def test_the_term_intervention() -> None:
+    reward = {"harm": 1.0, "intervention": 0.5}
+    env = shield(EthBrakeParallelEnv("cooperation-3-pair", reward=reward))
+    env.reset(seed=7)
+    replaced = 0
+    for _ in range(5):
+        _, rewards, _, _, infos = env.step({"vehicle_2": [1.0], "vehicle_3": [1.0]})
+        for agent, info in infos.items():
+            assert info["reward_intervention"] == -1.0 * info["shield_intervened"]
+            assert rewards[agent] == info["reward_harm"] + 0.5 * info["reward_intervention"]
+            replaced += info["shield_intervened"]
+    assert replaced > 0
+    alone = EthBrakeParallelEnv("paper-random", reward=reward)
+    alone.reset(seed=7)
+    with pytest.raises(InvalidInput, match=r"term 'intervention'.*this game has no shield"):
+        alone.step({"vehicle_2": [0.0]})
+
+
+def test_the_copy_can_be_pickled() -> None:
+    env = shield(EthBrakeParallelEnv("paper-random"), LearnedAgent(load_shipped("ppo")))
+    env.reset(seed=7)
+    again = pickle.loads(pickle.dumps(env))
+    assert again.step({})[4] == env.step({})[4]
+
+
+REFUSED: list[tuple[Callable[[], Any], type[Exception], str]] = [
+    (lambda: shield(4), InvalidInput, "4: must be a team, an agent, or an environment"),
+    (lambda: shield(EthBrakeEnv), InvalidInput, "must be a team, an agent, or an environment"),
+    (lambda: shield(DummyVecEnv([EthBrakeEnv])), InvalidInput, "must be a team, an agent, or an environment"),
+    (lambda: shield(gymnasium.make("CartPole-v1")), InvalidInput, "must be a team, an agent, or an environment"),
+    (lambda: shield(VecNormalize(make_sb3_vec_env("paper-random", 1))), InvalidInput, "VecNormalize\\(eb.shield\\(env"),
+    (lambda: shield(shield(EthBrakeEnv())), InvalidInput, "this environment already has a shield"),
+    (lambda: shield(shield(Team("t", {2: COAST}))), InvalidInput, "team 't\\+step' already has a shield"),
+    (lambda: shield(Team("t", {2: COAST}), "coast"), InvalidInput, "'t' proposes by itself; leave out policy"),
+    (lambda: shield(COAST), InvalidInput, "agent 'coast': pass scenario="),
+    (lambda: shield(EthBrakeEnv(), mode="stp"), UnknownName, "unknown shield mode 'stp'; did you mean 'step'"),
+    (lambda: shield(EthBrakeEnv(), alowance=1), UnknownName, "option .* 'alowance'; did you mean 'allowance'"),
+    (lambda: shield(EthBrakeEnv(), bound="coupled"), UnknownName, "option of a shield in mode step 'bound'"),
+    (lambda: shield(EthBrakeEnv(), "coast", "episode", allowance=1), UnknownName, "in mode episode 'allowance'"),
+    (lambda: shield(EthBrakeEnv(), mode="episode"), InvalidInput, "needs the policy of exactly one learner"),
+    (lambda: shield(EthBrakeEnv(), 4), InvalidInput, "4: .*must be an agent"),
+    (lambda: shield(EthBrakeEnv(), "cost"), UnknownName, "'cost'"),
+    (
+        lambda: shield(EthBrakeEnv(), {"vehicle_3": COAST}),
+        InvalidInput,
+        "drives vehicle_3; must drive exactly vehicle_2",
+    ),
+    (lambda: shield(EthBrakeEnv(), {2: COAST}), InvalidInput, "2: must be the name of a vehicle"),
+    (lambda: shield(EthBrakeEnv(), allowance=-1), InvalidInput, "allowance = -1"),
+]
+
+
+@pytest.mark.parametrize(("call", "error", "text"), REFUSED, ids=[text for *_, text in REFUSED])
+def test_refusals(call: Callable[[], Any], error: type[Exception], text: str) -> None:
+    with pytest.raises(error, match=text):
+        call()
+
+
+def test_a_line_without_learners() -> None:
+    scenario = load_scenario("paper-random")
+    scripted = scenario.replace(roles={**scenario.roles, "vehicle_2": "coast"})
+    with pytest.raises(InvalidInput, match="has no learner to shield"):
+        shield(EthBrakeParallelEnv(scripted))
+
+
+@pytest.mark.parametrize(
+    ("action", "text"), [([1.5], "= 1.5"), ([0.0, 0.0], "shape"), ("1", "must be a number"), ([np.inf], "= inf")]
+)
+def test_bad_actions_change_nothing(action: Any, text: str) -> None:
+    env = shield(EthBrakeParallelEnv("paper-random"))
+    env.reset(seed=7)
+    before = env.episode
+    with pytest.raises(InvalidInput, match=text):
+        env.step({"vehicle_2": action})
+    assert env.episode is before
+    env.step({"vehicle_2": [1.0]})
