@@ -82,9 +82,7 @@ def test_results__stand_alone_on_stdout_whatever_a_file_of_the_users_prints(ethb
 
 
 def test_defect_of_the_program__keeps_its_traceback_and_missing_memory_is_one_line(ethbrake, monkeypatch) -> None:
-    monkeypatch.setattr(
-        "ethbrake_marl.worlds.catalogue.list_scenarios", Mock(side_effect=RuntimeError("a defect"))
-    )
+    monkeypatch.setattr("ethbrake_marl.worlds.catalogue.list_scenarios", Mock(side_effect=RuntimeError("a defect")))
     with pytest.raises(RuntimeError, match="a defect"):
         ethbrake("scenario", "list")
     short = Mock(side_effect=MemoryError("Unable to allocate 9 TiB"))
