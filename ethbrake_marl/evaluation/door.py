@@ -9,6 +9,7 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.evaluation.evaluate import Result, evaluate as evaluate_teams
 from ethbrake_marl.evaluation.identity import about_scenario
+from ethbrake_marl.evaluation.named_measures import measures_called
 from ethbrake_marl.names import open_game, teams_of
 from ethbrake_marl.worlds.game import AnyScenario
 from ethbrake_marl.worlds.sampling import Drawn
@@ -43,7 +44,7 @@ def evaluate(
         episodes: number of worlds of the list.
         seed: of the list.
         harm_count: what optimising agents minimise, harm of the ``first`` impact of each pair or ``total``.
-        measures: names of measures beside the usual ones (``evaluation.measures``).
+        measures: names of measures beside the usual ones (``evaluation.named_measures``).
         jobs: number of processes.
         ray: ``local``, or address of a Ray cluster.
         on_done: called with the number of worlds that have been driven so far.
@@ -79,6 +80,5 @@ def evaluate(
         check_whole_number("episodes", episodes, 1)
         given = loaded.draw(int(episodes), seed)
     teams = teams_of(agents, loaded, harm_count=harm_count)
-    named = measures.split(",") if isinstance(measures, str) and measures else measures
     about["agent_settings"] = {"harm_count": harm_count}
-    return evaluate_teams(given, teams, game, named, jobs, ray=ray, about=about, on_done=on_done)
+    return evaluate_teams(given, teams, game, measures_called(measures), jobs, ray=ray, about=about, on_done=on_done)
