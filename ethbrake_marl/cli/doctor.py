@@ -159,7 +159,7 @@ def _kernel_cache() -> tuple[bool, str]:
 
 
 def _scenarios() -> tuple[bool, str]:
-    from ethbrake_marl.first_edition.scenario.catalogue import list_scenarios, shipped_folder
+    from ethbrake_marl.worlds.catalogue import list_scenarios, shipped_folder
 
     shipped = [entry for entry in list_scenarios() if entry.shipped]
     return len(shipped) > 0, f"{len(shipped)} in {shipped_folder()}"
@@ -170,17 +170,18 @@ def _golden_impact() -> tuple[bool, str]:
 
     The exact harm, the square of the impact speed, is ``10^2 - 2 * 5 * 8 = 20`` m2/s2.
     """
-    import numpy as np
+    from ethbrake_marl.agents.drive import drive
+    from ethbrake_marl.names import make_teams, open_game
+    from ethbrake_marl.worlds.given import worlds_from_state
 
-    from ethbrake_marl.first_edition.physics.advance import advance
-    from ethbrake_marl.first_edition.physics.state import make_worlds
-
-    world = make_worlds(
-        [8.0], [0.0, 10.0], braking_capacity_mps2=5.0, driving_capacity_mps2=5.0, latency_s=0.0, mass_t=5.0,
-        restitution=0.1,
+    scenario, game = open_game(
+        {
+            "name": "check", "vehicles": 2, "gaps_m": 8, "speeds_mps": [0, 10], "braking_capacity_mps2": 5,
+            "driving_capacity_mps2": 5, "latency_s": 0, "mass_t": 5,
+        }
     )  # fmt: skip
-    _, impacts = advance(world, np.array([[0.0, -5.0]]), 4.0)
-    harm = float(impacts.total_harm[0, 0])
+    team = make_teams("full_brake", scenario)["full_brake"]
+    harm = float(drive(game, worlds_from_state(scenario, {}), team).harm("total")[0])
     text = f"car at 10 m/s, braking with 5 m/s2, 8 m behind a standing car: harm {harm:.9g} (exact: 20)"
     return abs(harm - 20.0) < 1e-9, text
 
@@ -190,17 +191,12 @@ def _golden_baseline() -> tuple[bool, str]:
 
     The known result is a deceleration of 5.17021 m/s2 and a harm of 4.03447 m2/s2.
     """
-    import numpy as np
+    from ethbrake_marl.agents.pairwise import pairwise
+    from ethbrake_marl.worlds.catalogue import load_scenario
+    from ethbrake_marl.worlds.given import worlds_from_state
 
-    from ethbrake_marl.first_edition.agents.e_v2x_bm.pairwise import optimise_pairwise
-    from ethbrake_marl.first_edition.physics.state import make_worlds
-
-    capacity = np.array([6.0, 7.0, 6.0])
-    world = make_worlds(
-        [7.0, 7.0], [20.0, 18.0, 20.0], braking_capacity_mps2=capacity, driving_capacity_mps2=capacity,
-        latency_s=np.array([0.0, 0.5, 0.8]), mass_t=5.0, restitution=0.1,
-    )  # fmt: skip
-    best = optimise_pairwise(world, 1)
+    scenario = load_scenario("paper-distance").replace(gaps_m=7.0)
+    best = pairwise(worlds_from_state(scenario, {}), 2)
     computed = f"{float(best.deceleration_mps2[0]):.6g} m/s2, harm {float(best.harm[0]):.6g}"
     wanted = "5.17021 m/s2, harm 4.03447"
     return computed == wanted, f"E-V2X-BM with gaps of 7 m and 7 m: {computed} (known result: {wanted})"
