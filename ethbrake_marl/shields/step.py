@@ -222,7 +222,7 @@ class StepShield:
                 break
             here = self.part(before, left)
             after, _ = game.follow(here, actions[left].repeat(self.M, axis=0))
-            after = after if self.M == 1 else after.take(slice(None, None, self.M))
+            after = after if self.M == 1 else after.take(np.arange(0, after.n, self.M))
             later, value = rest(self, game, after, plans[left], most[left])
             hopeful = (value <= most[left] + NEARLY).nonzero()[0]
             if len(hopeful):
