@@ -288,7 +288,10 @@ def _in_file(match: re.Match[str], settings: AgentSettings) -> Callable[..., Any
     """Return the function of a Python file that makes an agent."""
     function = load_from_file(os.path.expanduser(match["file"]), match["name"], reads=settings.policy)
     if not callable(function):
-        raise InvalidInput(f"agent {settings.spec!r}: {match['name']!r} is not a function that makes the agent")
+        raise InvalidInput(
+            f"file {match['file']!r}: {match['name']!r} is not a function; write FILE.py:FUNCTION, where FUNCTION makes"
+            " the agent"
+        )
     if not signature(function).parameters:
         if match["argument"] or match["policy"]:
             raise InvalidInput(

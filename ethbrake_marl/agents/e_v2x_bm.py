@@ -42,7 +42,7 @@ def coupled(alert: State, body: int, count: str = "first", horizon_s: float = 8.
     braking[:, body] = alert.car[:, BRAKING, body]
     best = closed_form(alert, braking, body).deceleration_mps2
     harm = harms(alert, body, best[:, np.newaxis], count, horizon_s)[:, :, 0]
-    rows = np.flatnonzero(harm[1 if count == "first" else 0])
+    rows = np.flatnonzero(harm.any(axis=0))
     if len(rows):
         best[rows], harm[0, rows], _ = search(alert.take(rows), body, count, horizon_s).T
     failed = np.flatnonzero(np.isinf(harm[0]))  # for every deceleration

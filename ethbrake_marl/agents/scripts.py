@@ -38,14 +38,19 @@ class Held(NamedTuple):
         return memory, memory
 
 
+FULL_BRAKE, COAST = Held("full_brake"), Held("coast")
+
+
 def make_held(argument: str | None, settings: Any) -> Held:
     """Return the script with the name ``settings.spec``. Raises ``InvalidInput`` unless its argument is right."""
     check_role(settings.spec)
     return Held(settings.spec)
 
 
-FULL_BRAKE = Part(make_held, form="full_brake", about="full braking, the paper's non-ethical strategy", knows=SENSORS)
-COAST = Part(make_held, form="coast", about="neither brake nor drive", knows=SENSORS)
-CONSTANT = Part(
+FULL_BRAKE_ENTRY = Part(
+    make_held, form="full_brake", about="full braking, the paper's non-ethical strategy", knows=SENSORS
+)
+COAST_ENTRY = Part(make_held, form="coast", about="neither brake nor drive", knows=SENSORS)
+CONSTANT_ENTRY = Part(
     make_held, form="constant:A", about="constant deceleration A in m/s2; a negative A drives", knows=SENSORS
 )

@@ -45,7 +45,10 @@ def make_trained(argument: str | None, settings: Any) -> Agent | Team:
 
 def has_policy_each(run: Path) -> bool:
     """Return whether a run's learners have policies of their own."""
-    return any((run / "policy").glob("vehicle_[1-9]*"))
+    try:
+        return any((run / "policy").glob("vehicle_[1-9]*"))
+    except OSError:  # no path at all, such as one that is too long
+        return False
 
 
 def _shipped(name: str, what: str) -> Part:

@@ -15,7 +15,7 @@ from ethbrake_marl.policies.manifest import Manifest, content_sha256
 from ethbrake_marl.policies.policy import MANIFEST, WEIGHTS, Policy, checked_tensors
 
 LIMITS_BYTES = {MANIFEST: 1 << 20, WEIGHTS: 256 << 20}
-SHIPPED = Path(__file__).resolve().parents[1] / "_policies"  # NAME/policy is a bundle, NAME/card.md its description
+SHIPPED = Path(__file__).resolve().parents[1] / "_policies"  # NAME/policy is a bundle, NAME/card.md describes it
 
 
 def load_policy(path: str | os.PathLike[str]) -> Policy:
@@ -45,10 +45,9 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
 
 
 def _read_manifest(file: Path) -> Manifest:
+    data = _read(file)
     try:
-        content, manifest = read_json_model(_read(file), Manifest)
-    except CorruptBundle:
-        raise
+        content, manifest = read_json_model(data, Manifest)
     except ValueError as error:
         raise CorruptBundle(f"{file}: {error}") from None
     own = content_sha256(content)
@@ -67,16 +66,17 @@ def _read(file: Path) -> bytes:
 
 def _bundle_in(path: Path) -> Path:
     """Return the folder of the bundle: ``path``, or its folder ``policy``."""
+    members: list[Path] = []
     for folder in (path, path / "policy"):
         names = _names_in(folder)
         if names & {MANIFEST, WEIGHTS}:
             if folder.is_symlink():
                 raise CorruptBundle(f"{folder}: is a symbolic link; give the folder to which the link points")
             return folder
-    members = sorted(name for name in names if name.startswith("vehicle_"))
+        members += [folder / name for name in sorted(names) if name.startswith("vehicle_")]
     if members:
         raise InvalidInput(
-            f"{path}: has one policy for each learner; give the path of one of them, for instance {folder / members[0]}"
+            f"{path}: has one policy for each learner; give the path of one of them, for instance {members[0]}"
         )
     reason = "contains no policy" if path.is_dir() else "is not a folder"
     raise InvalidInput(
@@ -95,8 +95,8 @@ def _names_in(folder: Path) -> set[str]:
 
 
 def shipped_policies() -> dict[str, Path]:
-    """Return name -> folder of the bundle of every shipped policy."""
-    return {folder.parent.name: folder for folder in sorted(SHIPPED.glob("*/policy"))}
+    """Return name -> folder of every shipped policy: its card, and the folder ``policy``."""
+    return {folder.parent.name: folder.parent for folder in sorted(SHIPPED.glob("*/policy"))}
 
 
 def load_shipped(name: str) -> Policy:

@@ -59,6 +59,8 @@ def wait_of(worlds: State) -> Floats:
         ((3, 10, 5, 9, 14, 2, 0), 4.0),  # the rear brakes, the front still coasts: 16 - 2 * 2 * 3
         ((4.5, 10, 6, 1, 13, 2, 0), 21.0),  # then both brake: after 1 s the gap is 2.5 and w 1; 1 + 2 * 4 * 2.5
         ((4, 10, 5, 9, 14, 2, 0), 0.0),  # a touch: 16 - 2 * 2 * 4
+        ((4, 10, 5, 9, 14, 2 - 3e-12, 0), 0.0),  # still a touch: 2.4e-11
+        ((4, 10, 5, 9, 14, 2 - 3e-6, 0), 2.4e-5),  # an impact
         ((12, 4, 4, 0, 10, 50 / 14, 0), 0.0),  # stops right behind
         ((4, 12, 2, 0, 10, 5, 0), 0.0),  # opens
         ((4, 12, 0, 0, 10, 0, 0), 0.0),  # opens, nobody brakes
@@ -106,12 +108,45 @@ def test_closed_form__has_every_printed_digit(gaps, speeds, latency, ends, best,
     assert best[0] is not None or found[0] == pytest.approx(sum(map(float, ends)) / 2, abs=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("body", "pair", "expected", "harm"),
+    [  # gap; front vehicle: speed, capacity, onset; rear vehicle: the same; the best deceleration of `body`
+        (2, (12, 4, 4, 0, 10, 8, 0), (100 / 28 + 8) / 2, 0.0),  # from 100 / 28 on it stops behind: 2 + 12 m
+        (2, (2, 30, 3, 0, 33, 9, 0), (3 + 9 / 4 + 9) / 2, 0.0),  # touches while both brake: 3^2 = 2 (a - 3) 2
+        (2, (4, 10, 5, 9, 14, 6, 0), (2 + 6) / 2, 0.0),  # touches while the front coasts: 4^2 = 2 * 2 * 4
+        (2, (2, 10, 8, 3, 12, 1.5, 0), 1.0, 4e-10),  # strikes the coasting front lightly, or later hard: 2^2 = 2 * 2
+        (2, (2, 10, 8, 1.5, 12, 1, 0), 8 / 9, 4 / 9),  # arrives when the front begins to brake: 2 = 3 - 1.5^2 a / 2
+        (2, (4, 10, 5, 3, 12, 5, 4), 2.5, 4.0),  # both coast until they meet: all do the same
+        (2, (8, 10, 4, 0, 10, 9, 5), 4.5, 64.0),  # the front brakes before it may
+        (1, (5, 10, 12, 0, 10, 5, 0), 10 / 2, 0.0),  # up to 10 it stops 5 m ahead, where the rear one stops in 10
+        (1, (2, 30, 9, 0, 33, 3, 0), 0.75 / 2, 0.0),  # touches while both brake: 3^2 = 2 (3 - a) 2
+        (1, (17.5, 10, 9, 1, 20, 5, 0), 4 / 2, 0.0),  # after 1 s 10 m ahead of 15 m/s: 22.5 = 10 + 100 / (2 a)
+        (1, (1, 10, 9, 0, 14, 2, 0), 0.0, 12.0),  # even if it coasts: 16 - 2 * 2 * 1
+        (1, (20, 10, 8, 9, 14, 2, 0), 4.0, 0.0),  # the rear one is at rest before it brakes
+        (1, (0, 10, 8, 0, 10, 5, 0.5), 4.0, 0.0),  # pressed together: no impact
+    ],
+)
+def test_choice_for_one_pair__by_hand(body, pair, expected, harm):
+    gap, front, front_braking, front_onset, rear, rear_braking, rear_onset = map(float, pair)
+    latency, braking = [front_onset, rear_onset], [front_braking, rear_braking]
+    found = pairwise(alert([gap], [front, rear], braking_capacity_mps2=braking, latency_s=latency), body)
+    assert found.deceleration_mps2[0] == pytest.approx(expected, abs=1e-9)
+    assert found.harm[0] == pytest.approx(harm, rel=1e-3 if harm < 1e-6 else 1e-12, abs=1e-14)
+
+
 def test_closed_form__takes_the_middle_of_a_flat_minimum():
     # The front pair meets while both coast, whatever Vehicle 2 does: 2^2. The rear one stops in 14.4 m, so Vehicle 2
     # may stop in 9.4 m: 72 / 9.4 m/s2 and less do no further harm.
     world = alert([1.0, 5.0], [10.0, 12.0, 12.0], braking_capacity_mps2=[5.0, 8.0, 5.0], latency_s=1.0)
     deceleration, harm = pairwise(world, 2)
     assert harm[0] == 4.0 and deceleration[0] == pytest.approx(36 / 9.4, abs=1e-12)
+
+
+def test_closed_form__takes_the_first_of_two_minima():
+    # H is 60 at 2.4 and at 6.4 m/s2, and more between.
+    settings = {"braking_capacity_mps2": [8.0, 7.0, 3.0], "latency_s": [0.0, 0.0, 1.0]}
+    deceleration, harm = pairwise(alert([5.0, 6.0], [10.0, 12.0, 12.0], **settings), 2)
+    assert deceleration[0] == pytest.approx(2.4, abs=1e-12) and harm[0] == pytest.approx(60.0, abs=1e-12)
 
 
 @pytest.mark.parametrize(("vehicles", "body"), [(3, 2), (2, 1), (2, 2), (5, 3)])
@@ -149,6 +184,18 @@ def test_coupled__coasts_if_nobody_else_brakes():
     world = alert([10.0, 10.0], [20.0, 20.0, 20.0], braking_capacity_mps2=6.0)
     deceleration, harm = coupled(world._replace(wanted=np.zeros((1, 4))), 2, "total", 30.0)
     assert harm[0] == 0.0 and 0.0 <= deceleration[0] <= 10.0 * 2.0 / 30.0**2
+
+
+def test_coupled__takes_the_middle_of_what_does_no_harm_behind_and_ahead_of_gentle_brakes():
+    rng = np.random.default_rng(25)
+    gaps, speeds = rng.uniform(9.0, 16.0, (100, 2)), rng.uniform(18.0, 22.0, (100, 3))
+    settings = {**PAPER, "latency_s": [0.0, 0.5, 0.8]}
+    gentle = {**settings, "braking_capacity_mps2": [5.0, 7.0, 4.5]}
+    others = alert(gaps, speeds, **gentle)
+    best, closed = coupled(alert(gaps, speeds, **settings)._replace(wanted=others.wanted), 2), pairwise(others, 2)
+    free = closed.harm == 0.0
+    assert 10 < free.sum() < 90 and (best.harm[free] == 0.0).all()
+    assert (best.deceleration_mps2[free] == closed.deceleration_mps2[free]).all()
 
 
 def test_coupled__brakes_as_hard_as_it_can_if_that_is_not_enough():
@@ -200,19 +247,20 @@ def test_coupled__decides_ties_by_the_other_count_then_takes_the_middle():
         assert not equal.any() or own[k] <= total[k][equal].min() + 1e-8
     assert ties > 20
     known = np.array([np.nan, 1.0, 2.0])
-    e_v2x_bm.take_middle(np.arange(5.0), np.array([[1.0, 1.0, 3.0, 1.0, 1.0], [2.0, 2.0, 0.0, 4.0, 2.0]]), known)
-    assert known[0] == 1.0  # of 0, 1 and 4
+    e_v2x_bm.take_middle(np.arange(5.0), np.array([[1.0, 1.0, 3.0, 1.0, 1.0], [2.0, 4.0, 0.0, 2.0, 2.0]]), known)
+    assert known[0] == 3.0  # of 0, 3 and 4
 
 
-def test_coupled__does_not_depend_on_the_batch_nor_on_coasting_before():
+def test_choice__does_not_depend_on_the_batch_nor_on_coasting_before():
     scenario, game = open_game("paper-random")
     worlds = scenario.sample(60, 7)
     worlds.wanted[:, 2] = -worlds.car[:, BRAKING, 2]
     best = coupled(worlds, 2)
     for k in (0, 17, 59):
         assert [column[0] for column in coupled(worlds.take([k]), 2)] == [column[k] for column in best]
-    later = coupled(begin(worlds, game.deciders, 0.1, 8.0), 2)
-    np.testing.assert_allclose(later.harm, best.harm, rtol=0.0, atol=1e-9)
+    later = begin(worlds, game.deciders, 0.1, 8.0)
+    for choose in (coupled, pairwise):
+        np.testing.assert_allclose(choose(later, 2).harm, choose(worlds, 2).harm, rtol=0.0, atol=1e-9)
 
 
 def test_coupled__names_a_world_that_cannot_be_played(monkeypatch):

@@ -1,0 +1,505 @@
+"""Bundles: written and read to the bit; whatever is damaged, foreign or hostile is refused in one line, and not run."""
+
+import hashlib
+import json
+import os
+import pickle
+import stat
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import safetensors.numpy
+
+from ethbrake_marl.episode.features import FEATURES, known_names, register_feature
+from ethbrake_marl.episode.observe import View
+from ethbrake_marl.errors import AlreadyExists, CorruptBundle, InvalidInput
+from ethbrake_marl.motion.digest import physics_digest
+from ethbrake_marl.policies.bundle import (
+    load_drivers,
+    load_named_policy,
+    load_policy,
+    load_shipped,
+    save_drivers,
+    shipped_policies,
+)
+from ethbrake_marl.policies.manifest import content_sha256
+from ethbrake_marl.policies.network import NetworkSpec
+from ethbrake_marl.policies.policy import Policy
+from tests.policies.test_networks import FIELDS, network, observations, tensors_for
+from tests.refused import refused
+
+
+def make_policy(view: View | None = None, seed: int = 0, **changes: Any) -> Policy:
+    view = view or View()
+    spec = network("clip", observation_size=len(view.features))
+    return Policy.make(tensors_for(spec, seed), network=spec, observation=view, **{**FIELDS, **changes})
+
+
+@pytest.fixture
+def policy() -> Policy:
+    return make_policy()
+
+
+def test_bundle__is_read_as_it_was_written_and_always_has_the_same_bytes(policy: Policy, tmp_path: Path) -> None:
+    for name in ("a", "run/policy"):
+        policy.save(tmp_path / name)
+    os.link(tmp_path / "a" / "weights.safetensors", tmp_path / "elsewhere")  # as installers make them
+    for place in (tmp_path / "a", str(tmp_path / "run")):
+        other = load_policy(place)
+        assert other.manifest == policy.manifest and other.observation == policy.observation
+        assert np.array_equal(other(observations(50)), policy(observations(50)))
+        assert not any(tensor.flags.writeable for tensor in other.tensors.values())
+    assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["manifest.json", "weights.safetensors"]
+    for file in ("manifest.json", "weights.safetensors"):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "run" / "policy" / file).read_bytes()
+    content = json.loads((tmp_path / "a" / "manifest.json").read_text())
+    assert not {"networks", "gate_hidden", "among", "choices"} & content["network"].keys()
+    assert content["versions"]["physics"] == physics_digest() and "registered" not in content["observation"]
+    other = pickle.loads(pickle.dumps(policy))
+    assert np.array_equal(other(observations(5)), policy(observations(5)))
+
+
+def test_home_folder__is_expanded(policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    policy.save(tmp_path / "mine")
+    assert load_policy("~/mine").manifest == policy.manifest
+
+
+def test_existing_folder__is_replaced_only_on_request(policy: Policy, tmp_path: Path) -> None:
+    policy.save(tmp_path / "a")
+    other = make_policy(seed=5)
+    with refused("a: already exists; give another name", AlreadyExists):
+        other.save(tmp_path / "a")
+    other.save(tmp_path / "a", replace=True)
+    assert load_policy(tmp_path / "a").manifest == other.manifest != policy.manifest
+
+
+def test_drivers__are_one_bundle_or_one_for_each_learner(tmp_path: Path) -> None:
+    both = make_policy(learners=("vehicle_2", "vehicle_3"))
+    each = {f"vehicle_{k}": make_policy(seed=k, learners=(f"vehicle_{k}",)) for k in (2, 10, 3)}
+    save_drivers(dict.fromkeys(both.manifest.learners, both), tmp_path / "shared")
+    save_drivers(each, tmp_path / "each")
+    shared, apart = load_drivers(tmp_path / "shared"), load_drivers(tmp_path / "each")
+    assert list(shared) == ["vehicle_2", "vehicle_3"] and shared["vehicle_2"] is shared["vehicle_3"]
+    assert list(apart) == ["vehicle_2", "vehicle_3", "vehicle_10"]
+    assert all(apart[name].manifest == each[name].manifest for name in each)
+    for place in (tmp_path / "each", tmp_path / "run"):
+        save_drivers(each, tmp_path / "run" / "policy", replace=True)
+        with refused("has one policy for each learner; give the path of one of them, for instance"):
+            load_policy(place)
+    with refused("must contain a policy bundle, or one folder vehicle_... per learner", CorruptBundle):
+        load_drivers(tmp_path / "nothing")
+
+
+@pytest.mark.parametrize(("name", "path"), shipped_policies().items())
+def test_shipped_policy__loads_by_its_name_and_has_a_card(name: str, path: Path) -> None:
+    policy = load_shipped(name)
+    assert load_named_policy(name).manifest == load_named_policy(str(path)).manifest == policy.manifest
+    assert (path / "card.md").read_text("utf-8").startswith(f"# {name}\n") and policy.manifest.steps > 0
+    assert "physics" not in policy.manifest.versions  # from before there was a digest
+
+
+def test_shipped_policies__are_small_together() -> None:
+    assert sum((path / "policy" / "weights.safetensors").stat().st_size for path in shipped_policies().values()) < 5e6
+
+
+# ---------------------------------------------------------------- hostile bundles
+
+Spoil = Callable[[Path], Any]
+
+
+class Payload:
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (exec, ("raise RuntimeError('code of the bundle was run')",))
+
+
+def edit(*, rehash: bool = True, **changes: Any) -> Spoil:
+    """Change entries of the manifest, ``a__b`` one level down; its hash agrees, unless not ``rehash``."""
+
+    def spoil(folder: Path) -> None:
+        manifest = json.loads((folder / "manifest.json").read_bytes())
+        for key, value in changes.items():
+            outer, _, inner = key.rpartition("__")
+            (manifest[outer] if outer else manifest)[inner] = value
+        if rehash:
+            manifest["manifest_sha256"] = content_sha256(manifest)
+        (folder / "manifest.json").write_text(json.dumps(manifest))
+
+    return spoil
+
+
+def change(file: str, how: Callable[[bytes], bytes]) -> Spoil:
+    return lambda folder: (folder / file).write_bytes(how((folder / file).read_bytes()))
+
+
+def manifest(how: Callable[[bytes], bytes]) -> Spoil:
+    return change("manifest.json", how)
+
+
+def weights(how: Callable[[bytes], bytes]) -> Spoil:
+    """Change the weights, and their hash with them, as an attacker would."""
+
+    def spoil(folder: Path) -> None:
+        change("weights.safetensors", how)(folder)
+        digest = hashlib.sha256((folder / "weights.safetensors").read_bytes()).hexdigest()
+        edit(weights_sha256=digest)(folder)
+
+    return spoil
+
+
+def tensors(how: Callable[[dict[str, Any]], dict[str, Any]]) -> Spoil:
+    return weights(
+        lambda data: safetensors.numpy.save(how({k: np.array(v) for k, v in safetensors.numpy.load(data).items()}))
+    )
+
+
+def header(how: Callable[[dict[str, Any]], Any]) -> Spoil:
+    def rewrite(data: bytes) -> bytes:
+        length = int.from_bytes(data[:8], "little")
+        content = json.loads(data[8 : 8 + length])
+        how(content)
+        text = json.dumps(content).encode()
+        return len(text).to_bytes(8, "little") + text + data[8 + length :]
+
+    return weights(rewrite)
+
+
+def first_tensor(**changes: Any) -> Spoil:
+    return header(lambda content: content["policy.0.bias"].update(changes))
+
+
+def instead(name: str, make: Callable[[Path], object]) -> Spoil:
+    """Make something else in the place of a file, which is moved out of the folder."""
+
+    def spoil(folder: Path) -> None:
+        (folder / name).rename(folder.parent / f"moved-{name}")
+        make(folder / name)
+
+    return spoil
+
+
+def link(path: Path) -> None:
+    path.symlink_to(path.parents[1] / f"moved-{path.name}")
+
+
+def other_digit(name: str) -> Spoil:
+    def spoil(folder: Path) -> None:
+        digest = json.loads((folder / "manifest.json").read_bytes())[name]
+        edit(rehash=name != "manifest_sha256", **{name: digest[:-1] + ("0" if digest[-1] != "0" else "1")})(folder)
+
+    return spoil
+
+
+def endless_device(path: Path) -> None:
+    """A file that never ends: a device where that may be made, else a huge file without blocks."""
+    try:
+        os.mknod(path, 0o600 | stat.S_IFCHR, os.makedev(1, 5))
+    except PermissionError:
+        path.touch()
+        os.truncate(path, 1 << 40)
+
+
+def nested(depth: int) -> Any:
+    value: Any = 0
+    for _ in range(depth):
+        value = [value]
+    return value
+
+
+def raw_header(text: bytes) -> Spoil:
+    return weights(lambda data: len(text).to_bytes(8, "little") + text + data[-400:])
+
+
+SPOILED: dict[str, tuple[Spoil, str]] = {
+    "no_manifest": (lambda f: (f / "manifest.json").unlink(), "manifest.json: is missing from the policy bundle"),
+    "no_weights": (lambda f: (f / "weights.safetensors").unlink(), "weights.safetensors: is missing from the policy"),
+    "extra_file": (lambda f: (f / "policy.pkl").write_bytes(pickle.dumps(Payload())), "policy.pkl: does not belong"),
+    "hidden_file": (lambda f: (f / ".weights.py").write_text("raise SystemExit"), ".weights.py: does not belong"),
+    "manifest_link": (instead("manifest.json", link), "manifest.json: is a symbolic link"),
+    "weights_link": (instead("weights.safetensors", link), "weights.safetensors: is a symbolic link"),
+    "pipe": (instead("manifest.json", os.mkfifo), "manifest.json: is a device, a pipe or a socket"),
+    "folder": (instead("weights.safetensors", os.mkdir), "weights.safetensors: is a folder"),
+    "endless_device": (instead("weights.safetensors", endless_device), "weights.safetensors: is "),
+    "sparse_giant": (lambda f: os.truncate(f / "weights.safetensors", 1 << 40), "weights.safetensors: is larger than"),
+    "large": (manifest(lambda data: data + b" " * (1 << 20)), "manifest.json: is larger than 1 MiB"),
+    "empty": (manifest(lambda _: b""), "manifest.json: "),
+    "not_json": (manifest(lambda _: b"\x80\x04pickle"), "manifest.json: "),
+    "a_list": (manifest(lambda _: b"[]"), "manifest.json: "),
+    "key_twice": (
+        manifest(lambda data: data.replace(b"{", b'{"algorithm": "ppo",', 1)),
+        "manifest.json: a JSON object contains the key 'algorithm' twice",
+    ),
+    "nan": (manifest(lambda data: data.replace(b"1024", b"NaN")), "manifest.json: NaN is not a JSON number"),
+    "deep": (manifest(lambda _: b"[" * 200_000), "manifest.json: nested too deeply"),
+    "deep_scenario": (edit(scenario={"name": "x", "deep": nested(400)}), "manifest.json: "),
+    "huge_float": (manifest(lambda data: data.replace(b"1024", b"1e999")), "manifest.json: 1e999 is too large"),
+    "huge_integer": (manifest(lambda data: data.replace(b"1024", b"9" * 5000)), "manifest.json: "),
+    "unknown_key": (edit(loader="os.system"), "manifest.json: loader: is an unknown key"),
+    "dotted_algorithm": (edit(algorithm="subprocess.Popen"), "manifest.json: algorithm: must be 1 to 64 lower case"),
+    "another_format": (edit(format="zip"), "manifest.json: format: must be ethbrake-policy"),
+    "future_version": (edit(format_version=6), "manifest.json: format_version: must be 2, 3, 4 or 5"),
+    "other_version": (edit(format_version=3), "manifest.json: format_version = 3: must be 2 if networks = 1"),
+    "wrong_type": (edit(steps="many"), "manifest.json: steps: must be a whole number"),
+    "negative_steps": (edit(steps=-1), "manifest.json: steps: must be greater than or equal to 0"),
+    "giant_layer": (edit(network__policy_hidden=[10**9]), "manifest.json: network.policy_hidden.0"),
+    "no_layer": (edit(network__policy_hidden=[]), "manifest.json: network.policy_hidden: must not be empty"),
+    "unknown_activation": (edit(network__activation="gelu"), "manifest.json: network.activation: must be"),
+    "networks_without_a_gate": (
+        edit(format_version=3, network__networks=2, network__value_hidden=[]),
+        "manifest.json: network: gate_hidden = []: must have a layer if networks is above 1",
+    ),
+    "networks_without_tensors": (
+        edit(format_version=3, network__networks=2, network__gate_hidden=[4], network__value_hidden=[]),
+        "weights.safetensors: the file does not contain the tensor 'gate.0.bias'",
+    ),
+    "more_features": (
+        edit(observation__features=["own.speed"]),
+        "manifest.json: observation.features: has 1 features; must have 27, the observation_size",
+    ),
+    "unknown_features": (
+        edit(observation__features=[f"own.{k}" for k in range(27)]),
+        "manifest.json: observation: unknown feature 'own.0'",
+    ),
+    "feature_twice": (
+        edit(observation__features=["own.speed"] * 27),
+        "manifest.json: observation: observation: own.speed is listed twice",
+    ),
+    "group_as_feature": (
+        edit(observation__features=["rear_2", *View().names[1:]]),
+        "manifest.json: observation: this version of the package computes or scales features differently",
+    ),
+    "other_order": (
+        edit(observation__features=list(View().names[::-1])),
+        "manifest.json: observation: this version of the package computes",
+    ),
+    "other_scaling": (
+        edit(observation__scaling_sha256="0" * 64), "manifest.json: observation: this version of the package computes",
+    ),
+    "more_neighbours": (edit(observation__front=2), "manifest.json: observation: this version of the package"),
+    "forecasts_without_a_step": (
+        edit(observation__features=["contact.brake_front_time", *View().names[1:]], scenario={"name": "x"}),
+        "manifest.json: scenario: time_step_s = None: must be a number of seconds above 0, because the policy observes",
+    ),
+    "forecasts_with_a_huge_step": (
+        edit(observation__features=["contact.brake_front_time", *View().names[1:]], scenario__time_step_s=10**400),
+        "manifest.json: scenario: time_step_s = 1000",
+    ),
+    "path_as_learner": (edit(learners=["../../vehicle_2"]), "manifest.json: learners.0: must match"),
+    "no_learner": (edit(learners=[]), "manifest.json: learners: must not be empty"),
+    "learner_beyond_the_line": (
+        edit(learners=["vehicle_9"], scenario={"name": "x", "vehicles": 3}),
+        "manifest.json: learners: vehicle_9: must be one of the 3 vehicles",
+    ),
+    "learner_with_a_script": (
+        edit(scenario={"name": "x", "roles": {"vehicle_2": "coast"}}), "learners: vehicle_2: must be a learner",
+    ),
+    "other_steps": (edit(rehash=False, steps=999_999_999), "manifest.json: the content has SHA-256"),
+    "weights_hash": (other_digit("weights_sha256"), "weights.safetensors: the file has SHA-256"),
+    "own_hash": (other_digit("manifest_sha256"), "manifest.json: the content has SHA-256"),
+    "no_hash": (edit(rehash=False, manifest_sha256="none"), "manifest.json: manifest_sha256: must match"),
+    "bit_flip": (
+        change("weights.safetensors", lambda d: d[:-3] + bytes([d[-3] ^ 1]) + d[-2:]),
+        "weights.safetensors: the file has SHA-256",
+    ),
+    "tensor_path": (
+        header(lambda h: h.update({"../../policy.0.bias": h.pop("policy.0.bias")})),
+        "the file does not contain the tensor 'policy.0.bias'",
+    ),
+    "object_dtype": (first_tensor(dtype="O"), "tensor 'policy.0.bias' has type O and shape"),
+    "negative_shape": (first_tensor(shape=[-13]), "tensor 'policy.0.bias' has type F32 and shape [-13]"),
+    "overflowing_shape": (first_tensor(shape=[2**63, 2]), "tensor 'policy.0.bias' has type F32 and shape [92233720"),
+    "offsets_beyond": (first_tensor(data_offsets=[0, 2**40]), "weights.safetensors: not a safetensors file"),
+    "deep_header": (raw_header(b"[" * 200_000), "weights.safetensors: nested too deeply"),
+    "pickle": (weights(lambda _: pickle.dumps(Payload())), "weights.safetensors: not a safetensors file"),
+    "cut_short": (weights(lambda data: data[:-5]), "weights.safetensors: not a safetensors file"),
+    "trailing_bytes": (weights(lambda data: data + b"more"), "weights.safetensors: not a safetensors file"),
+    "long_header": (weights(lambda data: b"\xff" * 8 + data[8:]), "weights.safetensors: not a safetensors file"),
+    "metadata": (
+        header(lambda h: h.update(__metadata__={"a": "b"})), "tensor '__metadata__' must not be in this file",
+    ),
+    "overlap": (
+        header(lambda h: h["policy.0.bias"].update(data_offsets=h["policy.0.weight"]["data_offsets"])),
+        "weights.safetensors: not a safetensors file",
+    ),
+    "missing_tensor": (
+        tensors(lambda t: {name: t[name] for name in t if name != "policy.1.bias"}),
+        "the file does not contain the tensor 'policy.1.bias'",
+    ),
+    "extra_tensor": (
+        tensors(lambda t: {**t, "policy.9.bias": np.zeros(3, "f4")}),
+        "tensor 'policy.9.bias' must not be in this file",
+    ),
+    "wrong_shape": (
+        tensors(lambda t: {**t, "policy.0.bias": np.zeros(14, "f4")}),
+        "tensor 'policy.0.bias' has type F32 and shape [14]; must have type F32 and shape [13]",
+    ),
+    "wrong_dtype": (
+        tensors(lambda t: {**t, "policy.0.bias": np.zeros(13, "f8")}),
+        "tensor 'policy.0.bias' has type F64 and shape [13]; must have type F32",
+    ),
+    "nan_weight": (
+        tensors(lambda t: {**t, "value.0.bias": np.append(t["value.0.bias"][1:], np.float32(np.nan))}),
+        "tensor 'value.0.bias': contains a number that is not finite",
+    ),
+    "infinite_weight": (
+        tensors(lambda t: {**t, "policy.log_std": np.full(1, np.inf, "f4")}),
+        "tensor 'policy.log_std': contains a number that is not finite",
+    ),
+}  # fmt: skip
+
+watching: list[str] = []  # the folder that may be read; a hook of the interpreter stays as long as that
+events: list[str] = []
+
+
+def note(event: str, args: tuple[Any, ...]) -> None:
+    for root in watching:
+        inside = event == "open" and (isinstance(args[0], int) or str(args[0]).startswith(root)) and not args[2] & 3
+        if not inside and event not in ("os.listdir", "object.__getattr__", "sys._getframe"):
+            events.append(f"{event} {args!r:.200}")
+
+
+sys.addaudithook(note)
+
+
+@pytest.mark.parametrize("name", SPOILED)
+def test_damaged_bundle__is_refused_and_runs_and_opens_nothing_else(name: str, policy: Policy, tmp_path: Path) -> None:
+    spoil, message = SPOILED[name]
+    policy.save(tmp_path / "good")
+    load_policy(tmp_path / "good")
+    assert known_names()  # the extensions with features are imported before
+    policy.save(tmp_path / "policy")
+    spoil(tmp_path / "policy")
+    events.clear()
+    watching.append(str(tmp_path))
+    try:
+        with refused(message, CorruptBundle) as caught:
+            load_policy(tmp_path / "policy")
+    finally:
+        watching.clear()
+    assert events == []
+    text = str(caught.value)
+    assert text.startswith(str(tmp_path / "policy")) and "\n" not in text and len(text) < 2000
+
+
+FOLDERS: dict[str, Callable[[], Any]] = {
+    "/dev/zero: is not a folder; give the folder of a policy bundle": lambda: load_policy("/dev/zero"),
+    "nowhere: is not a folder": lambda: load_policy(Path("nowhere")),
+    "empty: contains no policy; give the folder": lambda: load_policy("empty"),
+    "policy = None: must be the path of a training run or of a policy bundle": lambda: load_policy(None),  # type: ignore[arg-type]
+    "policy = 3: must be the path": lambda: load_policy(3),  # type: ignore[arg-type]
+    "cannot be read (embedded null byte)": lambda: load_policy("a\0b"),
+    "cannot be read ([Errno 36] File name too long": lambda: load_policy("a" * 5000),
+    "unknown shipped policy 'universel'; did you mean 'universal'?": lambda: load_shipped("universel"),
+    "'shipped/ppo' is now written ppo": lambda: load_named_policy("shipped/ppo"),
+}
+
+
+@pytest.mark.parametrize("message", FOLDERS)
+def test_folder_without_a_policy__is_refused(message: str, empty_folder: Path) -> None:
+    Path("empty").mkdir()
+    with refused(message):
+        FOLDERS[message]()
+
+
+@pytest.mark.parametrize("place", ["policy", "run/policy"])
+def test_folder_of_a_policy__is_no_link(place: str, empty_folder: Path, policy: Policy) -> None:
+    policy.save("elsewhere")
+    Path("run").mkdir()
+    Path(place).symlink_to(Path("elsewhere").absolute())
+    with refused(f"{place}: is a symbolic link; give the folder to which the link points", CorruptBundle):
+        load_policy(place.removesuffix("/policy"))
+
+
+MADE: dict[str, Callable[[Policy], Any]] = {
+    "policy: steps: must be greater than or equal to 0": lambda policy: make_policy(steps=-1),
+    "policy: learners: vehicle_5: must be one of the 3": lambda policy: make_policy(
+        learners=("vehicle_5",), scenario={"vehicles": 3}
+    ),
+    "policy: algorithm: must be": lambda policy: make_policy(algorithm="a.b"),
+    "policy: seed: is an unknown key": lambda policy: make_with(seed=1),
+    "policy: tensor 'policy.0.bias': contains a number": lambda policy: make_with(
+        {**policy.tensors, "policy.0.bias": np.full(13, np.nan, np.float32)}
+    ),
+    "policy: the file does not contain the tensor 'policy.0.bias'": lambda policy: make_with(
+        {name: each for name, each in policy.tensors.items() if name != "policy.0.bias"}
+    ),
+    "policy: observation.features: has 27 features; must have 26": lambda policy: make_with(
+        spec=network("clip", observation_size=26)
+    ),
+}
+
+
+def make_with(given: dict[str, Any] | None = None, spec: NetworkSpec | None = None, **more: Any) -> Policy:
+    spec = spec or network("clip")
+    return Policy.make(given or tensors_for(spec), network=spec, observation=View(), **FIELDS, **more)
+
+
+@pytest.mark.parametrize("message", MADE)
+def test_policy__is_made_of_finite_tensors_and_possible_fields(message: str, policy: Policy) -> None:
+    with refused(message):
+        MADE[message](policy)
+
+
+# ---------------------------------------------------------------- features of others
+
+
+def register(factor: float = 1.0, **changes: Any) -> None:
+    def speed(state: Any, body: int) -> Any:
+        """Own speed."""
+        return factor * state.speeds_mps[:, body - 1]
+
+    speed.__module__ = "somebody_elses"
+    FEATURES.loaded.pop("their_speed", None)
+    settings: dict[str, Any] = {"unit": "m/s", "scale": 10.0, "low": 0.0, "high": 9.0}
+    register_feature("their_speed", speed, **{**settings, **changes})
+
+
+@pytest.fixture
+def observing(tmp_path: Path) -> Any:
+    register()
+    make_policy(View(["own", "their_speed"])).save(tmp_path / "policy")
+    assert load_policy(tmp_path / "policy").observation == View(["own", "their_speed"])
+    yield tmp_path / "policy"
+    FEATURES.loaded.pop("their_speed", None)
+
+
+def test_registered_feature__must_be_what_it_was(observing: Path) -> None:
+    register(1.001)
+    with refused("'their_speed', whose value in a few worlds was (2.0, 0.9", InvalidInput):
+        load_policy(observing)
+    for key, value in {"unit": "km/h", "scale": 11.0, "low": -1.0, "high": 8.0}.items():
+        register(**{key: value})
+        with refused(f"'their_speed', whose {key} was", InvalidInput):
+            load_policy(observing)
+    FEATURES.loaded.pop("their_speed")
+    with refused("the policy observes the feature 'their_speed', which is not registered; install the", InvalidInput):
+        load_policy(observing)
+    register()
+    assert load_policy(observing).manifest.observation.registered[0].name == "their_speed"
+
+
+def test_physics_digest__changes_with_the_code_and_not_with_its_texts(tmp_path: Path) -> None:
+    import ethbrake_marl.motion.digest as module
+
+    source = Path(module.__file__)
+    for path in source.parent.glob("*.py"):
+        (tmp_path / path.name).write_text(path.read_text())
+
+    def digest() -> str:
+        namespace = {"__file__": str(tmp_path / "digest.py"), "__name__": "copy"}
+        exec(compile(source.read_text(), "digest.py", "exec"), namespace)
+        return str(namespace["physics_digest"]())  # type: ignore[operator]  # of the copy
+
+    impact, before = tmp_path / "drive.py", digest()
+    text = impact.read_text()
+    assert before == physics_digest()
+    impact.write_text("# A comment.\n\n" + text.replace('"""', '"""Other words. ', 1))
+    assert digest() == before
+    impact.write_text(text + "\nMORE = 1.0\n")
+    assert digest() != before
+    (tmp_path / "drive.py").write_text(text)
+    assert digest() == before
