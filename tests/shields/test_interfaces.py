@@ -167,6 +167,20 @@ def test_every_new_episode_of_a_vec_env_reports_its_own_bound() -> None:
     assert numbers != list(range(8))
 
 
+@pytest.mark.parametrize("policy", [None, "ppo"])
+def test_the_bound_holds_where_the_next_step_begins_the_next_episode(policy: Any) -> None:
+    """Gymnasium's default: the step after an episode's last one reports the bound of the next one."""
+    env = shield(EthBrakeVectorEnv(8, "paper-random"), policy)
+    first, over, episodes = env.reset(seed=1)[1]["shield_bound_harm"].copy(), np.zeros(8, bool), 0
+    for _ in range(120):
+        *_, ended, cut, infos = env.step(np.full((8, 1), 1.0 if policy is None else np.nan))
+        assert (infos["shield_reason"][over] == ShieldReason.NO_DECISION).all()
+        first[over], over = infos["shield_bound_harm"][over], ended | cut
+        assert (infos["world_first_impact_harm"][over] <= first[over]).all()
+        episodes += over.sum()
+    assert episodes > 8
+
+
 def test_mode_episode() -> None:
     env = shield(EthBrakeEnv("paper-random"), "full_brake", "episode", bound="pairwise")
     env.reset(seed=7)
