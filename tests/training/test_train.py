@@ -19,10 +19,10 @@ from stable_baselines3 import A2C
 from stable_baselines3.common.vec_env import VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from ethbrake_marl.agents.drive import Team, drive
-from ethbrake_marl.agents.policy_agent import LearnedAgent
+from ethbrake_marl.agents.drive import drive
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.motion.digest import physics_digest
+from ethbrake_marl.names import make_agent, team_of
 from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.progress import Progress
 from ethbrake_marl.training import train as train_module
@@ -56,7 +56,8 @@ def test_train__leaves_a_folder_whose_policy_is_the_best_on_the_list(tmp_path: P
     assert policy.manifest.learners == ("vehicle_2",) and policy.manifest.seeds == {"training": 0, "evaluation": 7}
 
     scenario, game = game_of("paper-random")
-    ended = drive(game, scenario.sample(10, 7), Team("mine", {2: LearnedAgent(policy)}))
+    assert result.agent == f"ppo@{run}"
+    ended = drive(game, scenario.sample(10, 7), team_of(make_agent(result.agent), scenario))
     assert ended.harm("first").mean() == pytest.approx(min(harm), rel=1e-12)
 
     status, config = (json.loads((run / name).read_text()) for name in ("run.json", "config.json"))
