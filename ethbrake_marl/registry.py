@@ -130,8 +130,8 @@ class Registry(Mapping[str, T]):
         errors as looking up the name.
         """
         candidates = points(self.group).get(name, [])
-        givers = [OURS] * (name in self._built_in) + [giver(point) for point in candidates]
-        if len(givers) > 1:
+        if (name in self._built_in) + len(candidates) > 1:
+            givers = [OURS] * (name in self._built_in) + [giver(point) for point in candidates]
             raise InvalidInput(
                 f"{self.kind} {name!r} is defined by several installed packages, {' and '.join(givers)};"
                 " uninstall all but one of them"

@@ -155,7 +155,8 @@ def features_of(policy: Any, ask: Ask) -> tuple[str, ...] | None:
     if ask is ask_onnx:
         listed = session_of(policy).get_modelmeta().custom_metadata_map.get("features")
         return tuple(listed.split(",")) if listed else None
-    return getattr(getattr(policy, "observation_space", None), "features", None)
+    names = getattr(getattr(policy, "observation_space", None), "features", None)
+    return names if isinstance(names, tuple) else None
 
 
 def count_of_actions(policy: Any, given: int | None, who: str) -> int | None:
@@ -187,8 +188,8 @@ def statistics_of(model: Any) -> Any:
 def check_wrappers(policy: Any, who: str) -> None:
     """Raise ``InvalidInput`` if a model was trained under a wrapper that may change what it sees or does.
 
-    The wrapper of its environment is named. A model without an environment, from a file, may show that it has lost the
-    statistics of its ``VecNormalize``.
+    The wrapper of its environment is named. A model from a file may show that it has lost the statistics of its
+    ``VecNormalize``.
     """
     env, statistics = getattr(policy, "get_env", lambda: None)(), statistics_of(policy)
     for layer in [] if env is None else layers_of(env):
@@ -201,7 +202,7 @@ def check_wrappers(policy: Any, who: str) -> None:
                 " observations or actions and is not applied here; write a function around the model that makes the"
                 " same changes, or pass ignore_wrappers=True if there are none"
             )
-    if env is None and _was_normalised(policy):
+    if statistics is None and _was_normalised(policy):
         raise InvalidInput(
             f"{who}: the model was trained under VecNormalize, whose statistics are missing; load them with"
             " model.set_env(VecNormalize.load(PATH, venv)); if VecNormalize changed rewards only, pass"

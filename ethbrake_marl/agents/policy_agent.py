@@ -65,8 +65,8 @@ class LearnedAgent:
         then, now = self.policy.manifest.versions.get(PHYSICS), physics_digest()
         if then not in (None, now):
             warnings.warn(
-                f"{self.name}: was trained on other physics ({then:.16}) than this installation's ({now}), so it may"
-                " drive worse than reported; train it again",
+                f"{self.name}: was trained on other physics ({then!r:.20}) than this installation's ({now!r}), so it"
+                " may drive worse than reported; train it again",
                 Unfamiliar,
                 stacklevel=2,
             )
@@ -118,8 +118,11 @@ class PolicyAgent:
         if self.initial_state is None:
             answer = self.ask(self.policy, seen)
         else:
-            answer, memory = self.policy(seen, self._memory(memory, state.n))
-            memory = self._memory(memory, state.n)
+            both = self.policy(seen, self._memory(memory, state.n))
+            if not isinstance(both, tuple) or len(both) != 2:
+                right = "with initial_state must return a pair of actions and state"
+                raise AgentFailed(self.name, None, f"vehicle_{body}: returned {both!r:.60}; {right}")
+            answer, memory = both[0], self._memory(both[1], state.n)
         return to_command(state, body, self._actions(answer, state, body)), memory
 
     def _memory(self, memory: Any, n: int) -> Any:

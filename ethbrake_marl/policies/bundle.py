@@ -45,10 +45,9 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
 
 
 def _read_manifest(file: Path) -> Manifest:
+    data = _read(file)
     try:
-        content, manifest = read_json_model(_read(file), Manifest)
-    except CorruptBundle:
-        raise
+        content, manifest = read_json_model(data, Manifest)
     except ValueError as error:
         raise CorruptBundle(f"{file}: {error}") from None
     own = content_sha256(content)

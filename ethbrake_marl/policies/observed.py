@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from functools import cache
 from operator import not_
 from pathlib import Path
 from typing import Annotated, Self
@@ -13,6 +14,7 @@ from pydantic import ConfigDict, Field
 
 from ethbrake_marl.episode.features import FEATURES, Of, Own, side_of
 from ethbrake_marl.episode.observe import View, own_feature
+from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.files.model import FileModel
 from ethbrake_marl.worlds.catalogue import load_scenario
@@ -127,10 +129,15 @@ def _is_ours(own: Own) -> bool:
 
 def _tried(own: Own) -> tuple[float, ...]:
     """Return what vehicles of a line observe of a feature, in one world if it belongs to this package, or in three."""
-    state = worlds_from_table(load_scenario(TRIAL_LINE), TRIAL_WORLDS)
+    state = _trial_worlds()
     if _is_ours(own):
         state = state.take(slice(1))
     known = np.ones(state.n, np.bool_)
     seen = [(1, 0), (2, 0), (3, 0)] if own.of == "own" else [(2, -1), (2, 1), (3, -2)]
     values = [own_feature(own, state, body, offset, known) for body, offset in seen]
     return tuple(np.concatenate(values).tolist())
+
+
+@cache
+def _trial_worlds() -> State:
+    return worlds_from_table(load_scenario(TRIAL_LINE), TRIAL_WORLDS).read_only()

@@ -186,6 +186,18 @@ def test_coupled__coasts_if_nobody_else_brakes():
     assert harm[0] == 0.0 and 0.0 <= deceleration[0] <= 10.0 * 2.0 / 30.0**2
 
 
+def test_coupled__takes_the_middle_of_what_does_no_harm_behind_and_ahead_of_gentle_brakes():
+    rng = np.random.default_rng(25)
+    gaps, speeds = rng.uniform(9.0, 16.0, (100, 2)), rng.uniform(18.0, 22.0, (100, 3))
+    settings = {**PAPER, "latency_s": [0.0, 0.5, 0.8]}
+    gentle = {**settings, "braking_capacity_mps2": [5.0, 7.0, 4.5]}
+    others = alert(gaps, speeds, **gentle)
+    best, closed = coupled(alert(gaps, speeds, **settings)._replace(wanted=others.wanted), 2), pairwise(others, 2)
+    free = closed.harm == 0.0
+    assert 10 < free.sum() < 90 and (best.harm[free] == 0.0).all()
+    assert (best.deceleration_mps2[free] == closed.deceleration_mps2[free]).all()
+
+
 def test_coupled__brakes_as_hard_as_it_can_if_that_is_not_enough():
     # Front pair alone: harm falls linearly, 0 from 2 + 4^2 / (2 * 8) = 3 on.
     world = alert([8.0, 500.0], [20.0, 24.0, 0.0], braking_capacity_mps2=[2.0, 2.9, 6.0])

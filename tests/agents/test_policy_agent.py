@@ -34,6 +34,8 @@ from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
 from ethbrake_marl.faces.sb3 import make_sb3_vec_env
 from ethbrake_marl.motion.layout import BRAKING, DRIVING
 from ethbrake_marl.policies.bundle import load_shipped
+from ethbrake_marl.shields.algorithm_1 import EpisodeShield
+from ethbrake_marl.shields.step import StepShield
 from ethbrake_marl.worlds.game import game_of
 from tests.refused import refused
 
@@ -83,7 +85,9 @@ def test_learned_agent__warns_in_one_line_of_other_physics(digest: str | None, w
         warnings.simplefilter("always")
         drive(GAME, WORLDS, Team("old", {2: LearnedAgent(policy, "old")}))
     texts = [str(each.message) for each in caught if each.category is Unfamiliar]
-    assert len(texts) == warned and all("old: was trained on other physics (0000000000000000)" in t for t in texts)
+    assert len(texts) == warned and all(
+        "old: was trained on other physics ('0000000000000000') than" in t for t in texts
+    )
 
 
 def test_learned_agent__is_for_policies_of_one_action() -> None:
@@ -405,6 +409,9 @@ def test_model_from_a_file__needs_the_statistics_it_was_trained_under(algorithm:
         with refused("was trained under VecNormalize, whose statistics are missing; load them with model.set_env"):
             policy_agent(loaded, clip=True)
         assert policy_agent(loaded, ignore_wrappers=True).name == algorithm.__name__
+        if on_policy:  # the others forget what they saw last
+            with refused("was trained under VecNormalize, whose statistics are missing"):
+                policy_agent(algorithm.load(tmp_path / "model.zip", env=make_sb3_vec_env("paper-random", 2)))
         env.save(str(tmp_path / "statistics.pkl"))
         loaded.set_env(vec_env.VecNormalize.load(str(tmp_path / "statistics.pkl"), make_sb3_vec_env("paper-random", 2)))
         assert harms(policy_agent(loaded)) == harms(policy_agent(trained))
@@ -565,6 +572,27 @@ def test_memory__has_one_row_for_each_world(memory: Any) -> None:
         harms(policy_agent(ramp, initial_state=memory))
     with refused(right, AgentFailed):
         harms(policy_agent(lambda seen, kept: (brake(seen), memory(len(seen))), initial_state=np.zeros))
+
+
+@pytest.mark.parametrize("both", [lambda seen, kept: brake(seen), lambda seen, kept: (brake(seen), kept, kept)])
+def test_function_with_a_memory__returns_a_pair(both: Any) -> None:
+    with refused("with initial_state must return a pair of actions and state", AgentFailed):
+        harms(policy_agent(both, initial_state=np.zeros))
+
+
+@pytest.mark.parametrize("shield", [StepShield, EpisodeShield])
+@pytest.mark.parametrize("kind", ["function with a memory", "model"])
+def test_policy_behind_a_shield__keeps_the_bound(shield: Any, kind: str, model: Any) -> None:
+    agent = policy_agent(ramp, initial_state=no_steps) if kind != "model" else policy_agent(model, clip=True)
+    alone = drive(GAME, WORLDS, Team("alone", {2: agent}))
+    last = drive(GAME, WORLDS, Team("mine", {2: agent}, shield({2: agent})))
+    assert (last.harm("first") <= infos_of(shield, agent, last)["shield_bound_harm"] + 1e-9).all()
+    assert last.harm("first").sum() < alone.harm("first").sum()
+
+
+def infos_of(shield: Any, agent: Agent, last: Any) -> Any:
+    """The infos of a shielded game."""
+    return Team("mine", {2: agent}, shield({2: agent})).game(GAME).own_infos(last)
 
 
 def raising(seen: Any) -> Any:

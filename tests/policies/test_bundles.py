@@ -357,8 +357,7 @@ events: list[str] = []
 
 def note(event: str, args: tuple[Any, ...]) -> None:
     for root in watching:
-        may_be_read = isinstance(args[0], int) or str(args[0]).startswith(root) or str(args[0]).endswith("METADATA")
-        inside = event == "open" and may_be_read and not args[2] & 3
+        inside = event == "open" and (isinstance(args[0], int) or str(args[0]).startswith(root)) and not args[2] & 3
         if not inside and event not in ("os.listdir", "object.__getattr__", "sys._getframe"):
             events.append(f"{event} {args!r:.200}")
 
