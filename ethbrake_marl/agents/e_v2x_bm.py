@@ -151,7 +151,7 @@ class EV2XBM:
     name, knows = "e_v2x_bm", MODEL
 
     def __init__(self, rules: Rules, agents: Mapping[int, str] = MappingProxyType({}), count: str = "first") -> None:
-        self.rules, self.agents, self.count = rules, agents, count
+        self.rules, self.agents, self.count = rules, dict(agents), count
 
     def begin(self, alert: State, body: int) -> Memory:
         """Choose. Raises ``InvalidInput`` if another vehicle is driven by an agent."""

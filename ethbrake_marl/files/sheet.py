@@ -7,7 +7,7 @@ import io
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -29,6 +29,9 @@ class Estimate:
 
     value: float
     interval: tuple[float, float] | None  # low and high end; None if it cannot be computed, as for one world
+    # standard error, and its degrees of freedom; None where they are not known
+    error: float | None = field(default=None, compare=False)
+    freedom: float | None = field(default=None, compare=False)
 
     @property
     def ends(self) -> tuple[float, float]:
@@ -85,6 +88,10 @@ class Column:
     short: str = ""  # heading in a terminal; "": the heading
     wide: bool = False  # whether only terminals of at least ``WIDE`` characters show the column
     interval: Literal["beside", "below", "hidden"] = "beside"  # where a terminal shows the interval of an estimate
+    whole: bool = (
+        False  # whether a terminal never breaks the texts: those that do not fit are numbered and listed below
+    )
+    gives_way: int = 0  # terminals that are too narrow leave out the columns with the largest numbers first; 0: never
 
     @property
     def name(self) -> str:
@@ -101,6 +108,12 @@ class Column:
             return Shown(self._number(cell) + self.unit)
         ends = () if cell.interval is None else cell.interval
         return Shown(self._number(cell.value) + self.unit, ", ".join(map(self._number, ends)))
+
+    def in_terminal(self, shown: Shown) -> str:
+        """Return the text of a cell in a terminal, whose lines after the first are less prominent."""
+        if self.interval == "beside":
+            return shown.in_words
+        return shown.value + (f"\n{shown.interval}" if shown.interval and self.interval == "below" else "")
 
     def _number(self, value: float) -> str:
         return f"{self.scale * value:{self.sign}.{self.digits}f}"
@@ -180,27 +193,50 @@ class Sheet:
             box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, int(self.gap > 1), 0, int(self.gap > 2)),
             title=Text(self.title, "table.title") if self.title else None, title_justify="left",
         )  # fmt: skip
-        columns = self._columns()
-        shown = [k for k, column in enumerate(columns) if width >= WIDE or not column.wide]
+        columns, lines = self._columns(), [*self.shown()]
+        shown, listed = self._fitted(width, [row for row in lines if not isinstance(row, str)])
         for column in (columns[k] for k in shown):
             heading = Text(plain_text(column.short or column.heading, keep="\n"))
             if column.text:
-                table.add_column(heading, overflow="fold")
+                table.add_column(heading, overflow="fold", no_wrap=column.whole)
             else:
                 table.add_column(heading, justify="right", no_wrap=True)
-        for row in self.shown():
+        for row in lines:
             if isinstance(row, str):
                 table.add_section()
                 table.add_row(Text(plain_text(row), style="dim"))
                 continue
             cells = []
             for k in shown:
-                how, (value, interval) = columns[k].interval, row[k]
-                below = f"\n{interval}" if interval and how == "below" else ""
-                first, line, rest = ((row[k].in_words if how == "beside" else value) + below).partition("\n")
+                first, line, rest = columns[k].in_terminal(row[k]).partition("\n")
+                first = listed.get(first, first) if columns[k].whole else first
                 cells.append(Text(plain_text(first)).append(plain_text(line + rest, keep="\n"), style="dim"))
             table.add_row(*cells)
-        return Group(table, Text(), Text(self.note, "dim")) if self.note else table
+        note = "\n\n".join(
+            filter(None, ["\n".join(f"{number} {plain_text(text)}" for text, number in listed.items()), self.note])
+        )
+        return Group(table, Text(), Text(note, "dim")) if note else table
+
+    def _fitted(self, width: int, rows: Sequence[tuple[Shown, ...]]) -> tuple[list[int], dict[str, str]]:
+        """Return the columns that a terminal of ``width`` characters shows, and texts that do not fit -> numbers."""
+        columns = self._columns()
+        heads = [column.short or column.heading for column in columns]
+        texts = [
+            [head, *(column.in_terminal(row[k]) for row in rows)]
+            for k, (head, column) in enumerate(zip(heads, columns, strict=True))
+        ]
+        wide = [max((len(line) for text in cells for line in text.split("\n")), default=0) for cells in texts]
+        shown = [k for k, column in enumerate(columns) if width >= WIDE or not column.wide]
+        least = [min(room, width // 2) if column.whole else room for room, column in zip(wide, columns, strict=True)]
+        while sum(least[k] for k in shown) + self.gap * (len(shown) - 1) > width:
+            last = max(shown, key=lambda k: (columns[k].gives_way, k))
+            if not columns[last].gives_way:
+                break
+            shown.remove(last)
+        room = width - sum(wide[k] for k in shown if not columns[k].whole) - self.gap * (len(shown) - 1)
+        names = [text.partition("\n")[0] for k in shown if columns[k].whole for text in texts[k][1:]]
+        long = dict.fromkeys(name for name in names if len(name) > room)
+        return shown, {name: f"[{number}]" for number, name in enumerate(long, 1)}
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         yield self.rich(options.max_width)
@@ -219,6 +255,16 @@ class Sheet:
             words = [shown.in_words.replace("|", "\\|").replace("\n", " ") for shown in row]
             lines.append([section + words[0], *words[1:]])
         return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+    def latex(self) -> str:
+        """Return the table as a LaTeX ``tabular`` with the rules of ``booktabs``, without title and note."""
+        columns = self._columns()
+        lines = [" & ".join(_latex(column.heading) for column in columns) + r" \\", r"\midrule"]
+        for row in self.shown():
+            words = [row] if isinstance(row, str) else [shown.in_words.replace("\n", " ") for shown in row]
+            lines.append(" & ".join(map(_latex, words)) + r" \\")
+        kinds = "".join("l" if column.text else "r" for column in columns)
+        return "\n".join([rf"\begin{{tabular}}{{{kinds}}}", r"\toprule", *lines, r"\bottomrule", r"\end{tabular}"])
 
     def html(self) -> str:
         """Return the table as HTML for a notebook or a page, with the title above and the note below.
@@ -270,21 +316,21 @@ class Sheet:
 
 
 def terminal_text(*shown: RenderableType, whole_rows: bool = False) -> str:
-    """Return tables and texts as they look when printed in this terminal.
+    """Return tables and texts as plain text, as wide as this terminal: in a script, a notebook and a file alike.
 
     With ``whole_rows``, the cells of tables are not wrapped, and the text may be wider than the terminal.
     """
     from rich.console import Console
     from rich.measure import measure_renderables
 
-    console = Console(highlight=False)
+    text = io.StringIO()
+    console = Console(file=text, highlight=False, color_system=None, force_jupyter=False, force_terminal=False)
     if whole_rows:
         tables = [replace(each, note="").rich(console.width) for each in shown if isinstance(each, Sheet)]
         needed = measure_renderables(console, console.options.update_width(10_000), tables).maximum
         console.width = max(console.width, needed)
-    with console.capture() as captured:
-        console.print(*shown)
-    return captured.get()
+    console.print(*shown)
+    return text.getvalue()
 
 
 def csv_text(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
@@ -344,6 +390,17 @@ def parquet_file(
                 if told is not None:
                     writer.add_key_value_metadata(told())
                 writer.close()
+
+
+_LATEX = {
+    **{each: rf"\{each}" for each in "&%$#_{}"}, "\\": r"\textbackslash{}", "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}", "²": "$^2$", "≥": r"$\geq$", "–": "--", "†": r"\dag{}", "‡": r"\ddag{}",
+    "\u00a0": "~", "[": "{[}", "]": "{]}",
+}  # fmt: skip
+
+
+def _latex(text: str) -> str:
+    return "".join(_LATEX.get(each, each) for each in plain_text(text, keep="\u00a0"))
 
 
 def _html(value: object) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,11 +67,12 @@ def recording_of(texts: Texts) -> Texts:
     return names
 
 
-def clusters_of(drawn: Drawn) -> Texts | None:
-    """Return the name of each world's cluster, [n]; None if all worlds are independent.
+def clusters_of(columns: Mapping[str, NDArray[Any]]) -> Texts | None:
+    """Return the name of each world's cluster, [n], from its columns; None if all worlds are independent.
 
     Worlds of one recording depend on each other. A world without a recording is a cluster of its own.
     """
-    recording = recording_of(drawn.recordings)
-    own = np.char.add(" ", drawn.worlds.clock[:, NUMBER].astype(np.int64).astype(str))
-    return np.where(recording == "", own, recording) if (recording != "").any() else None
+    if RECORDING not in columns:
+        return None
+    recording = recording_of(columns[RECORDING])
+    return np.where(recording == "", np.char.add(" ", columns["world"].astype(str)), recording)

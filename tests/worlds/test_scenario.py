@@ -19,7 +19,7 @@ from ethbrake_marl.files.yaml import read_yaml
 from ethbrake_marl.worlds import catalogue, explain
 from ethbrake_marl.worlds.catalogue import group_of_scenarios, list_scenarios, load_scenario
 from ethbrake_marl.worlds.counters import numbers_of
-from ethbrake_marl.worlds.describe import clusters_of, kinds_of
+from ethbrake_marl.worlds.describe import clusters_of, columns_of, kinds_of
 from ethbrake_marl.worlds.rules import RULES
 from ethbrake_marl.worlds.scenario import Scenario
 from tests.fixtures.scenarios import SHIPPED
@@ -179,7 +179,7 @@ def test_table__gives_whole_rows() -> None:
     assert drawn.worlds.gaps_m[:, 0].tolist() == (5.0 + row).tolist()
     assert drawn.worlds.speeds_mps[:, 1].tolist() == (11.0 + row).tolist()
     assert drawn.worlds.gaps_m[:, 1].tolist() == [7.0] * 400
-    assert sorted(set(clusters_of(drawn))) == ["a", "b"]
+    assert sorted(set(clusters_of(columns_of(drawn)))) == ["a", "b"]
     assert scenario.bounds("gaps_m") == ((5.0, 7.0), (7.0, 7.0))
 
 

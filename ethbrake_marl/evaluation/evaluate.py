@@ -1,0 +1,252 @@
+"""Evaluate teams: every team drives every world once, from the alert to the end; measures turn episodes into columns.
+
+The worlds are fixed in advance: if the episodes that finish first were counted, short ones would count too often, and
+many short ones are crashes.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.agents.drive import MESSAGES, MODEL, SENSORS, STATE as TRUE_STATE, Team, play
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.state import STEPS, TIME, State
+from ethbrake_marl.errors import AgentFailed, InvalidInput, count_of, naming_extras, unknown_name
+from ethbrake_marl.evaluation.identity import policies_of, versions, worlds_sha256
+from ethbrake_marl.evaluation.measures import DEFAULT, Measure, Values, measured
+from ethbrake_marl.motion.digest import physics_digest
+from ethbrake_marl.motion.layout import LATENCY, OWN_LATENCY, Bools
+from ethbrake_marl.parallel import run_each
+from ethbrake_marl.worlds.describe import clusters_of, columns_of
+from ethbrake_marl.worlds.sampling import Drawn
+
+CHUNK = 2_500  # worlds that are driven together, to limit memory
+
+KNOWLEDGE = (SENSORS, MESSAGES, "estimated model", TRUE_STATE, MODEL)  # from little to much
+UNSTATED = "not stated"
+
+Columns = dict[str, Values]
+
+
+@dataclass(frozen=True)
+class Result:
+    """What teams did in the same worlds: columns [n] of every team, and of the worlds. Row k is always the same world.
+
+    >>> import ethbrake_marl as eb
+    >>> from ethbrake_marl.agents.drive import Team
+    >>> from ethbrake_marl.agents.scripts import Held
+    >>> from ethbrake_marl.evaluation.evaluate import evaluate
+    >>> from ethbrake_marl.worlds.game import game_of
+    >>> scenario, game = game_of("paper-random")
+    >>> teams = {name: Team(name, {2: Held(name)}) for name in ("full_brake", "coast")}
+    >>> result = evaluate(scenario.draw(3, seed=7), teams, game)
+    >>> result["full_brake"]["total_harm"].round(2), result["coast"]["collided"]
+    (array([33.79, 77.19,  0.  ]), array([ True,  True,  True]))
+
+    """
+
+    columns: Mapping[str, Columns]  # team -> column -> [n]: `evaluation.measures`
+    worlds: Columns  # column -> [n]: number, recording, quantities that differ, whether the channel hides something
+    measures: tuple[Measure, ...]
+    knows: Mapping[str, str]  # team -> what it has to know
+    policies: Mapping[str, Mapping[str, str]]  # team -> vehicle -> SHA-256 of its policy
+    about: Mapping[str, Any]  # plain data: scenario, seed, times, digests, versions
+
+    @property
+    def n(self) -> int:
+        """Number of worlds."""
+        return len(self.worlds["world"])
+
+    @property
+    def clusters(self) -> NDArray[np.str_] | None:
+        """Name of each world's recording, [n]; None if all worlds are independent."""
+        return clusters_of(self.worlds)
+
+    def __getitem__(self, team: str) -> Columns:
+        if team not in self.columns:
+            raise unknown_name("agent in this result", team, self.columns)
+        return self.columns[team]
+
+    def __repr__(self) -> str:
+        return f"Result({self.about['scenario']!r}, {count_of(self.n, 'world')}: {', '.join(self.columns):.200})"
+
+    def measure_of(self, column: str) -> Measure:
+        """Return the measure that a column belongs to."""
+        mine = [each for each in self.measures if column == each.name or column.startswith(f"{each.name}_")]
+        return max(mine, key=lambda measure: len(measure.name))
+
+    def take(self, rows: Any) -> Result:
+        """Return the result in some of its worlds: row numbers, or a mask [n]."""
+        columns = {team: {name: each[rows] for name, each in own.items()} for team, own in self.columns.items()}
+        worlds = {name: each[rows] for name, each in self.worlds.items()}
+        about = {key: value for key, value in self.about.items() if key != "worlds_sha256"}
+        about |= {"count": len(worlds["world"]), "rejected_draws": 0}
+        return replace(self, columns=columns, worlds=worlds, about=about)
+
+    def arrays(self) -> Columns:
+        """Return a table with one row per team and world: name of a column -> values. A missing number is NaN."""
+        names = list(dict.fromkeys(name for own in self.columns.values() for name in own))
+        table: Columns = {"agent": np.repeat([*self.columns], self.n)}
+        table |= {name: np.tile(each, len(self.columns)) for name, each in self.worlds.items()}
+        for name in names:
+            kinds = [own[name].dtype.kind for own in self.columns.values() if name in own]
+            missing = np.full(self.n, "" if "U" in kinds else np.nan)
+            table[name] = np.concatenate([own.get(name, missing) for own in self.columns.values()])
+        return table | {"knows": np.repeat([self.knows[team] for team in self.columns], self.n)}
+
+    def to_pandas(self) -> Any:
+        """Return the table of ``arrays`` as a ``DataFrame``. Raises ``MissingExtra`` without pandas."""
+        with naming_extras():
+            from pandas import DataFrame
+
+        return DataFrame(self.arrays())
+
+
+def evaluate(
+    worlds: Drawn | State,
+    agents: Mapping[str, Team],
+    game: Game,
+    measures: Iterable[Measure] = (),
+    jobs: int | None = 1,
+    *,
+    ray: str | None = None,
+    about: Mapping[str, Any] | None = None,
+    on_done: Callable[[int], None] | None = None,
+) -> Result:
+    """Let every team drive every world once. The result is the same, to the last bit, for any number of processes.
+
+    Args:
+        worlds: worlds at the alert: ``scenario.draw(n, seed)``, or a ``State``, whose recordings are not known.
+        agents: name in tables -> team, which drives all learners of the game.
+        game: game of the worlds' scenario.
+        measures: measures beside the usual ones, for instance ``measures_called("sampled_harm,injury")``.
+        jobs: number of processes.
+        ray: ``local``, or address of a Ray cluster; None: processes of joblib.
+        about: what else tables and files should say (``identity.about_scenario``).
+        on_done: called with the number of worlds that all teams have driven so far.
+
+    Raises ``InvalidInput`` for worlds that are not at the alert or have another number of vehicles, for a team that
+    does not fit, and for bad commands of an agent; ``PhysicsError`` if a check of the
+    physics fails.
+
+    """
+    drawn = worlds if isinstance(worlds, Drawn) else Drawn.given(worlds)
+    _check(drawn.worlds, agents, game)
+    chosen = (*DEFAULT, *measures)
+    alert, n = drawn.worlds, drawn.worlds.n
+    calls: Any = (
+        (drive_chunk, alert.take(slice(first, first + CHUNK)), dict(agents), game, chosen)
+        for first in range(0, n, CHUNK)
+    )
+    if jobs not in (None, 1) or ray is not None:
+        _check_can_be_sent(agents, chosen)
+    parts: list[dict[str, Columns]] = []
+    for part in run_each(calls, jobs, ray):
+        parts.append(part)
+        if on_done is not None:
+            on_done(min(len(parts) * CHUNK, n))
+    learners = game.rules.learners.tolist()
+    columns = columns_of(drawn)
+    return Result(
+        {team: _joined([part[team] for part in parts]) for team in agents},
+        {**columns, "hidden": hidden_from(alert, learners)},
+        chosen,
+        {name: known_by(team) for name, team in agents.items()},
+        {name: policies_of(team.drivers) for name, team in agents.items()},
+        {
+            "scenario": game.name,
+            "seed": None,
+            "count": n,
+            "controlled_vehicles": [f"vehicle_{body}" for body in learners],
+            "time_step_s": game.rules.time_step_s,
+            "horizon_s": game.rules.horizon_s,
+            "rejected_draws": drawn.rejected,
+            **(about or {}),
+            "worlds_sha256": worlds_sha256(alert),
+            "physics_digest": physics_digest(),
+            "versions": versions(),
+        },
+    )
+
+
+def drive_chunk(
+    alert: State, agents: Mapping[str, Team], game: Game, measures: Sequence[Measure]
+) -> dict[str, Columns]:
+    """Return the columns of every team in these worlds."""
+    return {name: _driven(alert, name, team, game, measures) for name, team in agents.items()}
+
+
+def _driven(alert: State, name: str, team: Team, game: Game, measures: Sequence[Measure]) -> Columns:
+    whole = team.game(game)
+    watches = {each.name: each.watch(whole, alert) for each in measures if each.watch is not None}
+    seen = [watch for watch in watches.values() if watch is not None]
+    before = alert
+    with AgentFailed.naming(name, [script.name for script in game.scripts.values() if hasattr(script, "name")]):
+        for step, state in play(game, alert, team, donate=not seen):
+            for watch in seen:
+                watch.see(before, step, state)
+            before = state
+    columns: Columns = {}
+    for measure in measures:
+        columns |= measured(measure, watches.get(measure.name), whole, alert, before)
+    return columns
+
+
+def _joined(parts: Sequence[Columns]) -> Columns:
+    """Return the columns of all chunks; one that is missing in a chunk is missing."""
+    return {
+        name: np.concatenate([part[name] for part in parts]) for name in parts[0] if all(name in part for part in parts)
+    }
+
+
+def hidden_from(alert: State, learners: Sequence[int]) -> Bools:
+    """Return whether the V2X channel hides something from a learner at its first decision, [n].
+
+    News of a vehicle have not arrived, or it reacts later than its messages say, because it waits for news itself.
+    """
+    latency, hidden = alert.car[:, LATENCY], np.zeros(alert.n, np.bool_)
+    late = latency > alert.car[:, OWN_LATENCY]
+    for i in learners:
+        unknown = (alert.know[:, i] > latency[:, [i]]) | late
+        hidden |= np.delete(unknown, [0, i], axis=1).any(axis=1)
+    return hidden
+
+
+def known_by(team: Team) -> str:
+    """Return what a team has to know, as one text: ``messages + true model``."""
+    each = {getattr(agent, "knows", UNSTATED) for agent in team.drivers.values()}
+    each |= {getattr(team.shield, "knows", MODEL)} if team.shield is not None else set()
+    return " + ".join(sorted(each, key=lambda word: (*KNOWLEDGE, word).index(word)))
+
+
+def _check_can_be_sent(agents: Mapping[str, Team], measures: Sequence[Measure]) -> None:
+    for name, part in (*agents.items(), *((measure.name, measure) for measure in measures)):
+        try:
+            pickle.dumps(part)
+        except Exception as error:
+            raise InvalidInput(
+                f"evaluate: {name!r:.60} cannot be sent to another process ({error}); define its classes and functions"
+                " in a module, or use jobs=1"
+            ) from error
+
+
+def _check(alert: State, agents: Mapping[str, Team], game: Game) -> None:
+    if not isinstance(agents, Mapping) or not agents or not all(isinstance(team, Team) for team in agents.values()):
+        raise InvalidInput(
+            f"evaluate: agents = {agents!r:.80}: must be a mapping from names to teams, for instance"
+            " {'mine': Team('mine', {2: agent})}"
+        )
+    vehicles = len(game.views) - 1
+    if not alert.n or alert.vehicles != vehicles or alert.clock[:, [TIME, STEPS]].any():
+        raise InvalidInput(
+            f"evaluate: worlds: {count_of(alert.n, 'world')} of {alert.vehicles} vehicles; must be one or more worlds"
+            f" of {vehicles} vehicles at the alert, for instance scenario.draw(100, seed=7)"
+        )
+    for team in agents.values():
+        team.game(game)

@@ -1,0 +1,53 @@
+"""Identity of a result: digests of worlds, scenario, physics and policies, and versions of software.
+
+Results can be compared if their worlds and scenarios are the same. Other physics or versions are reported.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Mapping
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.episode.state import NUMBER, State
+from ethbrake_marl.files.python_file import files_run
+from ethbrake_marl.registry import versions_used
+
+PACKAGES = ("ethbrake-marl", "numba", "numpy")
+WORDS = ("name", "title", "description", "source")  # keys of a scenario that do not affect an episode
+
+
+def worlds_sha256(worlds: State) -> str:
+    """Return the SHA-256 of worlds at the alert: all their arrays, little-endian, and their numbers."""
+    digest = hashlib.sha256()
+    for array in (worlds.line, worlds.car, worlds.know, worlds.wanted, worlds.clock[:, NUMBER]):
+        digest.update(f"{array.shape}".encode())
+        digest.update(np.ascontiguousarray(array, "<f8").data)
+    return digest.hexdigest()
+
+
+def about_scenario(scenario: Any, seed: int | None = None) -> dict[str, Any]:
+    """Return what a result should say of a ``Scenario``, and of the seed of its worlds; for ``evaluate(about=...)``."""
+    content = json.dumps(scenario.content(without=WORDS), sort_keys=True, separators=(",", ":"))
+    scripts = {name: role for name, role in scenario.roles.items() if role != "learner"}
+    return {"seed": seed, "scripts": scripts, "scenario_sha256": hashlib.sha256(content.encode()).hexdigest()}
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of every package that affects a result, those of extensions included.
+
+    With them the SHA-256 of each Python file of the user that this process ran.
+    """
+    own = {"python": platform.python_version()} | {name: version(name) for name in PACKAGES}
+    return own | versions_used() | {name: f"SHA-256 {sha256}" for name, sha256 in files_run().items()}
+
+
+def policies_of(drivers: Mapping[int, object]) -> dict[str, str]:
+    """Return the SHA-256 of the manifest of each vehicle's policy; vehicles without a policy of ours are left out."""
+    manifests = {body: getattr(getattr(agent, "policy", None), "manifest", None) for body, agent in drivers.items()}
+    return {f"vehicle_{body}": each.manifest_sha256 for body, each in manifests.items() if each is not None}

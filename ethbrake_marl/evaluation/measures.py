@@ -1,0 +1,205 @@
+"""Measures: what an evaluation reports of each episode, one number per world or per vehicle.
+
+A measure is a function ``of(game, alert, last)`` of the game, the worlds at the alert and the last states of their
+episodes. It returns [n], one value per world, or [n, N], one per vehicle: columns ``NAME_1`` to ``NAME_N``. A mapping
+ending -> [n] gives the columns ``NAME_ending``, and ``NAME`` for the ending ``""``. None: not defined here. Values are
+finite numbers, truth values (tables show how often they are true) or texts.
+
+=======================================  ===============================================================================
+of a state                               what it is (``episode.state.State``)
+=======================================  ===============================================================================
+``speeds_mps``, ``gaps_m``               [n, N] m/s; [n, N - 1] m, front to rear
+``obstacle_gap_m``                       [n] m; infinite without an obstacle
+``harm("first")``, ``harm("total")``     [n] m2/s2 of the line so far: first impact of each pair, all impacts
+``borne_harm(...)``                      [n, N] m2/s2, what each vehicle bears of it
+``collided``, ``pair_hit``               [n]; [n, N - 1] whether there was an impact
+``commands_mps2``, ``forces_mps2``       [n, N] m/s2: last commands; what brakes and engines cause
+``mass_t``, ``latency_s``                [n, N] t; s
+``braking_capacity_mps2``, ``driving_``  [n, N] m/s2 on this road
+``time_s``, ``steps``, ``ended``         [n] s since the alert; steps taken; whether the episode has ended
+``memories``                             body -> memory of its agent; ``"shield"`` -> memory of the shield
+``car``, ``line``                        [n, rows, N + 1] all parameters, all that changes (``motion.layout``)
+=======================================  ===============================================================================
+
+A ``Watch`` also sees what each step did (``episode.step.Step``): ``first_impact_harm`` and ``total_harm`` of the line,
+[n] m2/s2; ``reward`` [n, N] and its ``terms``; ``terminated``, ``truncated`` and ``safe_end``, [n].
+
+Every evaluation has DEFAULT. Other measures, which cost something, are named: ``evaluation.named_measures``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, Literal, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.step import Step
+from ethbrake_marl.errors import EthBrakeError, InvalidInput, describe_error
+from ethbrake_marl.motion.layout import COUNT, FIRST, FORCE, SPEED
+
+Values = NDArray[Any]
+Given = Values | Mapping[str, Values] | None
+
+AT_REST, HORIZON = "at_rest", "horizon"  # how an episode ended
+
+
+class Watch(Protocol):
+    """Measures episodes while they run."""
+
+    def see(self, before: State, step: Step | None, after: State) -> None:
+        """Look at what happened between two states; ``step`` None: between the alert and the first decision."""
+
+    def result(self, last: State) -> Given:
+        """Return the value, as a measure does."""
+
+
+class Statistic(NamedTuple):
+    """How tables and JSON show a column: its mean, the share of worlds where it is true, or compared with a baseline.
+
+    ``difference`` is the mean difference, ``decrease`` is 1 - (mean) / (mean of the baseline).
+    """
+
+    key: str  # in JSON
+    kind: Literal["mean", "rate", "difference", "decrease"] = "mean"
+    heading: str = ""  # in tables; "": not in tables
+    short: str = ""  # heading in a terminal
+    ending: str = ""  # of the column's name, after the measure's
+
+
+class Measure(NamedTuple):
+    """A measure: a function of the last states, or a watch of all states."""
+
+    name: str
+    of: Callable[[Game, State, State], Given] | None = None
+    meaning: str = ""
+    unit: str = "1"
+    shown: tuple[Statistic, ...] = ()  # statistics of its columns; any other column has a mean or rate of its name
+    watch: Callable[[Game, State], Watch | None] | None = None  # begins with (game, alert)
+
+
+def flat(measure: Measure, given: Given, last: State) -> dict[str, Values]:
+    """Return the columns of a measure: name -> [n]. Raises ``InvalidInput`` for a value of another shape or kind."""
+    if given is None:
+        return {}
+    parts: Mapping[str, Any] = given if isinstance(given, Mapping) else {"": given}
+    columns: dict[str, Values] = {}
+    for ending, value in parts.items():
+        name, values = "_".join(filter(None, (measure.name, ending))), np.asarray(value)
+        each = {f"{name}_{i + 1}": column for i, column in enumerate(values.T)} if values.ndim == 2 else {name: values}
+        right = (last.n,), (last.n, last.vehicles)
+        if values.shape not in right or values.dtype.kind not in "fiubU":
+            raise InvalidInput(
+                f"measure {name!r}: its function returned {values.dtype} of shape {values.shape}; must return numbers,"
+                f" truth values or texts of shape {right[0]}, one per world, or {right[1]}, one per vehicle"
+            )
+        if values.dtype.kind == "f" and not np.isfinite(values).all():
+            row = np.argwhere(~np.isfinite(values))[0]
+            raise InvalidInput(f"measure {name!r}: its value is {values[tuple(row)]} in row {row[0]}; must be finite")
+        columns |= each
+    return columns
+
+
+# ---- built-in measures
+
+
+def collided(game: Game, alert: State, last: State) -> Given:
+    """Whether there was an impact. The interval of the rate is Wilson's."""
+    return last.collided
+
+
+def harm(count: str, game: Game, alert: State, last: State) -> Given:
+    """Return the harm of the line, and what each vehicle bears of it."""
+    borne = {f"{i + 1}": column for i, column in enumerate(last.borne_harm(count).T)}
+    return {"": last.harm(count), **borne}
+
+
+def impacts(game: Game, alert: State, last: State) -> Given:
+    """Number of impacts, those with an obstacle included."""
+    return np.asarray(last.line[:, COUNT].sum(axis=1), np.int64)
+
+
+def hardest_impact_mps(game: Game, alert: State, last: State) -> Given:
+    """Largest closing speed of a pair's first impact."""
+    return np.asarray(np.sqrt(last.line[:, FIRST].max(axis=1)))
+
+
+def end_s(game: Game, alert: State, last: State) -> Given:
+    """When the episode ended."""
+    return last.time_s
+
+
+def ended(game: Game, alert: State, last: State) -> Given:
+    """at_rest: all vehicles came to rest; horizon: the horizon came first."""
+    moves = (last.line[:, SPEED] != 0.0) | (last.wanted > 0.0) | (last.line[:, FORCE] > 0.0)
+    return np.where(moves[:, 1:].any(axis=1), HORIZON, AT_REST)
+
+
+def predicted_harm(game: Game, alert: State, last: State) -> Given:
+    """Harm that the agent predicted at the alert, in the count that it minimises."""
+    memories: list[Any] = [last.memories.get(who) for who in ("shield", *game.rules.learners.tolist())]
+    predictions = [memory.predicted_harm for memory in memories if hasattr(memory, "predicted_harm")]
+    return predictions[0] if len(predictions) == 1 and np.isfinite(predictions[0]).all() else None
+
+
+def replaced(game: Game, alert: State, last: State) -> Given:
+    """Number of actions that the shield replaced; whether it replaced none, or let the policy drive (Algorithm 1)."""
+    memory: Any = last.memories.get("shield")
+    if hasattr(memory, "chosen"):
+        return {"none": memory.chosen}
+    if hasattr(memory, "replaced"):
+        return {"actions": memory.replaced, "none": memory.replaced == 0}
+    return None
+
+
+def _built_in(of: Callable[[Game, State, State], Given], unit: str, *shown: Statistic) -> Measure:
+    return Measure(of.__name__, of, of.__doc__ or "", unit, shown)
+
+
+DEFAULT = (
+    _built_in(collided, "", Statistic("collision_rate", "rate", "Collisions")),
+    Measure(
+        "first_impact_harm", partial(harm, "first"),
+        "Squared closing speed of each pair's first impact, summed over the pairs, as the paper counts harm. With the"
+        " number of a vehicle: what it bears.", "m2/s2",
+        (
+            Statistic("first_impact_harm", "mean", "First-impact harm", "First-impact\nharm"),
+            Statistic("first_impact_harm_difference", "difference"),
+            Statistic("harm_decrease_first", "decrease", "Decrease, first-impact", "Decrease\nfirst"),
+        ),
+    ),
+    Measure(
+        "total_harm", partial(harm, "total"),
+        "Squared closing speed of every impact, summed. After a light first impact, first-impact harm does not count a"
+        " hard second one of the same pair; total harm does.", "m2/s2",
+        (
+            Statistic("total_harm", "mean", "Total harm", "Total\nharm"),
+            Statistic("total_harm_difference", "difference"),
+            Statistic("harm_decrease_total", "decrease", "Decrease, total", "Decrease\ntotal"),
+        ),
+    ),
+    _built_in(impacts, "1"),
+    _built_in(hardest_impact_mps, "m/s"),
+    _built_in(end_s, "s"),
+    _built_in(ended, ""),
+    _built_in(predicted_harm, "m2/s2", Statistic("predicted_harm", "mean", "Predicted harm", "Pre-\ndicted")),
+    _built_in(replaced, "1", Statistic("policy_share", "rate", ending="none")),
+)  # fmt: skip
+
+
+def measured(measure: Measure, watch: Watch | None, game: Game, alert: State, last: State) -> dict[str, Values]:
+    """Return the columns of one measure. Raises ``InvalidInput``, which names the measure, if its function fails."""
+    try:
+        if measure.of is not None:
+            given = measure.of(game, alert, last)
+        else:
+            given = None if watch is None else watch.result(last)
+    except EthBrakeError:
+        raise
+    except Exception as error:
+        raise InvalidInput(f"measure {measure.name!r}: its function fails: {describe_error(error)}") from error
+    return flat(measure, given, last)

@@ -1,0 +1,160 @@
+"""Measures by name: registered ones, summed terms of a reward, objectives, functions of a user's Python file.
+
+The sum of a term over all steps is what a learner with this reward would get (``episode.terms``). An objective
+(``social:45``) has a value for each vehicle, in both counts of harm.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, objectives_of
+from ethbrake_marl.episode.reward import Rewarding
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.step import Step
+from ethbrake_marl.episode.terms import TERMS, TermFunction
+from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
+from ethbrake_marl.evaluation.measures import DEFAULT, Given, Measure, Statistic, Values, Watch
+from ethbrake_marl.files.python_file import load_from_file
+from ethbrake_marl.registry import Part, Registry
+
+
+def register_measure(
+    name: str,
+    of: Callable[[Game, State, State], Given] | None = None,
+    *,
+    unit: str = "1",
+    shown: Iterable[Statistic] = (),
+    watch: Callable[[Game, State], Watch | None] | None = None,
+) -> None:
+    """Register a measure, for ``measures_called``. Entry points: ``ethbrake_marl.episode_measures``.
+
+    Raises ``AlreadyExists`` for a name in use, and ``InvalidInput`` for a bad name or a function without a docstring,
+    which says what the measure means.
+
+    Args:
+        name: 1 to 64 characters ``a-z``, ``0-9``, ``_``, beginning with a letter, not ending in ``_`` and a number, nor
+            in ``_interval``, ``_low``, ``_high``, ``_error``, ``_freedom``.
+        of: ``of(game, alert, last)`` returns [n] or [n, N].
+        unit: unit of the value.
+        shown: how tables show it; by default the mean, or the share of worlds in which it is true.
+        watch: in place of ``of``: ``watch(game, alert)`` returns a ``Watch``, which sees every step.
+
+    >>> import ethbrake_marl as eb
+    >>> from ethbrake_marl.evaluation.named_measures import register_measure
+    >>> def hardest(game, alert, last):
+    ...     '''Speed at which the rear vehicle ends, m/s.'''
+    ...     return last.speeds_mps[:, -1]
+    >>> register_measure("rear_speed_mps", hardest, unit="m/s")
+
+    """
+    right = r"(?!.*_([0-9]+|interval|low|high|error|freedom)\Z)[a-z][a-z0-9_]{0,63}"
+    if not isinstance(name, str) or re.fullmatch(right, name) is None:
+        raise InvalidInput(
+            f"measure {name!r:.80}: the name must be 1 to 64 characters a-z, 0-9 and _, beginning with a letter and not"
+            " ending in _ and a number, nor in _interval, _low, _high, _error or _freedom"
+        )
+    function = watch if of is None else of
+    if (of is None) == (watch is None) or not callable(function) or not (function.__doc__ or "").strip():
+        raise InvalidInput(f"measure {name!r}: give one function, of= or watch=, with a docstring that describes it")
+    measure = Measure(name, of, " ".join(str(function.__doc__).split()), str(unit), tuple(shown), watch)
+    if name in USUAL or name in TERMS:
+        raise AlreadyExists(f"measure {name!r}: this name is already in use; give another name")
+    MEASURES.add(name, measure, lambda other: other == measure)
+
+
+USUAL = tuple(measure.name for measure in DEFAULT)
+
+MEASURES: Registry[Measure] = Registry(
+    "measure", "episode_measures", register_measure, {measure.name: measure for measure in DEFAULT}
+)
+
+_REWARDED = ("collision", "risk", "jerk")  # built-in terms of a step, with the constants of a usual reward
+
+
+def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:
+    """Return the measures, summed terms and objectives of these names, each once; ``FILE.py:NAME`` runs the file.
+
+    Raises ``UnknownName``, and ``InvalidInput`` for a file without such a measure.
+    """
+    found: dict[str, Measure] = {}
+    for name in names.split(",") if isinstance(names, str) else names:
+        found |= {measure.name: measure for measure in _called(name)}
+    return tuple(found.values())
+
+
+def _called(name: str) -> list[Measure]:
+    if name in MEASURES:
+        return [MEASURES[each] for each in MEASURES.load(name)]
+    if name in _REWARDED:
+        return [_summed(name, partial(_rewarded, name), "1")]
+    if name in TERMS:
+        return [_summed(name, TERMS[name].value, TERMS[name].unit)]
+    file, _, own = str(name).rpartition(":")
+    if file.endswith(".py"):
+        register_measure(own, *_part(file, own).given, **_part(file, own).settings)
+        measure, called = MEASURES[own], cast(Any, FromFile(file, own))
+        return [measure._replace(of=called) if measure.watch is None else measure._replace(watch=called)]
+    kind = str(name).partition(":")[0]
+    if kind in OBJECTIVES:
+        meaning = f"What the vehicle would minimise: {OBJECTIVES[kind].about}."
+        return [Measure(name, partial(_objective, name), meaning, "m2/s2")]
+    raise unknown_name("measure", name, (*MEASURES, *_REWARDED, *TERMS, *OBJECTIVES), may_be_own=True)
+
+
+class FromFile(NamedTuple):
+    """A function of a user's Python file, which every process runs for itself."""
+
+    file: str
+    name: str
+
+    def __call__(self, *given: Any) -> Any:
+        """Call the function."""
+        part = _part(self.file, self.name)
+        function = part.given[0] if part.given else part.settings.get("of") or part.settings["watch"]
+        return function(*given)
+
+
+def _part(file: str, name: str) -> Part:
+    part = load_from_file(file, name)
+    return part if isinstance(part, Part) else Part(part)
+
+
+def _summed(name: str, term: TermFunction, unit: str) -> Measure:
+    return Measure(name, None, f"Sum of the term {name} over all steps.", unit, watch=partial(SummedTerm, term))
+
+
+def _rewarded(name: str, before: State, step: Step, after: State) -> Values:
+    learners, times = np.zeros(0, np.int64), (step.time_step_s, 0.0)
+    rewarding, _ = Rewarding.of({"harm": 0.0, name: 1.0}, "total", after.vehicles, learners, times, None)
+    return rewarding.terms[0][2](before, step, after)
+
+
+def _objective(name: str, game: Game, alert: State, last: State) -> Given:
+    objectives = objectives_of(name, last.vehicles)
+    return {count: amounts(objectives, None, last, count) for count in ("first", "total")}
+
+
+class SummedTerm:
+    """Adds up a term of a reward over all steps."""
+
+    def __init__(self, term: TermFunction, game: Game, alert: State) -> None:
+        self.term, self.sum = term, np.zeros(alert.n)
+
+    def see(self, before: State, step: Step | None, after: State) -> None:
+        """Add the step's term, 0 in episodes that had ended."""
+        if step is not None:
+            value = self.term(before, step, after)
+            self.sum = (self.sum if self.sum.shape == value.shape else np.zeros(value.shape)) + np.where(
+                before.ended if value.ndim == 1 else before.ended[:, np.newaxis], 0.0, value
+            )
+
+    def result(self, last: State) -> Given:
+        """Return the sum."""
+        return self.sum

@@ -1,0 +1,161 @@
+"""Record one episode with closely spaced samples, for figures and viewers.
+
+A team drives as in an evaluation. Between two decisions the motion is computed again, from the state at the first one.
+The record ends with the episode.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from ethbrake_marl.agents.drive import Team, play
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.step import advance_worlds
+from ethbrake_marl.errors import InvalidInput, count_of
+from ethbrake_marl.evaluation.measures import AT_REST, ended
+from ethbrake_marl.evaluation.pushing import POST_M
+from ethbrake_marl.motion.layout import (
+    COUNT,
+    FAR_M,
+    FIRST,
+    FORCE,
+    GAP,
+    LATENCY,
+    NEXT_CLOSING,
+    NEXT_TIME,
+    SPEED,
+    TOTAL,
+    Floats,
+    Ints,
+    scratch_for,
+)
+
+SAMPLE_S = 0.02  # usual time between two samples
+
+
+@dataclass(frozen=True)
+class Impacts:
+    """Impacts of one episode in order of time; several of a pair between two samples are one row."""
+
+    time_s: Floats  # [m] of the first
+    pair: Ints  # [m] 0: Vehicle 1 with the obstacle, p: vehicle_p and the one behind it
+    closing_speed_mps: Floats  # [m] of the first
+    number: Ints  # [m]
+    first_impact_harm: Floats  # [m] m2/s2
+    total_harm: Floats  # [m] m2/s2
+
+
+@dataclass(frozen=True)
+class EpisodeRecord:
+    """Motion of one world at k times from the alert to the end of its episode.
+
+    >>> from ethbrake_marl.agents.drive import Team
+    >>> from ethbrake_marl.agents.scripts import Held
+    >>> from ethbrake_marl.evaluation.record import record_episode
+    >>> from ethbrake_marl.worlds.game import game_of
+    >>> scenario, game = game_of("paper-random")
+    >>> record = record_episode(scenario.sample(1, seed=7), Team("full_brake", {2: Held("full_brake")}), game)
+    >>> record.positions_m.shape, record.impacts.time_s.round(2), record.at_rest
+    ((196, 3), array([2.17, 3.3 ]), True)
+
+    """
+
+    agent: str
+    scenario: str
+    vehicles: tuple[int, ...]  # bodies that the team drives (1: Vehicle 1)
+    states: tuple[State, ...]  # at the alert, at every decision, and at the end
+    time_s: Floats  # [k] ascending
+    gaps_m: Floats  # [k, N - 1]
+    speeds_mps: Floats  # [k, N]
+    positions_m: Floats  # [k, N] along the road from where Vehicle 1 is at the alert, as if vehicles had no length
+    command_mps2: Floats  # [k, N] commanded from this time on; 0 before the latency is over
+    forces_mps2: Floats  # [k, N] what brakes and engines cause
+    impacts: Impacts
+    at_rest: bool  # whether the line came to rest before the horizon
+
+    @property
+    def initial(self) -> State:
+        """The world at the alert."""
+        return self.states[0]
+
+    @property
+    def last(self) -> State:
+        """The state at the end, with the harm of the episode."""
+        return self.states[-1]
+
+    def __repr__(self) -> str:
+        first, total = (float(self.last.harm(count)[0]) for count in ("first", "total"))
+        return (
+            f"EpisodeRecord({self.agent!r:.60} on {self.scenario!r}, {len(self.time_s)} samples to"
+            f" {self.time_s[-1]:g} s, {count_of(int(self.impacts.number.sum()), 'impact')}, harm {first:.2f}"
+            f" first-impact, {total:.2f} total)"
+        )
+
+
+def record_episode(world: State, team: Team, game: Game, sample_s: float = SAMPLE_S) -> EpisodeRecord:
+    """Let a team drive one world exactly as in ``evaluate``, and record the motion.
+
+    Samples are at most ``sample_s`` apart, and at every decision. Raises ``InvalidInput`` unless there is exactly one
+    world at the alert, and for a ``sample_s`` that is not finite and above 0.
+    """
+    if world.n != 1 or world.time_s[0] != 0.0:
+        raise InvalidInput(
+            f"record_episode: world has {count_of(world.n, 'world')}; pass exactly 1 at the alert, for instance"
+            " worlds.take([0])"
+        )
+    if not (isinstance(sample_s, int | float) and 0.0 < sample_s < math.inf):
+        raise InvalidInput(f"record_episode: sample_s = {sample_s!r}: must be a finite number of seconds above 0")
+    states = [world, *(state for _, state in play(game, world, team))]
+    pieces = [_between(before, after, sample_s) for before, after in pairwise(states)]
+    times, lines, wanted = (np.concatenate(part) for part in zip(*pieces, strict=True))
+    way_m = np.cumsum(lines[:, 0, GAP, 0] - lines[:, 1, GAP, 0])  # of Vehicle 1, up to the end of each piece
+    line = np.concatenate([lines[:, 0], lines[-1:, 1]])
+    time_s = np.append(times[:, 0], times[-1, 1])
+    front_m = np.append(0.0, way_m)
+    behind_m = np.cumsum(line[:, GAP, 1:-1], axis=1)
+    in_force = world.car[:, LATENCY, 1:] <= time_s[:, np.newaxis]
+    commands = np.concatenate([wanted, wanted[-1:]])[:, 1:]
+    last = states[-1]
+    return EpisodeRecord(
+        team.name, game.name, tuple(team.drivers), tuple(states), time_s, line[:, GAP, 1:-1], line[:, SPEED, 1:],
+        np.column_stack([front_m, front_m[:, np.newaxis] - behind_m]),
+        np.where(in_force, commands, 0.0), line[:, FORCE, 1:], _impacts(times, lines, world.car, wanted),
+        bool(np.asarray(ended(game, world, last))[0] == AT_REST),
+    )  # fmt: skip
+
+
+def _between(before: State, after: State, sample_s: float) -> tuple[Floats, Floats, Floats]:
+    """Return k pieces of the motion between two states: times [k, 2], lines [k, 2, ...], and commands [k, N + 1].
+
+    Lines are those at the beginning and the end of a piece; without an obstacle, a post measures Vehicle 1's way.
+    """
+    start, end = float(before.time_s[0]), float(after.time_s[0])
+    count = max(math.ceil((end - start) / sample_s - 1e-9), 1) if end > start else 0
+    ends = np.linspace(start, end, count + 1)
+    line = before.line.copy()
+    line[:, GAP, 0] = np.where(line[:, GAP, 0] < FAR_M, line[:, GAP, 0], POST_M)
+    every = np.zeros(count, np.int64)
+    lines, wanted = line[every], after.wanted[every]
+    advance_worlds(lines, before.car[every], np.full(count, start), ends[1:], wanted, scratch_for(line.shape[2]))
+    lines = np.concatenate([line, lines])
+    return np.column_stack([ends[:-1], ends[1:]]), np.stack([lines[:-1], lines[1:]], axis=1), wanted
+
+
+def _impacts(times: Floats, lines: Floats, car: Floats, wanted: Floats) -> Impacts:
+    """Return the impacts; pieces of the motion with impacts are driven again, for the times of the first."""
+    rows = [FIRST, TOTAL, COUNT]
+    made = lines[:, 1, rows] - lines[:, 0, rows]
+    piece, pair = np.nonzero(made[:, 2])
+    firsts = np.empty((len(piece), 2))
+    for row, (k, p) in enumerate(zip(piece, pair, strict=True)):
+        scratch = scratch_for(car.shape[2])
+        advance_worlds(lines[k : k + 1, 0].copy(), car, times[k, :1], times[k, 1:], wanted[k : k + 1], scratch)
+        firsts[row] = times[k, 0] + scratch[NEXT_TIME, p], scratch[NEXT_CLOSING, p]
+    order = np.argsort(firsts[:, 0], kind="stable")
+    first, total, number = made[piece, :, pair][order].T
+    return Impacts(firsts[order, 0], pair[order], firsts[order, 1], number.astype(np.int64), first, total)

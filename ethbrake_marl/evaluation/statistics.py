@@ -1,0 +1,184 @@
+"""Means, rates and paired comparisons over worlds, each with its 95 % interval.
+
+Worlds are independent draws, and every agent drives the same worlds, so comparisons are paired by world: that removes
+the spread between easy and hard worlds. Sums are exactly rounded, so the order of the worlds does not matter.
+
+Worlds of one recording resemble each other. With ``clusters``, the name of each world's recording, [n], only recordings
+are independent. All estimates then come from each recording's sums, and are ratios ``r = sum x / sum y`` (a mean: y
+counts worlds). Recording g has the share ``h_g = y_g / sum y`` and the influence ``d_g = (x_g - r y_g) / sum y``:
+
+- standard error: the jackknife, ``sqrt((G - 1) / G sum e_g^2)``, where ``e_g = d_g / (1 - h_g)`` is the change of r
+  if recording g is left out;
+- degrees of freedom: Satterthwaite's, ``tr(K)^2 / tr(K^2)``, where K is the covariance of the ``e_g`` if the deviation
+  of each recording is proportional to its share (Bell and McCaffrey 2002; Hansen 2024). They are G - 1 for recordings
+  of equal size, and fewer otherwise;
+- skewness ``A = sum e^3 / (sum e^2)^1.5``: Hall's (1992) transformation ``3 / A (cbrt(1 + A (t - A / 6)) - 1)`` of the
+  quantile t, where that makes the interval longer.
+
+In simulations these intervals cover the truth in 91 to 99 % with 2 to 66 unequal recordings (plain t intervals: 75 to
+96 %). They cover less if no recording shows what a few others would: where 4 of 66 recordings have nearly all harm, 98
+% with 66 recordings drawn from them, but 83 % with 20 and 73 % with 10.
+
+In all functions ``values`` and ``baseline`` have one number per world, [n], for the same worlds in the same order.
+"""
+
+from __future__ import annotations
+
+from math import cbrt, fsum, sqrt
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri, stdtrit
+
+from ethbrake_marl.files.sheet import Estimate
+from ethbrake_marl.motion.layout import Bools, Floats
+
+UPPER = 0.975  # quantile at the upper end of a 95 % interval
+Z = float(ndtri(UPPER))
+LEAST_REST = 1e-6  # of the weight, outside each recording: nothing can be said of others without it
+
+Clusters = NDArray[Any] | None
+
+
+def mean(values: Floats, clusters: Clusters = None) -> Estimate:
+    """Return the mean with its t interval, ``mean -+ t s / sqrt(n)``.
+
+    If no value is negative, the interval does not go below 0. If all values are 0, there is no interval: zeros show
+    that more is rare, but not how much more it can be.
+    """
+    estimate = _mean(values, clusters)
+    if (values < 0.0).any() or estimate.interval is None:
+        return estimate
+    interval = (max(estimate.interval[0], 0.0), estimate.interval[1]) if values.any() else None
+    return Estimate(estimate.value, interval, estimate.error, estimate.freedom)
+
+
+def difference(values: Floats, baseline: Floats, clusters: Clusters = None) -> Estimate:
+    """Return the mean of ``values - baseline`` with its t interval."""
+    return _mean(values - baseline, clusters)
+
+
+def decrease(values: Floats, baseline: Floats, clusters: Clusters = None) -> Estimate | None:
+    """Return ``1 - r`` for ``r = mean(values) / mean(baseline)``, by the delta method; None if the baseline is 0.
+
+    The standard error of r is ``std(values - r baseline) / (sqrt(n) abs(mean(baseline)))``.
+    """
+    whole = fsum(baseline)
+    if whole == 0.0:
+        return None
+    ratio = fsum(values) / whole
+    estimate = _around(ratio, values - ratio * baseline, baseline, clusters)
+    interval = None if estimate.interval is None else (1.0 - estimate.interval[1], 1.0 - estimate.interval[0])
+    return Estimate(1.0 - ratio, interval, estimate.error, estimate.freedom)
+
+
+def rate(truths: Bools, clusters: Clusters = None) -> Estimate:
+    """Return the share p of worlds that are true, with Wilson's score interval, which lies within [0, 1].
+
+    The interval has the centre ``(p + z^2 / (2 n)) / (1 + z^2 / n)`` and the half-width
+    ``z sqrt(p (1 - p) / n + z^2 / (4 n^2)) / (1 + z^2 / n)``. With clusters, n is the number of
+    independent worlds that would have the same standard error, ``1 + p (1 - p) / error^2``, at most the number of
+    worlds, times ``(z / t)^2``
+    (Korn and Graubard 1998). If all worlds are alike, it is ``1 / sum h_g^2`` times ``(z / t)^2``.
+    """
+    share, n = int(np.count_nonzero(truths)) / len(truths), float(len(truths))
+    error: float | None = sqrt(share * (1.0 - share) / n)
+    freedom: float | None = n - 1.0
+    if clusters is not None:
+        ones = np.ones(len(truths))
+        sums = _by_cluster(np.asarray(truths - share, np.float64), ones, clusters)
+        error, freedom, _ = _spread(*sums, n)
+        if error is None or freedom is None:
+            return Estimate(share, None)
+        alike = 1.0 / fsum((sums[1] / n) ** 2)
+        draws = alike if share in (0.0, 1.0) else min(n, 1.0 + share * (1.0 - share) / max(error, 1e-99) ** 2)
+        n = draws * (Z / float(stdtrit(freedom, UPPER))) ** 2
+    return Estimate(share, wilson(share, n), error, freedom)
+
+
+def wilson(share: float, count: float) -> tuple[float, float]:
+    """Return the ends of Wilson's interval for a share of ``count`` independent draws; both may be no whole numbers."""
+    shrink = 1.0 + Z * Z / count
+    centre = (share + Z * Z / (2.0 * count)) / shrink
+    half = Z / shrink * sqrt(share * (1.0 - share) / count + Z * Z / (4.0 * count * count))
+    return 0.0 if share == 0.0 else max(centre - half, 0.0), 1.0 if share == 1.0 else min(centre + half, 1.0)
+
+
+def unpaired(value: Estimate, baseline: Estimate) -> Estimate:
+    """Return the difference of two means of other worlds with Welch's interval, from their standard errors.
+
+    Its square error is ``s1^2 + s2^2``, with ``s^4 / (s1^4 / f1 + s2^4 / f2)`` degrees of freedom. No interval if one
+    of the standard errors is not known.
+    """
+    apart = value.value - baseline.value
+    if value.error is None or baseline.error is None or not value.freedom or not baseline.freedom:
+        return Estimate(apart, None)
+    one, other = value.error**2, baseline.error**2
+    if one + other == 0.0:
+        return Estimate(apart, (apart, apart), 0.0, min(value.freedom, baseline.freedom))
+    error = sqrt(one + other)
+    one, other = one / (error * error), other / (error * error)
+    freedom = 1.0 / (one * one / value.freedom + other * other / baseline.freedom)
+    half = float(stdtrit(freedom, UPPER)) * error
+    return Estimate(apart, (apart - half, apart + half), error, freedom)
+
+
+def _mean(values: Floats, clusters: Clusters) -> Estimate:
+    average = fsum(values) / len(values)
+    return _around(average, values - average, np.ones(len(values)), clusters)
+
+
+def _around(ratio: float, residuals: Floats, weights: Floats, clusters: Clusters) -> Estimate:
+    """Return a ratio with its interval; ``residuals`` [n] are x - r y, and ``weights`` [n] are y."""
+    n, whole = len(residuals), fsum(weights)
+    if clusters is None:
+        if n < 2:
+            return Estimate(ratio, None)
+        error, freedom, skewness = sqrt(n / (n - 1) * fsum(residuals * residuals)) / abs(whole), n - 1.0, 0.0
+    else:
+        spread = _spread(*_by_cluster(residuals, weights, clusters), whole)
+        if spread[0] is None:
+            return Estimate(ratio, None)
+        error, freedom, skewness = spread
+    t = float(stdtrit(freedom, UPPER))
+    below, above = max(t, _transformed(t, skewness)), max(t, -_transformed(-t, skewness))
+    return Estimate(ratio, (ratio - below * error, ratio + above * error), error, freedom)
+
+
+def _by_cluster(residuals: Floats, weights: Floats, clusters: NDArray[Any]) -> tuple[Floats, Floats]:
+    """Return both sums over each cluster, [G]."""
+    which = np.unique(clusters, return_inverse=True)[1]
+    return np.bincount(which, residuals).astype(np.float64), np.bincount(which, weights).astype(np.float64)
+
+
+def _spread(residuals: Floats, weights: Floats, whole: float) -> tuple[float, float, float] | tuple[None, None, None]:
+    """Return standard error, degrees of freedom and skewness of a ratio from sums [G]; None if one has all weight."""
+    groups, share = len(residuals), weights / whole
+    rest = 1.0 - share
+    if groups < 2 or not (rest > LEAST_REST).all():
+        return None, None, None
+    change = residuals / (whole * rest)
+    squares = fsum(change * change)
+    skewness = fsum(change**3) / squares**1.5 if squares > 0.0 else 0.0
+    return sqrt((groups - 1) / groups * squares), _freedom(share, 1.0 / rest**2), skewness
+
+
+def _freedom(share: Floats, scale: Floats) -> float:
+    """Return Satterthwaite's ``tr(K)^2 / tr(K^2)``, with ``K_gk = scale_g^.5 C_gk scale_k^.5`` and, for the shares h,
+
+    ``C_gk = (g = k) h_g^2 - h_g h_k (h_g + h_k - sum h^2)``: the covariance of the deviations from the common ratio if
+    each recording's own deviation has the variance h_g^2.
+    """
+    whole = fsum(share * share)
+    two, three, four = (fsum(scale * share**power) for power in (2, 3, 4))
+    trace = two - 2.0 * three + whole * two
+    diagonal = fsum(scale * scale * share**4 * (1.0 - 4.0 * share + 2.0 * whole))
+    return trace * trace / (diagonal + 2.0 * (two * four + three * three) + whole * two * (whole * two - 4.0 * three))
+
+
+def _transformed(t: float, skewness: float) -> float:
+    """Return Hall's transformation of a quantile."""
+    if abs(skewness) < 1e-9:
+        return t
+    return 3.0 / skewness * (cbrt(1.0 + skewness * (t - skewness / 6.0)) - 1.0)

@@ -1,0 +1,67 @@
+"""One row of a table of results: what one team did in all worlds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ethbrake_marl.agents.drive import MODEL, STATE
+from ethbrake_marl.errors import unknown_name
+from ethbrake_marl.files.sheet import Estimate
+
+SEES_THROUGH, EXPLOITS = "†", "‡"  # marks of teams
+FAR_M, MOVING = 5.0, 0.05  # mean way of shoving, and share of worlds moving at the horizon, that are exploits
+
+
+@dataclass(frozen=True)
+class SummaryRow:
+    """Results of one team. ``row["total_harm"]`` is an estimate by its key in JSON, None where it is not defined."""
+
+    agent: str
+    knows: str  # what the team has to know
+    estimates: Mapping[str, Estimate | None]
+    collisions: int  # number of worlds with an impact
+    horizon_ends: int  # number of worlds in which a vehicle still moves at the horizon
+    episodes: int  # number of worlds
+    hidden_share: float  # share of worlds in which the V2X channel hides something from a controlled vehicle
+    policies: Mapping[str, str]  # vehicle -> SHA-256 of its policy
+
+    def __getitem__(self, key: str) -> Estimate | None:
+        if key not in self.estimates:
+            raise unknown_name("estimate", key, self.estimates)
+        return self.estimates[key]
+
+    @property
+    def sees_through(self) -> bool:
+        """Whether the team reads values that the V2X channel hides in these worlds."""
+        return self.hidden_share > 0.0 and any(word in self.knows for word in (STATE, MODEL))
+
+    @property
+    def exploits(self) -> dict[str, str]:
+        """Damage that harm does not count -> its size in words: ``shoves`` Vehicle 1, ``moving`` at the horizon."""
+        shoved, moving = self.estimates.get("vehicle_1_shoved_m"), self.horizon_ends / self.episodes
+        words = {}
+        if shoved is not None and shoved.value > FAR_M:
+            words["shoves"] = f"shoves Vehicle 1 by {shoved.value:.1f} m on average"
+        if moving > MOVING:
+            words["moving"] = f"runs past the horizon in {100 * moving:.1f} % of worlds"
+        return words
+
+    @property
+    def marked(self) -> str:
+        """Name of the team, followed by ‡ if it has exploits."""
+        return f"{self.agent} {EXPLOITS}" if self.exploits else self.agent
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain data: each estimate with interval, standard error and degrees of freedom, null if unknown."""
+        plain: dict[str, Any] = {
+            "agent": self.agent, "knows": self.knows, "sees_through_channel": self.sees_through,
+            "hidden_share": self.hidden_share, "episodes": self.episodes, "collisions": self.collisions,
+            "horizon_ends": self.horizon_ends, "exploits": list(self.exploits),
+        }  # fmt: skip
+        for key, each in self.estimates.items():
+            plain |= Estimate.side_by_side({key: each})
+            plain[f"{key}_error"] = None if each is None else each.error
+            plain[f"{key}_freedom"] = None if each is None else each.freedom
+        return plain | {"policy_sha256": dict(self.policies)}

@@ -1,0 +1,329 @@
+"""Evaluations: measures by hand, golden rows, the same bits in any number of processes, refusals."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.agents.drive import Team
+from ethbrake_marl.agents.e_v2x_bm import EV2XBM
+from ethbrake_marl.agents.policy_agent import LearnedAgent
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.terms import TERMS, register_term
+from ethbrake_marl.errors import AlreadyExists, InvalidInput, PhysicsError, UnknownName
+from ethbrake_marl.evaluation import evaluate as evaluating
+from ethbrake_marl.evaluation.evaluate import evaluate
+from ethbrake_marl.evaluation.measures import DEFAULT, Statistic
+from ethbrake_marl.evaluation.named_measures import MEASURES, measures_called, register_measure
+from ethbrake_marl.evaluation.statistics import mean, rate
+from ethbrake_marl.evaluation.summary import summarise
+from ethbrake_marl.motion.layout import GAP
+from ethbrake_marl.policies.bundle import load_shipped
+from ethbrake_marl.shields.algorithm_1 import EpisodeShield
+from ethbrake_marl.shields.step import StepShield
+from ethbrake_marl.worlds.game import game_of
+from tests.evaluation.lines import COAST, FULL_BRAKE, GENTLE, PAIR, Careless, Foreteller, evaluated, recorded, teams
+from tests.refused import refused
+
+# ---- measures
+
+
+def test_measures__of_one_impact_by_hand() -> None:
+    result = evaluated(PAIR, 2, [FULL_BRAKE], ["sampled_harm", "vehicle_1_shoved_m", "injury_lr4s", "own", "maximin"])
+    # 10.6458 m to the impact, 27.9533 m after it; alone 33.3333 m
+    changes = {
+        1: 4.888 - 0.177 * 1.815,
+        2: 4.457 - 0.177 * 1.485,
+    }  # Vehicle 1 is hit at its rear, Vehicle 2 at its front
+    injuries = {body: 1000.0 / (1.0 + math.exp(exponent)) for body, exponent in changes.items()}
+    expected = {
+        "collided": 1.0, "impacts": 1.0, "first_impact_harm": 9.0, "total_harm": 9.0, "total_harm_1": 4.95,
+        "total_harm_2": 4.05, "hardest_impact_mps": 3.0, "sampled_harm": 9.0, "vehicle_1_shoved_m": 5.26575,
+        "vehicle_1_shoved_m_far": 1.0, "injury_lr4s_1": injuries[1], "injury_lr4s_2": injuries[2],
+        "injury_lr4s": sum(injuries.values()), "own_first_1": 4.95, "own_total_2": 4.05, "maximin_total_2": 4.95,
+        "end_s": 3.7,
+    }  # fmt: skip
+    row = {name: float(result["full_brake"][name][1]) for name in expected}
+    assert row == pytest.approx(expected, rel=1e-5)
+    assert result["full_brake"]["ended"].tolist() == ["at_rest", "at_rest"]
+
+
+def test_measures__that_cost_are_not_computed_unless_they_are_named() -> None:
+    columns = evaluated(PAIR, 2)["full_brake"]
+    assert not [name for name in columns if name.startswith(("sampled", "vehicle_1_shoved", "injury"))]
+    assert {each.name for each in DEFAULT if each.name not in columns} == {"predicted_harm", "replaced"}
+
+
+def test_measures__that_are_not_defined_have_no_column() -> None:
+    obstacle = evaluated("paper-random-obstacle", 3, measures=["sampled_harm", "vehicle_1_shoved_m"])["full_brake"]
+    assert "sampled_harm" not in obstacle and "vehicle_1_shoved_m" in obstacle
+    leads = {**PAIR, "roles": {"vehicle_1": "learner"}, "obstacle_gap_m": 60.0}
+    assert "vehicle_1_shoved_m" not in evaluated(leads, 2, measures=["vehicle_1_shoved_m"])["full_brake"]
+
+
+def test_shoving__is_where_vehicle_1_ends_minus_where_it_would() -> None:
+    result = evaluated("paper-random-obstacle", 40, [COAST], ["vehicle_1_shoved_m"])
+    scenario, game = game_of("paper-random-obstacle")
+    alert = scenario.sample(40, 7)
+    last = [state for _, state in evaluating.play(game, alert, teams(COAST)["coast"])][-1]
+    way = alert.obstacle_gap_m - last.obstacle_gap_m
+    speed = alert.speeds_mps[:, 0]
+    assert result["coast"]["vehicle_1_shoved_m"] == pytest.approx(way - speed**2 / 12.0, abs=1e-9)
+
+
+def test_sums_of_terms__are_what_is_rewarded() -> None:
+    result = evaluated("paper-random", 5, measures=["collision", "jerk"])["constant:4.0"]
+    harm = result["total_harm"]
+    assert result["collision"] == pytest.approx(-harm, rel=1e-12) and harm.any()
+    # at 0.5 s Vehicle 2 reaches -4 m/s2 within a step of 0.1 s, Vehicle 3 -6 m/s2 at 0.8 s; Vehicle 1 has braked before
+    assert result["jerk_2"].tolist() == pytest.approx([-1600.0] * 5) and not result["jerk_1"].any()
+
+
+def test_prediction__is_the_field_of_the_agents_memory() -> None:
+    result = evaluated("paper-random", 6, [Foreteller(), FULL_BRAKE])
+    assert result["foreteller"]["predicted_harm"].tolist() == result.worlds["gap_1_m"].tolist()
+    assert "predicted_harm" not in result["full_brake"]
+
+
+def test_measure_of_ones_own__is_a_column_with_its_statistic(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(MEASURES, "loaded", dict(MEASURES.loaded))
+
+    def near(game: Any, alert: State, last: State) -> Any:
+        """Whether the last gap is below 1 m."""
+        return last.gaps_m < 1.0 if game.rules.learners[0] == 1 else last.gaps_m[:, -1] < 1.0
+
+    register_measure("near", near, unit="", shown=[Statistic("near_rate", "rate", "Near")])
+    register_measure("near", near, unit="", shown=[Statistic("near_rate", "rate", "Near")])  # twice the same
+    result = evaluated("paper-random", 20, measures=["near"])
+    table = summarise(result)
+    assert table[0]["near_rate"] == rate(result["full_brake"]["near"]) and "Near" in str(table)
+    assert table.meanings()["Near"] == "Whether the last gap is below 1 m."
+    with refused("measure 'near' is registered already", AlreadyExists):
+        register_measure("near", near, unit="m")
+
+
+def doc(function: Any) -> Any:
+    function.__doc__ = "A measure."
+    return function
+
+
+REFUSED_MEASURES: dict[str, tuple[str, Any]] = {
+    "must be 1 to 64 characters": ("x_1", doc(lambda g, a, last: last.time_s)),
+    "nor in _interval, _low": ("x_interval", doc(lambda g, a, last: last.time_s)),
+    "with a docstring that describes it": ("x", lambda g, a, last: last.time_s),
+    "this name is already in use": ("total_harm", doc(lambda g, a, last: last.time_s)),
+    "its function fails: ZeroDivisionError": ("x", doc(lambda g, a, last: 1 / 0)),
+    "float64 of shape (2, 3); must return": ("x", doc(lambda g, a, last: np.zeros((2, 3)))),
+    "must return numbers, truth values or texts of shape (2,)": ("x", doc(lambda g, a, last: 1.0)),
+    "its value is nan in row 1; must be finite": ("x", doc(lambda g, a, last: np.array([1.0, np.nan]))),
+    "its value is inf in row 0; must be finite": ("x", doc(lambda g, a, last: np.array([np.inf, 1.0]))),
+}
+
+
+@pytest.mark.parametrize("message", REFUSED_MEASURES)
+def test_measure__that_cannot_be_used(message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(MEASURES, "loaded", dict(MEASURES.loaded))
+    name, function = REFUSED_MEASURES[message]
+    with refused(message, (InvalidInput, AlreadyExists)):  # type: ignore[arg-type]
+        register_measure(name, function)
+        evaluated(PAIR, 2, measures=[name])
+
+
+def test_term_of_ones_own__is_summed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(TERMS, "loaded", dict(TERMS.loaded))
+    register_term("moving", doc(lambda before, step, after: (after.speeds_mps > 0.0) * step.time_step_s), unit="s")
+    result = evaluated(PAIR, 2, [FULL_BRAKE], ["moving"])["full_brake"]
+    assert 3.0 < result["moving_1"][0] <= 3.8
+    with refused("already in use", AlreadyExists):
+        register_measure("moving", doc(lambda game, alert, last: last.time_s))
+
+
+def test_names_of_measures() -> None:
+    assert [each.name for each in measures_called(["injury", "injury_gidas", "total_harm"])] == [
+        "injury_lr4s", "injury_reference", "injury_gidas", "total_harm",
+    ]  # fmt: skip
+    with refused("unknown measure 'sampled_ham'; did you mean 'sampled_harm'?", UnknownName):
+        measures_called(["sampled_ham"])
+    with refused("social needs an angle from 0 to 90"):
+        evaluated(PAIR, 2, measures=["social:99"])
+
+
+FILE = """
+from ethbrake_marl import Part
+
+
+def gap(game, alert, last):
+    '''Last gap ahead of Vehicle 2, m.'''
+    return last.gaps_m[:, 0]
+
+
+class Pushes:
+    def __init__(self, game, alert):
+        self.steps = 0 * alert.steps
+
+    def see(self, before, step, after):
+        if step is not None:
+            self.steps += (after.gaps_m[:, 0] == 0.0) & ~before.ended
+
+    def result(self, last):
+        return self.steps
+
+
+def pushes(game, alert):
+    '''Steps that end in contact.'''
+    return Pushes(game, alert)
+
+
+steps = Part(watch=pushes, unit="steps")
+number = 3
+"""
+
+
+def test_measures_of_a_python_file__run_in_every_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(MEASURES, "loaded", dict(MEASURES.loaded))
+    monkeypatch.setattr(evaluating, "CHUNK", 5)
+    file = tmp_path / "mine.py"
+    file.write_text(FILE)
+    one, two = (evaluated("paper-random", 10, measures=f"{file}:gap,{file}:steps", jobs=jobs) for jobs in (1, 2))
+    for name in ("gap", "steps"):
+        assert one["full_brake"][name].tolist() == two["full_brake"][name].tolist()
+    assert {each.name: each.unit for each in one.measures[-2:]} == {"gap": "1", "steps": "steps"}
+    assert "mine.py" in one.about["versions"]
+    with refused("does not define 'gap_m'"):
+        measures_called(f"{file}:gap_m")
+    with refused("measure 'number': give one function"):
+        measures_called([f"{file}:number"])
+
+
+# ---- evaluations
+
+
+def test_our_agents__are_sent_to_processes_and_report_what_they_predict(monkeypatch: pytest.MonkeyPatch) -> None:
+    scenario, game = game_of("paper-random")
+    ppo = {2: LearnedAgent(load_shipped("ppo"), "ppo")}
+    agents = {
+        "e_v2x_bm": Team("e", {2: EV2XBM(game.rules)}), "ppo": Team("p", ppo),
+        "ppo+step": Team("s", ppo, StepShield(ppo)), "ppo+episode": Team("a", ppo, EpisodeShield(ppo)),
+    }  # fmt: skip
+    monkeypatch.setattr(evaluating, "CHUNK", 40)
+    one, two = (evaluate(scenario.draw(80, 7), agents, game, jobs=jobs) for jobs in (1, 2))
+    for name, columns in one.columns.items():
+        assert all((two[name][key] == column).all() for key, column in columns.items())
+    assert one["e_v2x_bm"]["predicted_harm"].tolist() == one["e_v2x_bm"]["first_impact_harm"].tolist()
+    assert one["ppo+step"]["replaced_none"].tolist() == (one["ppo+step"]["replaced_actions"] == 0).tolist()
+    least = np.minimum(one["ppo"]["first_impact_harm"], one["e_v2x_bm"]["first_impact_harm"])
+    assert one["ppo+episode"]["first_impact_harm"].tolist() == least.tolist()
+    assert summarise(one)[3]["policy_share"] == rate(one["ppo+episode"]["replaced_none"])
+    assert one.knows["ppo+step"] == "messages + true model" and one.policies["ppo+step"] == one.policies["ppo"] != {}
+
+
+def test_golden_rows() -> None:
+    harm = mean(evaluated("paper-random", 10_000, [FULL_BRAKE])["full_brake"]["first_impact_harm"])
+    assert harm.in_words() == "24.19 [23.85, 24.53]"
+    for name, first, total in (("paper-random", "23.64", "24.86"), ("paper-random-obstacle", "33.31", "50.00")):
+        row = summarise(evaluated(name, 2_000, [FULL_BRAKE]))[0]
+        shown = [row[key].value for key in ("first_impact_harm", "total_harm", "collision_rate")]  # type: ignore[union-attr]
+        assert [f"{shown[0]:.2f}", f"{shown[1]:.2f}", f"{shown[2]:.1%}"] == [first, total, "85.5%"]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_result__is_the_same_in_chunks_of_any_size_and_in_processes(jobs: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    measures, done = ["sampled_harm", "vehicle_1_shoved_m", "risk"], list[int]()
+    whole = evaluated("paper-random", 50, measures=measures)
+    monkeypatch.setattr(evaluating, "CHUNK", 17)
+    parts = evaluated("paper-random", 50, measures=measures, jobs=jobs, on_done=done.append)
+    assert done == [17, 34, 50] and parts.about == whole.about
+    for agent, columns in whole.columns.items():
+        for name, column in columns.items():
+            assert parts[agent][name].dtype == column.dtype and (parts[agent][name] == column).all(), name
+
+
+def test_result__says_who_knows_what_and_what_was_evaluated() -> None:
+    scenario, game = game_of("cooperation-2-blocked")
+    agents = {**teams(FULL_BRAKE, Careless()), "both": Team("both", {2: FULL_BRAKE._replace(knows="true model")})}
+    result = evaluate(scenario.draw(12, 7), agents, game)
+    assert result.knows == {"full_brake": "own sensors", "careless": "not stated", "both": "true model"}
+    share = float(result.worlds["hidden"].mean())
+    table = summarise(result)
+    assert 0.0 < share < 1.0 and [row.sees_through for row in table] == [False, False, True]
+    text = " ".join(str(table).split())
+    assert f"In {100 * share:.1f} % of these worlds the V2X channel hides something" in text
+    assert "† both: reads hidden values nevertheless" in text and "do not state what they know: careless." in text
+    assert not evaluated("paper-random", 12).worlds["hidden"].any()
+
+
+def test_identity__changes_with_worlds_and_scenario_alone() -> None:
+    one, again, other = (
+        evaluated("paper-random", n, [agent]).about for n, agent in ((5, FULL_BRAKE), (5, GENTLE), (6, GENTLE))
+    )
+    assert one == again and one["worlds_sha256"] != other["worlds_sha256"]
+    assert one["scenario_sha256"] == other["scenario_sha256"] and len(one["physics_digest"]) == 16
+    assert {"python", "ethbrake-marl", "numba", "numpy"} <= one["versions"].keys()
+    slow = game_of("paper-random")[0].replace(horizon_s=5.0)
+    assert evaluated(slow.declared(), 5).about["scenario_sha256"] != one["scenario_sha256"]
+
+
+def test_take_and_table__have_one_row_per_team_and_world() -> None:
+    result = evaluated("paper-random", 30, [Foreteller(), FULL_BRAKE])
+    table = result.arrays()
+    assert {len(column) for column in table.values()} == {60}
+    assert table["world"].tolist() == [*range(30)] * 2 and np.isnan(table["predicted_harm"][30:]).all()
+    assert table["total_harm"][30:].tolist() == result["full_brake"]["total_harm"].tolist()
+    some = result.take(result.worlds["gap_1_m"] > 7.5)
+    assert some.n == int((result.worlds["gap_1_m"] > 7.5).sum()) and (some.worlds["gap_1_m"] > 7.5).all()
+    frame = pytest.importorskip("pandas") and result.to_pandas()
+    assert frame.groupby("agent").total_harm.mean()["full_brake"] == pytest.approx(table["total_harm"][30:].mean())
+    with refused("unknown agent in this result 'fullbrake'; did you mean 'full_brake'?", UnknownName):
+        result["fullbrake"]
+
+
+def test_clusters__are_recordings() -> None:
+    result = evaluated(recorded(8), 60)
+    assert result.clusters is not None and len(set(result.clusters)) == 8
+    assert evaluated("paper-random", 3).clusters is None
+
+
+class Wild(Careless):
+    name = "wild"
+
+    def act(self, state: State, memory: Any, body: int) -> Any:
+        return np.full(state.n, np.nan), memory
+
+
+def refusals() -> dict[str, Any]:
+    scenario, game = game_of("paper-random")
+    drawn, mine = scenario.draw(3, 7), teams(FULL_BRAKE)
+    begun = game.begin(drawn.worlds)
+    pair = game_of(game_of("cooperation-2-five")[0])[0].draw(2, 7)
+    local, wrong = Careless(), Team("x", {1: FULL_BRAKE})
+    local.act = lambda state, memory, body: (np.zeros(state.n), memory)  # type: ignore[method-assign]
+    return {
+        "agents = {}: must be a mapping from names to teams": lambda: evaluate(drawn, {}, game),
+        "must be a mapping from names to teams, for instance": lambda: evaluate(drawn, {"a": FULL_BRAKE}, game),  # type: ignore[dict-item]
+        "agents = 'full_brake'": lambda: evaluate(drawn, "full_brake", game),  # type: ignore[arg-type]
+        "3 worlds of 3 vehicles; must be one or more worlds of 3 vehicles at": lambda: evaluate(begun, mine, game),
+        "worlds: 0 worlds": lambda: evaluate(drawn.worlds.take(slice(0)), mine, game),
+        "2 worlds of 5 vehicles; must be": lambda: evaluate(pair, mine, game),
+        "team 'x': drives vehicle_1; must drive exactly vehicle_2": lambda: evaluate(drawn, {"a": wrong}, game),
+        "agent 'wild', world 0, vehicle_2 at 0.50 s: command nan m/s2": lambda: evaluate(drawn, teams(Wild()), game),
+        "'careless' cannot be sent to another process": lambda: evaluate(drawn, teams(local), game, jobs=2),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("message", refusals())
+def test_evaluation__that_is_refused(message: str) -> None:
+    with refused(message):
+        refusals()[message]()
+
+
+def test_failed_physics__raises_with_the_number_of_the_world() -> None:
+    scenario, game = game_of("paper-random")
+    worlds = scenario.sample(4, 7, first=100)
+    line = worlds.line.copy()
+    line[2, GAP, 1] = np.nan
+    with refused("world 102: a check of the physics failed", PhysicsError):
+        evaluate(worlds._replace(line=line), teams(FULL_BRAKE), game)

@@ -1,0 +1,237 @@
+"""The table of results: its estimates, its looks in terminals, documents and notebooks, and the texts below it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.errors import InvalidInput, UnknownName
+from ethbrake_marl.evaluation import statistics
+from ethbrake_marl.evaluation.evaluate import Result
+from ethbrake_marl.evaluation.summary import SummaryTable, summarise, summarise_by, summarise_lists
+from ethbrake_marl.files.sheet import terminal_text
+from tests.evaluation.lines import COAST, FULL_BRAKE, GENTLE, PAIR, Careless, Foreteller, evaluated, recorded
+from tests.refused import refused
+
+EXPENSIVE = ["sampled_harm", "vehicle_1_shoved_m"]
+
+
+@pytest.fixture(scope="module")
+def result() -> Result:
+    return evaluated("paper-random", 100, [FULL_BRAKE, GENTLE, Foreteller()], EXPENSIVE)
+
+
+def at(width: int, table: SummaryTable, monkeypatch: pytest.MonkeyPatch) -> str:
+    monkeypatch.setenv("COLUMNS", str(width))
+    text = str(table)
+    assert all(len(line) <= width for line in text.splitlines()), text
+    return text
+
+
+def test_estimates__are_those_of_the_columns(result: Result) -> None:
+    full, gentle, foretold = summarise(result)
+    mine, other = result["constant:4.0"], result["full_brake"]
+    expected = {
+        "collision_rate": statistics.rate(mine["collided"]),
+        "total_harm": statistics.mean(mine["total_harm"]),
+        "total_harm_3": statistics.mean(mine["total_harm_3"]),
+        "sampled_harm": statistics.mean(mine["sampled_harm"]),
+        "vehicle_1_shoved_far_rate": statistics.rate(mine["vehicle_1_shoved_m"] > 5.0),
+        "first_impact_harm_difference": statistics.difference(mine["first_impact_harm"], other["first_impact_harm"]),
+        "harm_decrease_total": statistics.decrease(mine["total_harm"], other["total_harm"]),
+        "predicted_harm": None,
+    }
+    assert {key: gentle[key] for key in expected} == expected
+    assert foretold["predicted_harm"] == statistics.mean(result.worlds["gap_1_m"])
+    assert (gentle.collisions, gentle.episodes) == (int(mine["collided"].sum()), 100)
+    assert full["harm_decrease_first"] == statistics.Estimate(0.0, (0.0, 0.0))
+    with refused("unknown estimate 'total_harms'; did you mean 'total_harm'?", UnknownName):
+        full["total_harms"]
+
+
+def test_baseline__can_be_another_or_missing(result: Result) -> None:
+    gentle = summarise(result, baseline="constant:4.0")
+    assert [row["total_harm_difference"] == statistics.Estimate(0.0, (0.0, 0.0)) for row in gentle] == [
+        False,
+        True,
+        False,
+    ]
+    nobody = summarise(result, baseline="nobody")
+    assert {row["harm_decrease_first"] for row in nobody} == {None} and "–" in str(nobody)
+    one = summarise(evaluated(PAIR, 1, [COAST]))[0]
+    assert one["total_harm"].interval is None and one["collision_rate"].interval is not None  # type: ignore[union-attr]
+
+
+def test_json__has_estimates_with_interval_and_error_and_the_identity(result: Result) -> None:
+    rows = summarise(result).to_json()
+    assert json.loads(json.dumps(rows, allow_nan=False)) == rows
+    row, harm = rows[1], summarise(result)[1]["total_harm"]
+    assert harm is not None and harm.interval is not None
+    assert [row[f"total_harm{end}"] for end in ("", "_interval", "_error", "_freedom")] == [
+        harm.value, list(harm.interval), harm.error, 99.0,
+    ]  # fmt: skip
+    assert row["kind"] == "evaluate" and row["agent"] == "constant:4.0" and row["knows"] == "own sensors"
+    assert row["predicted_harm"] is None and row["predicted_harm_error"] is None
+    assert {"worlds_sha256", "scenario_sha256", "physics_digest", "versions"} <= row.keys()
+    parameters = row["parameters"]
+    assert (parameters["scenario"], parameters["seed"], parameters["count"]) == ("paper-random", 7, 100)
+    assert parameters["restitution"] == 0.1 and parameters["mass_t"] == [4.5, 5.5, 5.9]
+    assert 5.0 <= parameters["gaps_m"][0][0] < parameters["gaps_m"][0][1] <= 10.0
+
+
+def test_terminal_of_80__shows_both_harms_with_intervals_and_what_was_asked_for(
+    result: Result, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = at(80, summarise(result), monkeypatch)
+    head = " ".join(text.splitlines()[0].split())
+    assert head == "Agent, First-impact Total Sampled Shoved Shoved"
+    assert "constant:4.0 ‡" in text and "own sensors" in text and "95 % interval" in text
+    narrow = at(48, summarise(result), monkeypatch)
+    assert "Total" in narrow and "First-impact" in narrow and "Sampled" not in narrow
+    assert "Decrease" in at(120, summarise(result), monkeypatch)
+
+
+@pytest.mark.parametrize("length", [20, 40, 60, 200])
+def test_names__are_never_broken(length: int, result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
+    name = ("policy@runs/" + "deep/" * 40)[:length]
+    columns = {name: result["full_brake"], "constant:4.0": result["constant:4.0"]}
+    renamed = replace(
+        result, columns=columns, knows=dict.fromkeys(columns, "messages"), policies={key: {} for key in columns}
+    )
+    monkeypatch.setenv("COLUMNS", "80")
+    text = str(summarise(renamed, baseline=name))
+    assert any(name[:76] in line for line in text.splitlines()), text
+    assert "constant:4.0" in text and "harm" in text
+
+
+@pytest.mark.parametrize("where", ["script", "terminal", "notebook", "redirected"])
+def test_text__is_plain_wherever_it_is_made(where: str, result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
+    table, usual = summarise(result), str(summarise(result))
+    if where == "terminal":
+        monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
+        monkeypatch.setenv("FORCE_COLOR", "1")
+        monkeypatch.setenv("TERM", "xterm-256color")
+    if where == "notebook":
+        shell = type("ZMQInteractiveShell", (), {})()
+        monkeypatch.setattr("builtins.get_ipython", lambda: shell, raising=False)
+        type(shell).__module__ = "ipykernel.zmqshell"
+        monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    if where == "redirected":
+        monkeypatch.setattr(sys, "stdout", None)
+    assert str(table) == usual and "\x1b" not in usual and len(usual) > 500
+
+
+def test_documents(result: Result) -> None:
+    table = summarise(result)
+    harm = table[1]["total_harm"].in_words()  # type: ignore[union-attr]
+    markdown, latex, html = table.to_markdown(), table.to_latex(), table._repr_html_()
+    assert markdown.splitlines()[0].startswith("| Agent | Knows | Collisions | First-impact harm | Total harm |")
+    assert f" {harm} " in markdown and "Worlds: paper-random: 100 worlds, seed 7" in markdown
+    assert latex.startswith(r"\begin{tabular}{llrrr") and r"full\_brake & own sensors & " in latex
+    assert harm.replace("[", "{[}").replace("]", "{]}") in latex and latex.count(r"\\") == 4
+    assert "<caption>paper-random: 100 worlds, seed 7</caption>" in html and "Sampled" not in html
+    assert "Decrease" in table.meanings() and "eq. Jharm" in table.meanings()["Sampled harm"]
+
+
+def test_data_frame(result: Result) -> None:
+    pytest.importorskip("pandas")
+    frame, row = summarise(result).to_pandas(), summarise(result)[1]
+    assert frame.loc["constant:4.0", "total_harm"] == row["total_harm"].value  # type: ignore[union-attr]
+    assert frame.loc["constant:4.0", "total_harm_high"] == row["total_harm"].interval[1]  # type: ignore[union-attr, index]
+    assert np.isnan(frame.loc["constant:4.0", "predicted_harm"])
+
+
+def test_measures_without_a_heading__have_a_table_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    table = summarise(evaluated("paper-random", 20, measures=["jerk", "own"]))
+    text = at(80, table, monkeypatch)
+    assert "jerk, vehicle 2 (1)" in text and "own_total, vehicle 3 (m2/s2)" in text
+    assert summarise(evaluated("paper-random", 20)).measures() is None
+
+
+# ---- below the table
+
+
+def pushing(shoved_m: float, moving: int) -> SummaryTable:
+    """Full braking, and the same as if it shoved Vehicle 1 so far, and were not at rest in so many of 20 worlds."""
+    result = evaluated("paper-random", 20, [FULL_BRAKE], EXPENSIVE)
+    ends = np.where(np.arange(20) < moving, "horizon", "at_rest")
+    mine = {**result["full_brake"], "vehicle_1_shoved_m": np.linspace(0.0, 2.0 * shoved_m, 20), "ended": ends}
+    columns = {"full_brake": result["full_brake"], "mine": mine}
+    both: dict[str, Any] = {"knows": dict.fromkeys(columns, ""), "policies": {key: {} for key in columns}}
+    return summarise(replace(result, columns=columns, **both))
+
+
+@pytest.mark.parametrize(
+    ("shoved_m", "moving", "names"),
+    [(4.9, 1, []), (5.1, 1, ["shoves"]), (4.9, 2, ["moving"]), (25.0, 12, ["shoves", "moving"])],
+)
+def test_exploits__mark_the_row_and_are_a_sentence_below(shoved_m: float, moving: int, names: list[str]) -> None:
+    table = pushing(shoved_m, moving)
+    assert [row["exploits"] for row in table.to_json()] == [[], names]
+    text = " ".join(str(table).split())
+    assert ("mine ‡" in text) == bool(names) and "full_brake ‡" not in text
+    assert (f"shoves Vehicle 1 by {shoved_m:.1f} m on average" in text) == ("shoves" in names)
+    assert (f"runs past the horizon in {5 * moving:.1f} % of worlds" in text) == ("moving" in names)
+    assert f"still moved at the horizon (8 s): mine {moving}. Harm after" in text
+
+
+def test_notes__of_no_impact_rejected_draws_and_recordings() -> None:
+    far = {**PAIR, "gaps_m": 1000.0}
+    text = " ".join(str(summarise(evaluated(far, 50, [FULL_BRAKE]))).split())
+    assert "No impact in 50 worlds: full_brake. With 95 % confidence, at most 7.1 % of all such worlds" in text
+    rejecting = {**recorded(8).declared(), "early_impacts": "reject", "latency_s": [0.0, {"uniform": [0.3, 1.5]}, 1.6]}
+    table = summarise(evaluated(rejecting, 60))
+    text = " ".join(str(table).split())
+    assert table.parameters["rejected_draws"] > 0 and "drawn worlds (" in text
+    assert "60 worlds, seed 7; 95 % intervals by 8 recordings; d = " in text
+    single = summarise(evaluated(recorded(1), 20))
+    assert "no 95 % intervals: all worlds come from one recording" in " ".join(str(single).split())
+    assert single[0]["total_harm"].interval is None  # type: ignore[union-attr]
+
+
+def test_intervals__are_by_recording() -> None:
+    result = evaluated(recorded(8), 200)
+    harm, recordings = result["constant:4.0"]["total_harm"], result.clusters
+    row = summarise(result)[1]
+    assert row["total_harm"] == statistics.mean(harm, recordings)
+    assert row["total_harm"].interval[1] > 1.05 * statistics.mean(harm).interval[1]  # type: ignore[union-attr, index]
+
+
+def test_knowledge__of_an_agent_that_says_nothing() -> None:
+    assert summarise(evaluated(PAIR, 2, [Careless()]))[0].knows == "not stated"
+
+
+# ---- groups and lists
+
+
+def test_groups__have_the_estimates_of_their_worlds() -> None:
+    result = evaluated("mixture-delays", 30)
+    tables = summarise_by(result, "scenario")
+    assert {name: table[0].episodes for name, table in tables.items()} == {
+        "paper-delay-high": 11, "paper-delay-low": 8, "paper-delay-middle": 11,
+    }  # fmt: skip
+    mine = result.worlds["scenario"] == "paper-delay-low"
+    harm = result["constant:4.0"]["total_harm"][mine]
+    assert tables["paper-delay-low"][1]["total_harm"] == statistics.mean(harm)
+    assert "mixture-delays: 8 worlds, seed 7; d =" in " ".join(str(tables["paper-delay-low"]).split())
+    with refused("unknown group 'scenarios'; did you mean 'scenario'?", UnknownName):
+        summarise_by(result, "scenarios")
+    with refused("by = 'scenario': these worlds have no groups", InvalidInput):
+        summarise_by(evaluated(PAIR, 2), "scenario")
+
+
+def test_lists__stand_below_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    far = {**PAIR, "name": "far", "gaps_m": 1000.0}
+    results = {str(each["name"]): evaluated(each, 3, [FULL_BRAKE]) for each in (PAIR, far)}
+    monkeypatch.setenv("COLUMNS", "80")
+    text = terminal_text(summarise_lists({name: summarise(each) for name, each in results.items()}, results))
+    rows = [line.split() for line in text.splitlines() if line.startswith(("pair", "far", "full"))]
+    assert rows == [
+        ["pair"], ["full_brake", "failed", "100.0", "%", "10.8", "9.00", "9.00"],
+        ["far"], ["full_brake", "passed", "0.0", "%", "0.0", "0.00", "0.00"],
+    ]  # fmt: skip
