@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -42,9 +43,11 @@ class Progress:
     def listener(told: Told) -> OnProgress | None:
         """Return the function to call with each ``Progress``, or None if progress is not reported.
 
-        ``told`` is this function, ``"show"`` to print progress on stderr, or None.
+        ``told`` is this function, ``"show"`` to print progress on stderr, or None. Without stderr nothing is printed.
         """
-        return ShownProgress() if told == "show" else told
+        if told == "show":
+            return None if sys.stderr is None else ShownProgress()
+        return told
 
 
 OnProgress = Callable[[Progress], None]
@@ -61,7 +64,9 @@ class ShownProgress:
     """
 
     def __init__(self) -> None:
-        self._terminal = sys.stderr.isatty()
+        self._terminal = False
+        with suppress(AttributeError, ValueError):  # no terminal either: a stream that is closed or has no ``isatty``
+            self._terminal = sys.stderr.isatty()
         self._last: tuple[str, int] | None = None  # harm and tenth of the last line
 
     def __call__(self, progress: Progress) -> None:
@@ -74,5 +79,6 @@ class ShownProgress:
         text = f"{progress.name}: {progress.done:,} of {progress.total:,}"
         text += f", {harm}" if harm else ""
         text += f"; {progress.note}" if progress.note else ""
-        sys.stderr.write(f"\r{text}\x1b[K{chr(10) if ended else ''}" if self._terminal else f"{text}\n")
-        sys.stderr.flush()
+        line = f"\r{text}\x1b[K{chr(10) if ended else ''}" if self._terminal else f"{text}\n"
+        with suppress(AttributeError, OSError, ValueError):  # nobody listens to a stream that is closed or cannot flush
+            print(line, end="", file=sys.stderr, flush=True)  # noqa: T201

@@ -1,1 +1,1 @@
-"""Train policies with PPO and SAC of Stable-Baselines3: recipes, runs, exact resume."""
+"""Train policies, and go on with a training. torch and Stable-Baselines3 are imported where a training begins."""

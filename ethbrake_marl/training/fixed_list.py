@@ -1,0 +1,84 @@
+"""Measurements during training: the current policies drive a fixed list of worlds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from ethbrake_marl.agents.drive import Team, play
+from ethbrake_marl.agents.policy_agent import LearnedAgent
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, objectives_of
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.motion.layout import Bools, Floats
+from ethbrake_marl.names import open_game
+from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.training.training import Training
+
+Policies = Mapping[str, Policy]  # learner -> policy, front to rear; learners may share one
+Evaluate = Callable[[Policies], Mapping[str, float]]  # returns metrics of policies, by name
+Measure = Callable[[Training], Evaluate]
+
+OBJECTIVE = "objective"  # mean of what the learners minimise, where that is not the harm of the line
+HARM = {"first": "first_impact_harm", "total": "total_harm"}
+AT_ONCE = 2_500  # worlds that are simulated together, to limit memory
+
+
+def measure_on_list(training: Training) -> Evaluate:
+    """Return the function that measures policies on the fixed list of worlds of the recipe's key ``evaluation``.
+
+    Metrics are means over the worlds: ``first_impact_harm``, ``total_harm``, ``collision_rate``, ``horizon_rate`` (a
+    vehicle still moves at the horizon) and, where a learner's objective is not the harm of the line, the ``objective``
+    of each learner (``objective_vehicle_2``) and the mean of these.
+    """
+    plan, (scenario, game) = training.recipe.evaluation, open_game(training.scenario)
+    worlds = scenario.sample(plan.worlds, plan.seed)
+    parts = [worlds.take(slice(first, first + AT_ONCE)) for first in range(0, plan.worlds, AT_ONCE)]
+
+    def measure(policies: Policies) -> dict[str, float]:
+        drivers = {1 + scenario.vehicle_names.index(name): LearnedAgent(each) for name, each in policies.items()}
+        team = Team("policy", drivers)
+        ends, at_rest = zip(*(drive_to_the_end(game, part, team) for part in parts), strict=True)
+        return metrics_of(training, State.join(ends), np.concatenate(at_rest))
+
+    return measure
+
+
+def drive_to_the_end(game: Game, alert: State, team: Team) -> tuple[State, Bools]:
+    """Return the last state of these worlds, and whether each line came to rest before the horizon, [n]."""
+    at_rest = np.zeros(alert.n, np.bool_)
+    for step, state in play(game, alert, team, donate=True):
+        if step is not None:
+            at_rest |= step.terminated
+        last = state
+    return last, at_rest
+
+
+def metrics_of(training: Training, last: State, at_rest: Bools) -> dict[str, float]:
+    """Return the metrics of episodes whose last state is ``last``."""
+    metrics = {
+        "first_impact_harm": mean(last.harm("first")),
+        "total_harm": mean(last.harm("total")),
+        "collision_rate": float(last.collided.mean()),
+        "horizon_rate": float((~at_rest).mean()),
+    }
+    reward, scenario = training.recipe.reward, training.scenario
+    objectives = objectives_of(reward.objective or scenario.objective, scenario.vehicles)
+    if reward.harm > 0.0 and any(each.kind is not OBJECTIVES["total"] for each in objectives):
+        harm = amounts(objectives, None, last, reward.harm_count)
+        each = {scenario.vehicle_names[body - 1]: mean(harm[:, body - 1]) for body in scenario.learners}
+        metrics[OBJECTIVE] = sum(each.values()) / len(each)
+        metrics |= {f"{OBJECTIVE}_{name}": value for name, value in each.items()}
+    return metrics
+
+
+def mean(values: Floats) -> float:
+    """Return the mean of an array, exactly rounded."""
+    return math.fsum(values) / len(values)
+
+
+def deciding(metrics: Mapping[str, float], harm_count: str) -> float:
+    """Return the metric that is smallest for the best policies; NaN if it was not measured."""
+    return metrics.get(OBJECTIVE, metrics.get(HARM[harm_count], np.nan))

@@ -1,0 +1,374 @@
+"""``TrainingRecipe``: the settings of a training, read from a YAML file. PPO's and SAC's stand here too."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from operator import not_
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import Annotated, Any, ClassVar, Literal, Self, get_args
+
+from pydantic import Field, field_validator, model_validator
+
+from ethbrake_marl.episode.features import listed_features
+from ethbrake_marl.episode.reward import RewardParams, own_terms
+from ethbrake_marl.errors import InvalidInput, new_name, unknown_name
+from ethbrake_marl.files.model import NAME_PATTERN, FileModel, Wording, read_model, refuse
+from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
+from ethbrake_marl.policies.network import Activation, NetworkSpec
+from ethbrake_marl.registry import Registry
+from ethbrake_marl.worlds.catalogue import shipped_folder
+from ethbrake_marl.worlds.scenario import plain
+
+Scheme = Literal["single", "shared", "independent", "centralised"]
+Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Rate = Annotated[float, Field(gt=0.0, le=1.0)]
+Layers = Annotated[tuple[Annotated[int, Field(ge=1, le=4096)], ...], Field(strict=False, min_length=1, max_length=8)]
+
+MOST_DECISIONS = 2**24  # of one update that fit into memory
+ACTOR_LAYERS = "hidden layers of the actor"
+NETWORK = "hidden layers of actor and critic, and their activation"
+BATCH_SIZE = "number of decisions in one step of the optimiser"
+
+
+class LearningRate(FileModel):
+    """Learning rate of the optimiser, which falls from ``start`` to ``end`` over the training."""
+
+    start: Rate  # learning rate at the beginning
+    end: Rate  # learning rate at the end
+    schedule: Literal["cosine"] = Field(
+        "cosine", description="learning rate after a fraction p of all steps: end + (start - end) (1 + cos(pi p)) / 2"
+    )
+
+    def at(self, remaining: float) -> float:
+        """Return the learning rate ``end + (start - end) (1 + cos(pi p)) / 2`` with ``p = 1 - remaining``.
+
+        ``remaining`` is the fraction (1 to 0) of the training's steps that is not yet done.
+        """
+        done = min(max(1.0 - remaining, 0.0), 1.0)
+        return self.end + (self.start - self.end) * 0.5 * (1.0 + math.cos(math.pi * done))
+
+
+class NetworkShape(FileModel):
+    """Hidden layers of actor and critics."""
+
+    policy: Layers = Field(description=ACTOR_LAYERS)
+    value: Layers = Field(description="hidden layers of each critic")
+    activation: Activation = "relu"
+
+
+class NoisyShape(NetworkShape):
+    """Hidden layers of PPO's actor and critic, and the initial exploration noise."""
+
+    initial_log_std: Annotated[float, Field(ge=-10.0, le=2.0)] = Field(
+        0.0, description="logarithm of the standard deviation of the exploration noise at the start"
+    )
+
+
+class EvaluationPlan(FileModel):
+    """Measurements of the policy during training, on a fixed list of worlds."""
+
+    every_updates: Annotated[int, Field(ge=1)]  # number of updates between two measurements
+    worlds: Annotated[int, Field(ge=1, le=1_000_000)]  # number of worlds in the fixed list
+    seed: Annotated[int, Field(ge=0)]  # seed from which the worlds are drawn
+
+
+class TrainingRecipe(FileModel):
+    """Settings that all algorithms have; each algorithm has a subclass with more.
+
+    An *update* is one round of collecting decisions and learning from them. The text in ``Field(description=...)``
+    explains a key in new recipe files, in the JSON Schema and in the documentation.
+
+    >>> import ethbrake_marl as eb
+    >>> recipe = eb.load_recipe("ppo").replace(seed=3, total_steps=100_000)
+    >>> recipe.algorithm, recipe.seed, recipe.total_steps
+    ('ppo', 3, 100000)
+
+    """
+
+    schemes: ClassVar[tuple[Scheme, ...]] = ("single", "shared")  # schemes that the algorithm supports
+
+    name: str = Field(pattern=NAME_PATTERN, description="equal to the file's name without .yaml")
+    title: str = Field("", description="title in one line")
+    description: str = Field("", description="what the recipe is for")
+    source: str = Field("", description="where the values come from")
+    algorithm: str = Field(
+        description="name of the learning algorithm: ppo, sac, or another registered one (ethbrake scenario parts)"
+    )
+    scheme: Scheme | None = Field(  # None: single for one learner, shared for several
+        None, description="how several learners train together: single, shared, independent, centralised"
+    )
+    total_steps: int = Field(ge=1, description="number of decisions of all learners together")
+    n_envs: int = Field(ge=1, description="number of worlds that are simulated together")
+    learning_rate: LearningRate = Field(description="learning rate of the optimiser, which falls from start to end")
+    gamma: Fraction = Field(description="discount factor per time step; must be equal to reward.shaping_discount")
+    reward: RewardParams = Field(description="weights and constants of the reward's terms (episode/terms.py)")
+    observation: Annotated[tuple[str, ...] | None, Field(strict=False, exclude_if=not_)] = Field(
+        None,
+        description="groups and features that learners observe, such as [own, front_1, rear_1]; if missing, the"
+        " observation of the scenario is used",
+    )
+    horizon_is_end: bool = Field(
+        True, description="whether the return ends at the horizon, instead of continuing with the critic's estimate"
+    )
+    seed: int = Field(0, ge=0, lt=2**32, description="seed of worlds, networks and exploration")
+    evaluation: EvaluationPlan = Field(
+        description="measurements of the policy during training: how often, and on which fixed list of worlds"
+    )
+    checkpoint_every_updates: int = Field(ge=1, description="number of updates between two checkpoints")
+
+    @field_validator("reward")
+    @classmethod
+    def _something_to_learn(cls, value: RewardParams) -> RewardParams:
+        if not any(weight for name, weight in value.weights.items() if name != "shaping"):
+            raise ValueError(
+                "all weights of the reward except shaping are 0, so there is nothing to learn; give at least one of"
+                " these terms another weight"
+            )
+        return value
+
+    @field_validator("observation", mode="before")
+    @classmethod
+    def _known_features(cls, value: Any) -> Any:
+        if value is not None:
+            try:
+                listed_features(value)
+            except InvalidInput as error:
+                raise ValueError(str(error).removeprefix("observation: ")) from None
+        return value
+
+    @property
+    def rounds(self) -> int:
+        """Number of decisions of each learner in each world between two updates: the key ``n_steps``."""
+        return int(vars(self)["n_steps"])
+
+    @property
+    def updates_per_row(self) -> int:
+        """Number of updates between two rows of ``progress.csv``."""
+        return 1
+
+    def network_spec(self, observation_size: int) -> NetworkSpec:
+        """Return the networks of a policy that observes ``observation_size`` features, as policy files describe them.
+
+        An algorithm whose actor is not PPO's, one action that is clipped to [-1, 1], overrides this method.
+        """
+        shape = vars(self)["network"]
+        return NetworkSpec(
+            observation_size=observation_size,
+            action_size=1,
+            policy_hidden=shape.policy,
+            value_hidden=getattr(shape, "value", ()),
+            activation=shape.activation,
+            output="clip",
+        )
+
+    def check_learners(self, learners: int) -> None:
+        """Raise ``InvalidInput`` if the recipe does not fit the number of learners."""
+
+    def replace(self, **changes: Any) -> Self:
+        """Return the recipe with other values: ``replace(seed=3)``. Raises ``InvalidInput`` as ``load_recipe`` does."""
+        content = {**self.model_dump(mode="json"), **{key: plain(value) for key, value in changes.items()}}
+        changed = _checked(Document(f"recipe {self.name!r}", content, {}))
+        return changed  # type: ignore[return-value]  # another class only with another algorithm
+
+
+class PpoRecipe(TrainingRecipe):
+    """Recipe of PPO: an update collects ``n_steps`` decisions of every learner, and learns from them."""
+
+    schemes = get_args(Scheme)
+
+    algorithm: Literal["ppo"]
+    batch_size: int = Field(ge=2, description=BATCH_SIZE)
+    n_steps: int = Field(ge=2, description="number of decisions of each learner in each world between two updates")
+    n_epochs: int = Field(ge=1, le=1000, description="number of passes over the collected decisions in one update")
+    gae_lambda: Fraction = Field(
+        description="lambda of generalised advantage estimation, from 0 (one step) to 1 (whole return)"
+    )
+    clip_range: Rate = Field(
+        description="PPO's clip range: largest relative change of an action's probability in one update"
+    )
+    ent_coef: NonNegative = Field(description="weight of the policy's entropy in the loss")
+    vf_coef: NonNegative = Field(description="weight of the critic's loss")
+    max_grad_norm: Positive = Field(description="largest norm of the gradient; longer gradients are scaled down to it")
+    target_kl: Positive | None = Field(None, description="KL divergence beyond which an update stops early")
+    turns: Annotated[int, Field(ge=1, le=1000)] | None = Field(  # None: all learners learn in every update
+        None, description="number of turns of each learner, if independent learners learn one after the other"
+    )
+    network: NoisyShape = Field(description=NETWORK)
+
+    @model_validator(mode="after")
+    def _keys_fit(self) -> Self:
+        if self.turns is not None and self.scheme != "independent":
+            refuse(("turns",), self.turns, "is allowed with scheme: independent only; remove the key turns")
+        rollout = self.n_envs * self.n_steps
+        if not rollout <= MOST_DECISIONS:
+            right = f"n_envs x n_steps = {rollout} decisions per update are too many (at most {MOST_DECISIONS})"
+            refuse(("n_envs",), self.n_envs, right)
+        if rollout % self.batch_size:
+            refuse(("batch_size",), self.batch_size, f"must divide n_envs x n_steps = {rollout}")
+        return self
+
+    def check_learners(self, learners: int) -> None:
+        """Raise ``InvalidInput`` if the training has fewer updates than turns (the turns of all learners added up)."""
+        updates = -(-self.total_steps // (self.n_envs * learners * self.n_steps))
+        if self.turns is not None and self.turns * learners > updates:
+            raise InvalidInput(
+                f"recipe {self.name!r}: turns = {self.turns} for each of {learners} learners needs at least"
+                f" {self.turns * learners} updates, but total_steps = {self.total_steps} gives only {updates}; raise"
+                " total_steps, or lower turns"
+            )
+
+
+class SacRecipe(TrainingRecipe):
+    """Recipe of SAC: an update stores ``steps_per_update`` decisions of every learner, and learns from stored ones."""
+
+    algorithm: Literal["sac"]
+    batch_size: int = Field(ge=2, description=BATCH_SIZE)
+    steps_per_update: int = Field(
+        1, ge=1, le=10_000, description="number of decisions of each learner in each world between two updates"
+    )
+    gradient_steps: int = Field(1, ge=1, le=100_000, description="number of steps of the optimiser in one update")
+    buffer_size: int = Field(ge=1, le=10_000_000, description="largest number of decisions in the replay buffer")
+    learning_starts: int = Field(ge=0, description="number of decisions before the first update")
+    tau: Rate = Field(description="fraction by which the target critic moves towards the critic in one update")
+    ent_coef: float | str = Field("auto", description="weight of the policy's entropy: a number, or auto (learned)")
+    initial_ent_coef: Positive = Field(1.0, description="initial value of ent_coef if it is learned")
+    target_entropy: Annotated[float, Field(allow_inf_nan=False)] | None = Field(
+        None, description="entropy at which a learned ent_coef aims; if missing, -1 per action"
+    )
+    target_update_interval: int = Field(1, ge=1, description="number of updates between two moves of the target critic")
+    network: NetworkShape = Field(description=NETWORK)
+    log_every_updates: int = Field(ge=1, description="number of updates between two rows of progress.csv")
+
+    @field_validator("ent_coef", mode="plain")
+    @classmethod
+    def _automatic_or_fixed(cls, value: Any) -> float | str:
+        if value == "auto":
+            return "auto"
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value < math.inf:
+            raise ValueError("must be 'auto' or a finite number of at least 0")
+        return float(value)
+
+    @model_validator(mode="after")
+    def _room_for_everybody(self) -> Self:
+        if not self.buffer_size >= self.n_envs:
+            refuse(("buffer_size",), self.buffer_size, f"must be at least n_envs = {self.n_envs}")
+        return self
+
+    @property
+    def rounds(self) -> int:
+        return self.steps_per_update
+
+    @property
+    def updates_per_row(self) -> int:
+        return self.log_every_updates
+
+    def network_spec(self, observation_size: int) -> NetworkSpec:
+        """Return the actor's network; the critics, which also see the action, are not part of a policy."""
+        return super().network_spec(observation_size).model_copy(update={"value_hidden": (), "output": "tanh"})
+
+
+def shipped_recipes() -> dict[str, Path]:
+    """Return the files of all recipes that come with the package, by name; an extension's stand in its own folder."""
+    files = sorted(shipped_folder("train").rglob("*.yaml"), key=lambda file: file.name)
+    return {file.stem: file for file in files}
+
+
+def usable_recipes() -> dict[str, Path]:
+    """Return the files of all shipped recipes whose algorithm is installed, by name."""
+    return {name: file for name, file in shipped_recipes().items() if _algorithm_in(read_yaml(file)) in ALGORITHMS}
+
+
+def load_recipe(recipe: str | Path | Mapping[str, Any] | TrainingRecipe) -> TrainingRecipe:
+    """Load a recipe by name, by the path of its file, or from the content of such a file.
+
+    What ends in ``.yaml`` or has a path separator is a path; ``~`` is the user's home. A ``TrainingRecipe`` is returned
+    as it is. Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` with file, line, key, value and what
+    would be right for bad content.
+    """
+    if isinstance(recipe, TrainingRecipe):
+        return recipe
+    if isinstance(recipe, Mapping):
+        return _checked(Document("recipe", plain(recipe), {}))
+    text, shipped = str(recipe), shipped_recipes()
+    if Path(text).suffix in (".yaml", ".yml") or "/" in text or "\\" in text:
+        return _checked(read_yaml(Path(text).expanduser()))
+    if text not in shipped:
+        raise unknown_name("recipe", text, usable_recipes())
+    return _checked(read_yaml(shipped[text]), shipped[text])
+
+
+def _algorithm_in(document: Document) -> object:
+    """Return the value of ``algorithm`` in a recipe file; ``ppo`` if the key is missing."""
+    return document.content.get("algorithm", "ppo") if isinstance(document.content, dict) else "ppo"
+
+
+def _checked(document: Document, shipped: Path | None = None) -> TrainingRecipe:
+    """Return the recipe that a document describes; ``shipped`` is its file if it comes with the package."""
+    name = _algorithm_in(document)
+    if not isinstance(name, str) or name not in ALGORITHMS:
+        new = new_name(name, ALGORITHMS)
+        right = f"is now called {new}" if new else f"must be one of {', '.join(ALGORITHMS)}"
+        if shipped is not None:
+            right += f"; this algorithm belongs to the extension {shipped.parent.name}, which is not installed"
+        raise InvalidInput(f"{document.where(('algorithm',))}: algorithm = {flow_text(name, 60)}: {right}")
+    model = ALGORITHMS[name][0]
+    example = f"; the shipped recipe {name} has all keys" if name in shipped_recipes() else ""
+    wording = _RecipeWording(model, f"this key is required{example}")
+    return read_model(document, model, wording, "of keys to values, for instance algorithm: ppo")
+
+
+class _RecipeWording(Wording):
+    def known(self, path: YamlPath) -> list[str]:
+        """Return the keys that are possible in place of the last key of ``path``; a reward also has own terms."""
+        inside = super().known(path)
+        return [*inside, *own_terms()] if path[:-1] == ("reward",) else inside
+
+
+def register_algorithm(name: str, recipe: type[TrainingRecipe], algorithm: type[Any] | str) -> None:
+    """Register a learning algorithm, which recipes select with ``algorithm: NAME``.
+
+    A package declares an entry point of the group ``ethbrake_marl.learning_algorithms`` instead: a ``Part`` with recipe
+    class and algorithm.
+
+    Args:
+        name: 1 to 64 letters ``a-z``, digits, ``-`` and ``_``.
+        recipe: class of the algorithm's recipes, a subclass of ``TrainingRecipe``, which also checks their YAML files.
+        algorithm: a subclass of ``training.algorithm.Algorithm``, or the text ``"module:class"``, whose module (and
+            torch, which takes seconds) is imported only when a training begins.
+
+    Raises ``InvalidInput`` for an invalid name or class, and ``AlreadyExists`` if another algorithm has the name.
+
+    """
+    if not isinstance(name, str) or re.fullmatch(r"[a-z0-9][a-z0-9_-]{0,63}", name) is None:
+        raise InvalidInput(
+            f"algorithm {name!r:.80}: the name must have 1 to 64 characters (a-z, 0-9, - and _), and must not begin"
+            " with - or _"
+        )
+    if not (isinstance(recipe, type) and issubclass(recipe, TrainingRecipe)):
+        raise InvalidInput(f"algorithm {name!r}: recipe = {recipe!r:.80}: must be a subclass of TrainingRecipe")
+    is_place = isinstance(algorithm, str) and ":" in algorithm
+    if not (is_place or (isinstance(algorithm, type) and hasattr(algorithm, "build"))):
+        raise InvalidInput(
+            f"algorithm {name!r}: algorithm = {algorithm!r:.80}: must be a class with the method build, or the text"
+            " 'module:class' that says where this class is"
+        )
+    ALGORITHMS.add(name, (recipe, algorithm), lambda entry: entry == (recipe, algorithm))
+
+
+ALGORITHMS: Registry[tuple[type[TrainingRecipe], type[Any] | str]] = Registry(
+    "algorithm",
+    "learning_algorithms",
+    register_algorithm,
+    {"ppo": (PpoRecipe, "ethbrake_marl.training.ppo:Ppo"), "sac": (SacRecipe, "ethbrake_marl.training.sac:Sac")},
+)
+
+
+def algorithm_of(recipe: TrainingRecipe) -> Any:
+    """Return a new object of the recipe's learning algorithm, a ``training.algorithm.Algorithm``."""
+    algorithm = ALGORITHMS[recipe.algorithm][1]
+    return (resolve_name(algorithm) if isinstance(algorithm, str) else algorithm)()

@@ -1,0 +1,145 @@
+"""``RunFolder``: the folder of a training run, whose files are each written whole or not at all, and its logs."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from collections.abc import Mapping
+from contextlib import nullcontext
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from stable_baselines3.common.logger import CSVOutputFormat, KVWriter, TensorBoardOutputFormat
+from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.files.plain import read_object
+from ethbrake_marl.files.store import hold_lock, new_folder, remove_unfinished, write_file
+from ethbrake_marl.training.training import Training
+from ethbrake_marl.worlds.scenario import Scenario
+
+Status = Literal["running", "finished", "interrupted", "failed"]
+
+FORMAT = "ethbrake-run"
+WRITTEN = "written"  # key of run.json: names of the files that ``ethbrake run`` has written after the training
+
+
+class RunFolder:
+    """The files of a run. The folder need not exist yet."""
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path).expanduser()
+        self.config = self.path / "config.json"  # recipe and scenario in full, seeds, versions
+        self.status = self.path / "run.json"  # steps, status and reason
+        self.team = self.path / "team.json"  # which policy drives which vehicle
+        self.policy = self.path / "policy"  # the best policies, or the last ones if nothing was measured
+        self.last_policy = self.path / "policy-last"
+        self.progress = self.path / "progress.csv"  # a row per update
+        self.tensorboard = self.path / "tensorboard"  # the numbers of progress.csv
+        self.checkpoints = self.path / "checkpoints"  # until the training has finished
+        self.lock = self.path / "run.lock"
+
+    def create(self, training: Training, config: Mapping[str, Any], *, force: bool = False) -> None:
+        """Create the folder, so that the run can be resumed. With ``force`` another run, or an empty folder, goes.
+
+        Raises ``AlreadyExists`` for any other path that exists, ``InvalidInput`` if a process trains in that run.
+        """
+        path, is_run = self.path, self.status.is_file()
+        replace = force and path.is_dir() and not path.is_symlink() and (is_run or not any(path.iterdir()))
+        if not replace and os.path.lexists(path):
+            if not is_run:
+                raise AlreadyExists(f"{path}: already exists and is not the folder of a run; choose another name")
+            raise AlreadyExists(
+                f"{path}: this run already exists; choose another folder (--output), resume the run (ethbrake train"
+                " --resume), or replace it (--force; make run ARGS=--force)"
+            )
+        with self.held() if replace and is_run else nullcontext(), new_folder(path, replace=replace) as partial:
+            new = RunFolder(partial)
+            write_json(new.config, config)
+            new.write_team(training)
+            new.write_status("running")
+
+    def held(self) -> Any:
+        """Return the context in which no other process can train here. It raises ``InvalidInput`` if one does."""
+        return hold_lock(self.lock, "another process is training in this folder")
+
+    def write_team(self, training: Training) -> None:
+        """Write ``team.json``."""
+        team = {"scheme": training.scheme, "vehicles": training.scenario.vehicles, "drivers": training.drivers}
+        write_json(self.team, {"format": "ethbrake-team", "format_version": 1, **team})
+
+    def write_status(self, status: Status, **more: Any) -> None:
+        """Write ``run.json``: the status, times, and ``more``."""
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        before = read_object(self.status) if self.status.exists() else {}
+        times = {"started_utc": before.get("started_utc") or now}
+        if status != "running":
+            times["ended_utc"] = now
+        write_json(self.status, {"format": FORMAT, "format_version": 1, "status": status, **times, **more})
+
+    def training(self) -> Training:
+        """Return the training that a run records.
+
+        Raises ``InvalidInput`` if this is no run, if a file is damaged, or if a folder is a link.
+        """
+        if not (os.path.lexists(self.status) or os.path.lexists(self.config)):
+            raise InvalidInput(
+                f"{self.path}: is not the folder of a run; name the folder of a run, for instance runs/my-run"
+            )
+        for folder in (self.checkpoints, self.tensorboard, self.policy, self.last_policy):
+            if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+                raise InvalidInput(
+                    f"{folder}: must be a plain folder, not a link or a file, because the training replaces its content"
+                )
+        status, config = read_object(self.status), read_object(self.config)
+        for key, right in (("format", (FORMAT,)), ("status", get_args(Status))):
+            if status.get(key) not in right:
+                raise InvalidInput(f"{self.status}: {key} = {status.get(key)!r:.60}: must be {' or '.join(right)}")
+        for key in ("recipe", "scenario"):
+            if not isinstance(config.get(key), dict):
+                raise InvalidInput(f"{self.config}: does not describe a training, because the key {key} is missing")
+        try:
+            return Training.of(config["recipe"], Scenario(**config["scenario"]))
+        except InvalidInput as error:
+            raise InvalidInput(f"{self.config}: {error}") from None
+
+    def clear(self) -> None:
+        """Delete what killed processes have left half-written, and the results of the training so far."""
+        for folder in (self.path, self.checkpoints):
+            if folder.is_dir():
+                remove_unfinished(folder)
+        own, written = {path.name for path in vars(self).values()}, read_object(self.status).get(WRITTEN)
+        for path in [*self.path.iterdir()]:
+            is_result = isinstance(written, list) and path.name in written and path.name not in own
+            if is_result and (path.is_symlink() or path.is_file()):
+                path.unlink()
+
+    def rows(self) -> list[dict[str, str]]:
+        """Return the rows of ``progress.csv``: column -> text."""
+        return list(csv.DictReader(self.progress.read_text("utf-8").splitlines()))
+
+    def open_logs(self, progress: str, steps: int | None) -> list[KVWriter]:
+        """Return the writers of ``progress.csv``, which begins with the text ``progress``, and of TensorBoard's events.
+
+        ``steps``: those before the first row to come, of a training that goes on; None: the events begin anew.
+        """
+        self.progress.unlink(missing_ok=True)  # it may be a link, whose target must not be overwritten
+        if steps is None:
+            for left in self.tensorboard.glob("events.out.tfevents.*"):
+                left.unlink()
+        table = CSVOutputFormat(str(self.progress))
+        table.file.write(progress)
+        table.file.flush()
+        table.keys = [name for name in progress.partition("\n")[0].split(",") if name]
+        events: Any = TensorBoardOutputFormat(str(self.tensorboard))  # torch declares its attribute ``writer`` as None
+        if steps is not None:
+            restart = Event(step=steps + 1, session_log=SessionLog(status=SessionLog.START))
+            events.writer.file_writer.add_event(restart)  # TensorBoard then drops all events from this step on
+        return [table, events]
+
+
+def write_json(file: Path, content: Mapping[str, Any]) -> None:
+    """Write a JSON file, whole or not at all."""
+    write_file(file, json.dumps(content, indent=2, allow_nan=False).encode() + b"\n")

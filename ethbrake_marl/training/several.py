@@ -1,0 +1,180 @@
+"""Several learners with PPO: a policy for each of them (independent), or one with a critic that sees the whole line.
+
+Independent learners drive in the same worlds. Decisions are collected for all of them together; then each learns from
+its own rows, with Stable-Baselines3's ``PPO.train``. The last entry of an observation is the number of the learner,
+from 0 (``appended="number"``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import torch
+from gymnasium.spaces import Box
+from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.torch_layers import MlpExtractor
+from torch import Tensor, nn
+
+from ethbrake_marl.faces.sb3 import EthBrakeVecEnv
+from ethbrake_marl.training.training import Training
+
+
+class CentralCriticPolicy(ActorCriticPolicy):
+    """PPO policy whose actor sees the first ``own`` entries of an observation, and whose critic sees all of it.
+
+    The other arguments are those of Stable-Baselines3's ``ActorCriticPolicy``.
+    """
+
+    def __init__(self, *arguments: Any, own: int, **settings: Any) -> None:
+        self.own = own  # set before ``super().__init__``, which builds the networks
+        super().__init__(*arguments, **settings)
+
+    def _build_mlp_extractor(self) -> None:
+        self.mlp_extractor = _OwnPartForTheActor(self.own, self.features_dim, self.net_arch, self.activation_fn)
+
+
+class _OwnPartForTheActor(MlpExtractor):
+    """Hidden layers of an actor, which sees the first ``own`` of ``whole`` entries, and of a critic, which sees all."""
+
+    def __init__(self, own: int, whole: int, net_arch: Any, activation_fn: Any) -> None:
+        super().__init__(own, net_arch, activation_fn, device="cpu")
+        self.value_net = MlpExtractor(whole, net_arch, activation_fn, device="cpu").value_net
+        self.own = own
+
+    def forward_actor(self, features: Tensor) -> Tensor:
+        """Return the output of the actor's last hidden layer for observations [n, F]."""
+        return super().forward_actor(features[:, : self.own])
+
+
+class SeparatePolicies(BasePolicy):
+    """A policy with its own optimiser for each learner, behind the interface of a single policy.
+
+    ``columns``: for each learner the columns of an observation that it sees. ``network``: further arguments of
+    Stable-Baselines3's ``ActorCriticPolicy``. The other arguments are as there.
+    """
+
+    def __init__(
+        self,
+        observation_space: Any,
+        action_space: Any,
+        lr_schedule: Any,
+        use_sde: bool = False,
+        *,
+        columns: Sequence[Sequence[int]],
+        **network: Any,
+    ) -> None:
+        super().__init__(observation_space, action_space)
+        low, high, kind = observation_space.low, observation_space.high, observation_space.dtype.type
+        own = [Box(low[list(each)], high[list(each)], dtype=kind) for each in columns]
+        self.columns = columns
+        self.members = nn.ModuleList(
+            ActorCriticPolicy(space, action_space, lr_schedule, use_sde=use_sde, **network) for space in own
+        )
+        self.resting: frozenset[int] = frozenset()  # numbers of the learners that do not explore
+
+    @property
+    def log_std(self) -> Tensor:
+        """Logarithm of the exploration noise of each learner, [L]."""
+        return torch.cat([member.log_std for member in self.policies])
+
+    @property
+    def policies(self) -> list[ActorCriticPolicy]:
+        """Policies of the learners, front to rear."""
+        return [member for member in self.members if isinstance(member, ActorCriticPolicy)]
+
+    def forward(self, observation: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+        """Return actions [n, 1], values [n, 1] and log-probabilities [n] for observations [n, F + 1]."""
+        count = len(observation)
+        actions, values, likelihood = torch.empty(count, 1), torch.empty(count, 1), torch.empty(count)
+        for number, policy, rows in self._by_learner(observation):
+            still = deterministic or number in self.resting
+            actions[rows], values[rows], likelihood[rows] = policy(observation[rows][:, self.columns[number]], still)
+        return actions, values, likelihood
+
+    def predict_values(self, observation: Any) -> Tensor:
+        """Return the critics' values [n, 1] for observations [n, F + 1]."""
+        values = torch.empty(len(observation), 1)
+        for number, policy, rows in self._by_learner(observation):
+            values[rows] = policy.predict_values(observation[rows][:, self.columns[number]])
+        return values
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
+        return self.forward(observation, deterministic)[0]
+
+    def _by_learner(self, observation: Tensor) -> Iterator[tuple[int, ActorCriticPolicy, Tensor]]:
+        numbers = observation[:, -1]
+        for number, policy in enumerate(self.policies):
+            rows = (numbers == number).nonzero()[:, 0]
+            if len(rows):
+                yield number, policy, rows
+
+
+class IndependentPPO(PPO):
+    """PPO with a separate policy for each learner. The columns of its log are ``vehicle_2/loss`` and so on.
+
+    ``turns``: None, or how often each learner has its turn to learn; all turns have about the same number of updates,
+    and learners that wait take the means of their policies.
+    """
+
+    policy: SeparatePolicies  # type: ignore[assignment]  # has the parts of an actor-critic policy that PPO uses
+
+    def __init__(
+        self,
+        environment: EthBrakeVecEnv,
+        training: Training,
+        turns: int | None,
+        policy_kwargs: dict[str, Any],
+        **settings: Any,
+    ) -> None:
+        self.names, self.turns = training.learners, turns
+        network = {**policy_kwargs, "columns": training.columns}
+        super().__init__(SeparatePolicies, environment, policy_kwargs=network, **settings)  # type: ignore[arg-type]
+        self._learning: tuple[int, ...] = ()
+
+    def collect_rollouts(self, *arguments: Any, **settings: Any) -> bool:
+        """Collect decisions as PPO does; learners that do not learn in the next update do not explore."""
+        everyone = range(len(self.names))
+        self._learning = tuple(everyone) if self.turns is None else (self._whose_turn(self.turns),)
+        self.policy.resting = frozenset(everyone) - frozenset(self._learning)
+        return super().collect_rollouts(*arguments, **settings)
+
+    def train(self) -> None:
+        """Let each learner whose turn it is learn from its own rows."""
+        joint, buffer, log, updates = self.policy, self.rollout_buffer, self._logger, self._n_updates
+        parts = {number: self._part(buffer, number) for number in self._learning}
+        try:
+            for number, part in parts.items():
+                self.policy, self.rollout_buffer = joint.policies[number], part  # type: ignore[assignment]
+                self._logger, self._n_updates = Logger(None, []), updates
+                super().train()
+                for name, value in self._logger.name_to_value.items():
+                    excluded = self._logger.name_to_excluded[name]
+                    log.record(name.replace("train", self.names[number], 1), value, excluded)
+        finally:
+            self.policy, self.rollout_buffer, self._logger = joint, buffer, log
+
+    def _whose_turn(self, turns: int) -> int:
+        """Return the number of the learner that learns in the next update. It follows from the decisions so far."""
+        rollout = self.n_envs * self.n_steps
+        planned = -(-self._total_timesteps // rollout)
+        stretch = self.num_timesteps // rollout * turns * len(self.names) // planned
+        return stretch % len(self.names)
+
+    def _part(self, buffer: RolloutBuffer, number: int) -> RolloutBuffer:
+        """Return the rows of a learner."""
+        own, count = self.policy.policies[number].observation_space, len(self.names)
+        part = RolloutBuffer(
+            buffer.buffer_size, own, self.action_space, self.device, self.gae_lambda, self.gamma, self.n_envs // count
+        )
+        for name in ("actions", "rewards", "episode_starts", "values", "log_probs", "returns", "advantages"):
+            setattr(part, name, getattr(buffer, name)[:, number::count].copy())
+        part.observations = buffer.observations[:, number::count][:, :, self.policy.columns[number]]
+        part.pos, part.full = buffer.buffer_size, True
+        return part
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", *(f"policy.members.{k}.optimizer" for k in range(len(self.names)))], []

@@ -1,0 +1,284 @@
+"""Train policies, or resume a training: build the model, let it learn, and between updates measure, log and save."""
+
+from __future__ import annotations
+
+import random
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.faces.sb3 import EthBrakeVecEnv
+from ethbrake_marl.files.plain import read_object
+from ethbrake_marl.names import AGENTS, open_game
+from ethbrake_marl.policies.manifest import installed_versions
+from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.progress import Progress, Told
+from ethbrake_marl.registry import versions_used
+from ethbrake_marl.stopping import stop_on_signal
+from ethbrake_marl.training import checkpoint
+from ethbrake_marl.training.finite import FiniteNumbers, TrainingDiverged, check_weights
+from ethbrake_marl.training.fixed_list import Measure, Policies, measure_on_list
+from ethbrake_marl.training.recipe import Scheme, TrainingRecipe
+from ethbrake_marl.training.run import RunFolder
+from ethbrake_marl.training.training import Training
+from ethbrake_marl.training.updates import BetweenUpdates, Stopped
+from ethbrake_marl.worlds.game import AnyScenario
+
+APPENDED: dict[Scheme, Any] = {"independent": "number", "centralised": "state"}
+_ONE_TRAINING = threading.Lock()
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """Policies, and how they came about.
+
+    >>> import ethbrake_marl as eb
+    >>> short = {"n_envs": 8, "n_steps": 16, "batch_size": 64, "n_epochs": 1}
+    >>> recipe = eb.load_recipe("ppo").replace(**short, network={"policy": [8], "value": [8]})
+    >>> result = eb.train(recipe, "paper-random", "runs/example", steps=128, measure=None)
+    >>> result.status, result.steps, result.policy.manifest.algorithm
+    ('finished', 128, 'ppo')
+
+    """
+
+    directory: Path  # of the run
+    training: Training  # recipe and scenario
+    policies: Policies  # the best on the fixed list, or the last if nothing was measured; the run's folder ``policy``
+    last_policies: Policies  # at the end; ``policy-last``
+    status: Literal["finished", "interrupted"]
+    steps: int  # decisions of all learners together
+    updates: int  # rounds of collecting and learning
+    wall_s: float  # time that all processes have spent on this training
+    evaluations: tuple[Mapping[str, float], ...]  # steps, updates, metrics and ``cpu_s``, the learning's processor time
+
+    @property
+    def agent(self) -> str:
+        """Name of the trained agent for ``--agents``: ``ppo@runs/mine``."""
+        algorithm = self.training.recipe.algorithm
+        alone = algorithm if algorithm in AGENTS else "policy"
+        return f"{alone if len(self.training.learners) == 1 else 'team'}@{self.directory}"
+
+    @property
+    def metrics(self) -> Mapping[str, float] | None:
+        """Evaluation of ``policies``; None if nothing was measured."""
+        steps = next(iter(self.policies.values())).manifest.steps
+        return next((each for each in self.evaluations if each["steps"] == steps), None)
+
+    @property
+    def policy(self) -> Policy:
+        """The policy that drives all learners. Raises ``InvalidInput`` if each has its own."""
+        return _only(self.policies)
+
+    @property
+    def last_policy(self) -> Policy:
+        """The policy at the end. Raises ``InvalidInput`` if each learner has its own."""
+        return _only(self.last_policies)
+
+
+def train(
+    recipe: str | Path | Mapping[str, Any] | TrainingRecipe,
+    scenario: AnyScenario,
+    directory: str | Path,
+    *,
+    scheme: Scheme | None = None,
+    turns: int | None = None,
+    seed: int | None = None,
+    steps: int | None = None,
+    force: bool = False,
+    settings: Sequence[str] = (),
+    measure: Measure | None = measure_on_list,
+    on_progress: Told = "show",
+) -> TrainResult:
+    """Train the learners of a scenario, and write the folder of the run.
+
+    Ctrl-C stops after the current update (status ``interrupted``), a second one at once. After Ctrl-C or an error
+    ``policy/`` has the best policy so far and ``policy-last/`` the latest; ``resume`` goes on. The same recipe,
+    scenario and seed lead to the same policy on the same machine, to the bit.
+
+    Args:
+        recipe: a recipe, its name, the path of its file, or the content of one.
+        scenario: likewise. Its roles say which vehicles learn.
+        directory: new folder of the run.
+        scheme: how several learners train together; None: as the recipe says. Likewise:
+        turns: how often each independent learner has its turn to learn.
+        seed: of worlds, networks and exploration.
+        steps: decisions of all learners together. A training ends with a whole update, so there may be a few more.
+        force: replace an earlier run in ``directory``.
+        settings: by which recipe and scenario differ from their files, ``KEY=VALUE``; ``config.json`` records them.
+        measure: takes a ``Training``, and returns a function of policies, learner -> policy, that returns metrics. It
+            is called before the first update, every few updates and at the end. By default policies are measured on
+            the recipe's fixed list of worlds; None: not at all.
+        on_progress: is called with each ``Progress``; ``show``: print it on stderr; None: no reports.
+
+    Raises ``AlreadyExists`` for a directory that exists, ``InvalidInput`` if recipe and scenario do not fit each other
+    or another thread is training, ``TrainingDiverged`` if a number is not finite.
+
+    """
+    changes = {"scheme": scheme, "turns": turns, "seed": seed, "total_steps": steps}
+    training = Training.of(recipe, scenario, **{key: value for key, value in changes.items() if value is not None})
+    folder = RunFolder(directory)
+    with _prepared(training, folder, measure, on_progress) as updates:
+        folder.create(training, training.config(settings), force=force)
+        with folder.held():
+            return _learn(updates, None)
+
+
+def resume(
+    directory: str | Path,
+    *,
+    measure: Measure | None = measure_on_list,
+    on_progress: Told = "show",
+    other_versions: bool = False,
+) -> TrainResult:
+    """Continue a training that was stopped or killed, from its newest checkpoint, or from the beginning.
+
+    Policies, evaluations and logs are the same as without the interruption, to the bit. Results of ``ethbrake run`` are
+    deleted.
+
+    Args:
+        directory: folder of the run.
+        measure: as in ``train``.
+        on_progress: as in ``train``.
+        other_versions: accept a checkpoint that other versions of packages, or another physics, have written.
+
+    Raises ``InvalidInput`` if the folder has no training or a finished one, if another process is training in it, if
+    ``config.json`` has changed since the checkpoint, or for other versions.
+
+    """
+    folder = RunFolder(directory)
+    training = folder.training()
+    with _prepared(training, folder, measure, on_progress) as updates, folder.held():
+        _check_unfinished(folder)
+        saved, damaged = checkpoint.newest(folder.checkpoints)
+        if saved is not None:
+            _check_same(folder, training, saved, other_versions)
+        folder.clear()
+        folder.write_team(training)  # it may be damaged
+        updates.notes += [f"deleted a damaged checkpoint: {reason}" for reason in damaged]
+        return _learn(updates, saved)
+
+
+def _only(policies: Policies) -> Policy:
+    first, *others = policies.values()
+    if any(other is not first for other in others):
+        name = next(iter(policies))
+        raise InvalidInput(
+            f"training: {', '.join(policies)} have different policies; use the attribute policies, for instance"
+            f" policies[{name!r}]"
+        )
+    return first
+
+
+@contextmanager
+def _prepared(
+    training: Training, folder: RunFolder, measure: Measure | None, on_progress: Told
+) -> Iterator[BetweenUpdates]:
+    """Build environment and model; yield what happens between updates. Nothing is written yet.
+
+    Inside, Ctrl-C asks to stop, and torch has one thread: with networks so small a second one makes training 3 to 15
+    times slower if another process uses the cores. At the end the global random generators are as before.
+    """
+    if not _ONE_TRAINING.acquire(blocking=False):
+        raise InvalidInput(
+            "train: another thread of this process is training, and both would draw from the same random generators;"
+            " wait until it has ended, or train in another process"
+        )
+    states = random.getstate(), np.random.get_state(), torch.get_rng_state(), torch.get_num_threads()  # noqa: NPY002
+    try:
+        torch.set_num_threads(1)
+        evaluate = None if measure is None else measure(training)
+        with stop_on_signal() as stop, closing(make_environment(training)) as environment:
+            yield BetweenUpdates(training, folder, environment, evaluate, Progress.listener(on_progress), stop)
+    finally:
+        random.setstate(states[0])
+        np.random.set_state(states[1])  # noqa: NPY002
+        torch.set_rng_state(states[2])
+        torch.set_num_threads(states[3])
+        _ONE_TRAINING.release()
+
+
+def make_environment(training: Training) -> EthBrakeVecEnv:
+    """Return the environment of a training, with one row for each learner in each world."""
+    recipe = training.recipe
+    scenario, game = open_game(training.scenario, reward=recipe.reward, observation=list(training.row.names))
+    appended = APPENDED.get(training.scheme)
+    return EthBrakeVecEnv(scenario, game, recipe.n_envs, recipe.seed, recipe.horizon_is_end, appended)
+
+
+def _learn(updates: BetweenUpdates, saved: Mapping[str, Any] | None) -> TrainResult:
+    """Train to the end, or until somebody stops it; save the policies, also after an error."""
+    model, training, folder = updates.model, updates.training, updates.folder
+    if saved is not None:
+        updates.restore(saved)
+    folder.write_status("running")
+    steps = None if saved is None else updates.steps
+    model.logger.output_formats = folder.open_logs("" if saved is None else saved["course"]["progress"], steps)
+    status: Literal["finished", "interrupted"] = "finished"
+    try:
+        model.learn(
+            training.recipe.total_steps - model.num_timesteps,
+            callback=[FiniteNumbers(), updates],
+            log_interval=None,  # type: ignore[arg-type]  # rows are written between updates
+            reset_num_timesteps=saved is None,
+        )
+    except Stopped:
+        status = "interrupted"
+    except BaseException as error:
+        cause = _cause(model, error)
+        updates.save("interrupted" if isinstance(error, KeyboardInterrupt) else "failed", cause)
+        if cause is error:
+            raise
+        raise cause from error
+    finally:
+        model.logger.close()
+    updates.save(status)
+    assert updates.policies is not None and updates.chosen is not None  # since before the first rollout
+    return TrainResult(
+        folder.path, training, updates.chosen, updates.policies, status, updates.steps, updates.updates,
+        updates.wall_s, tuple(updates.evaluations),
+    )  # fmt: skip
+
+
+def _cause(model: BaseAlgorithm, error: BaseException) -> BaseException:
+    """Return ``TrainingDiverged`` for a ValueError of torch about weights that are not finite; else the error."""
+    if isinstance(error, ValueError):
+        try:
+            check_weights(model)
+        except TrainingDiverged as diverged:
+            return diverged
+    return error
+
+
+def _check_unfinished(folder: RunFolder) -> None:
+    """Raise ``InvalidInput`` if the training has finished, even if ``ethbrake run`` has not evaluated it yet."""
+    status = read_object(folder.status)
+    if status["status"] == "finished" or (status.get("stage") is not None and not any(folder.checkpoints.glob("*"))):
+        raise InvalidInput(
+            f"{folder.path}: this training has finished and cannot be resumed; evaluate its policy (ethbrake evaluate)"
+        )
+
+
+def _check_same(folder: RunFolder, training: Training, saved: Mapping[str, Any], other_versions: bool) -> None:
+    """Raise ``InvalidInput`` if a checkpoint is of another training, or of other versions of packages."""
+    if saved["training"] != training.identity:
+        raise InvalidInput(
+            f"{folder.config}: this file was changed after the checkpoint of step {saved['steps']} was written; restore"
+            " the old content, or train again in another folder"
+        )
+    now, then = installed_versions(), saved["versions"]
+    asked = then.keys() | (now.keys() - versions_used().keys())  # this process may have loaded more parts
+    other = sorted(name for name in asked if now.get(name) != then.get(name))
+    if other and not other_versions:
+        name = other[0]
+        raise InvalidInput(
+            f"{folder.path}: this training began with {name} {then.get(name)}, but {name} {now.get(name)} is installed"
+            " and may compute other numbers; install the old version, or continue anyway (--other-versions)"
+        )

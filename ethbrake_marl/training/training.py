@@ -1,0 +1,115 @@
+"""``Training``: a recipe and a scenario, and what follows: who learns, which policy drives whom, who observes what."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from ethbrake_marl.episode.observe import View
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.policies.manifest import installed_versions
+from ethbrake_marl.training.recipe import Scheme, TrainingRecipe, load_recipe
+from ethbrake_marl.worlds.catalogue import load_scenario
+from ethbrake_marl.worlds.game import AnyScenario, views_of
+from ethbrake_marl.worlds.mixture import WORDS
+from ethbrake_marl.worlds.scenario import Scenario
+
+
+class Training(NamedTuple):
+    """A recipe and a scenario that fit each other (``Training.of``). Equal ones lead to equal policies."""
+
+    recipe: TrainingRecipe
+    scenario: Scenario
+    scheme: Scheme  # how the learners train together
+    learners: tuple[str, ...]  # names, front to rear
+    views: tuple[View, ...]  # what each learner observes
+
+    @classmethod
+    def of(cls, recipe: Any, scenario: AnyScenario, **changes: Any) -> Training:
+        """Return the training of a recipe in a scenario, both as ``load_recipe`` and ``load_scenario`` take them.
+
+        Learners observe what the recipe lists, else what the scenario lists. ``changes``: other values for keys of the
+        recipe. Raises ``InvalidInput`` if recipe and scenario do not fit each other.
+        """
+        recipe, scenario = load_recipe(recipe), load_scenario(scenario)
+        recipe = recipe.replace(**changes) if changes else recipe
+        learners = tuple(scenario.vehicle_names[body - 1] for body in scenario.learners)
+        every = views_of(scenario) if recipe.observation is None else (View(recipe.observation),) * scenario.vehicles
+        views = tuple(every[body - 1] for body in scenario.learners)
+        scheme: Scheme = recipe.scheme or ("single" if len(learners) == 1 else "shared")
+        _check(recipe, scenario, scheme, learners)
+        if scheme != "independent" and len(set(views)) > 1:
+            raise InvalidInput(
+                f"scheme {scheme}: {', '.join(learners)} share a policy, but observe different features in scenario"
+                f" {scenario.name!r}; list the features of all in the recipe's key observation, or use the scheme"
+                " independent"
+            )
+        return cls(recipe, scenario, scheme, learners, views)
+
+    @property
+    def drivers(self) -> dict[str, str]:
+        """Folder of each learner's policy, inside the folder of the run."""
+        return {name: f"policy/{name}" if self.scheme == "independent" else "policy" for name in self.learners}
+
+    @property
+    def groups(self) -> tuple[tuple[str, ...], ...]:
+        """The learners that share a policy, one group for each policy, front to rear."""
+        return tuple((name,) for name in self.learners) if self.scheme == "independent" else (self.learners,)
+
+    @property
+    def row(self) -> View:
+        """The features in a row of the environment: all that some learner observes."""
+        return View(list(dict.fromkeys(name for view in self.views for name in view.names)))
+
+    @property
+    def columns(self) -> list[list[int]]:
+        """Columns of a row that each learner observes."""
+        place = {name: column for column, name in enumerate(self.row.names)}
+        return [[place[name] for name in view.names] for view in self.views]
+
+    def content(self) -> dict[str, dict[str, Any]]:
+        """Return everything that affects the training as plain data: defaults too, words not."""
+        recipe = self.recipe.model_dump(mode="json", exclude=set(WORDS))
+        return {"recipe": recipe, "scenario": self.scenario.content(without=WORDS)}
+
+    @property
+    def identity(self) -> str:
+        """SHA-256 of ``content``, in hexadecimal digits."""
+        return hashlib.sha256(json.dumps(self.content(), sort_keys=True).encode()).hexdigest()
+
+    def config(self, settings: Sequence[str] = ()) -> dict[str, Any]:
+        """Return the content of ``config.json``; ``settings`` are those of a command."""
+        return {
+            "recipe": self.recipe.model_dump(mode="json"),
+            "scenario": self.scenario.declared(),
+            "seeds": {"training": self.recipe.seed, "evaluation": self.recipe.evaluation.seed},
+            "versions": installed_versions(),
+            **({"settings": list(settings)} if settings else {}),
+        }
+
+    def who_drives(self) -> str:
+        """Return, for instance, ``scheme shared: policy drives vehicle_2, vehicle_3``."""
+        parts = (f"{self.drivers[group[0]]} drives {', '.join(group)}" for group in self.groups)
+        return f"scheme {self.scheme}: {'; '.join(parts)}"
+
+
+def _check(recipe: TrainingRecipe, scenario: Scenario, scheme: Scheme, learners: Sequence[str]) -> None:
+    """Raise ``InvalidInput`` if no vehicle learns, or if scheme or recipe do not fit the number of learners."""
+    where = f"scenario {scenario.name!r}"
+    if not learners:
+        raise InvalidInput(f"{where} has no learner; give at least one vehicle the role learner")
+    if scheme == "single" and len(learners) > 1:
+        raise InvalidInput(
+            f"scheme single: {where} has {len(learners)} learners; use the scheme shared, independent or centralised,"
+            " or a scenario with one learner"
+        )
+    if scheme == "independent" and len(learners) == 1:
+        raise InvalidInput(f"scheme independent: needs several learners, but {where} has one; use the scheme single")
+    if scheme not in recipe.schemes:
+        raise InvalidInput(
+            f"scheme {scheme}: the algorithm {recipe.algorithm} of recipe {recipe.name!r} does not support this scheme;"
+            " use a recipe for PPO, for instance cooperation-ppo"
+        )
+    recipe.check_learners(len(learners))
