@@ -109,7 +109,7 @@ class State(NamedTuple):
 
     @property
     def at_rest(self) -> Bools:
-        """Whether every vehicle is at rest and no command would move it, [n]; at the end: else the horizon came first."""
+        """Whether every vehicle is at rest and no command would move it, [n]; if not, at the end, the horizon came."""
         moves = (self.line[:, SPEED] != 0.0) | (self.wanted > 0.0) | (self.line[:, FORCE] > 0.0)
         return ~moves[:, 1:].any(axis=1)
 
